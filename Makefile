@@ -1,0 +1,56 @@
+# Every target sets itself up: a machine with Python 3.11 or newer and make needs nothing else.
+VENV ?= .venv
+BIN := $(VENV)/bin
+PYTHON ?= $(shell for python in python3.11 python3; do \
+	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
+
+# Idle torch threads otherwise spin and take the cores from each other.
+export OMP_WAIT_POLICY := passive
+
+CORE := $(VENV)/.core
+DEV := $(VENV)/.dev
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint format clean
+
+help:  ## what there is
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-8s %s\n", $$1, $$2}'
+
+setup: $(DEV)  ## create .venv with everything for development
+
+demo: $(CORE)  ## learn from the built-in data and write pictures and numbers to out/demo
+	$(BIN)/symphony demo --out out/demo
+
+test: $(DEV)  ## run the tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(DEV)  ## style, types, imports between packages, file lengths
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python scripts/lint_length.py
+
+format: $(DEV)  ## rewrite the files in the style that lint asks for
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean:  ## remove .venv, caches and everything written by the targets above
+	rm -rf $(VENV) out build dist src/*.egg-info
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	find src tests scripts recipes benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+
+$(CORE): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "error: needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "error: $(PYTHON) is missing or older than Python 3.11; choose another with: make PYTHON=/path/to/python" >&2; exit 1; }
+	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) || \
+		{ echo "error: $(PYTHON) cannot create $(VENV) (on Debian: apt install python3-venv)" >&2; rm -rf $(VENV); exit 1; }
+	@echo "installing into $(VENV) (some minutes, once)"
+	$(INSTALL) -e .
+	@touch $@
+
+$(DEV): $(CORE)
+	$(INSTALL) -e '.[dev]'
+	@touch $@

@@ -1,0 +1,192 @@
+"""Convert logs into a store of run segments, look into it, draw from it."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from symphony.errors import ConfigError
+
+app = tyro.extras.SubcommandApp()
+
+
+@app.command(name="convert")
+@dataclass(frozen=True)
+class Convert:
+    """Convert logs into a store of run segments.
+
+    A record that can't be used is skipped, counted and reported. A new store appears once it is complete.
+    """
+
+    format: tyro.conf.Positional[Literal["womd", "commonroad"]]
+    """Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML)."""
+    files: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="FILE ...", help_behavior_hint="(required)"),
+    ]
+    """Files of that format, or folders to search for them."""
+    out: Path
+    """Folder of the store."""
+    rate: float = 5.0
+    """Steps per second in the store (the paper's 5)."""
+    interactive: int = 2
+    """Interactive agents a segment must have at its first step."""
+    smooth: float = 0.0
+    """Smoothing of the tracks before they are resampled: sigma in seconds, 0 for none."""
+    append: bool = False
+    """Add to a store that exists; what it holds already is left as it is."""
+
+    def __post_init__(self) -> None:
+        if not self.files:
+            raise ConfigError("no files given")
+        if not self.rate > 0:
+            raise ConfigError(f"--rate must be positive, is {self.rate}")
+        if self.interactive < 1:
+            raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
+        if not self.smooth >= 0:
+            raise ConfigError(f"--smooth must not be negative, is {self.smooth}")
+
+    def run(self) -> None:
+        """Convert, showing how far it is, and report."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from symphony.data.convert import Report, convert
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("files"))
+        counts = TextColumn("{task.fields[converted]} converted, {task.fields[skipped]} skipped")
+        with Progress(*columns, counts, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+            task = bar.add_task("Converting", total=None, converted=0, skipped=0)
+
+            def show(done: int, total: int, so_far: Report) -> None:
+                skipped = len(so_far.skipped)
+                bar.update(task, completed=done, total=total, converted=so_far.converted, skipped=skipped)
+
+            report = convert(
+                self.format,
+                self.files,
+                self.out,
+                rate=self.rate,
+                interactive=self.interactive,
+                smooth=self.smooth,
+                append=self.append,
+                progress=show,
+            )
+        _print_report(report, self.out)
+
+
+@app.command(name="info")
+@dataclass(frozen=True)
+class Info:
+    """Say what a store of run segments holds."""
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of the store."""
+    json: bool = False
+    """Print everything as JSON, the skipped records included."""
+
+    def run(self) -> None:
+        """Print it."""
+        from symphony.data.convert import info
+
+        found = info(self.store)
+        if self.json:
+            _write(jsonlib.dumps(found, indent=2))
+        else:
+            _print_info(found)
+
+
+@app.command(name="plot")
+@dataclass(frozen=True)
+class Plot:
+    """Draw a run segment: map, lights and agents, with the tracks of the whole window."""
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of the store."""
+    segment: str
+    """Its id, or its number in the store."""
+    out: Path
+    """Picture to write (.png, .pdf or .svg)."""
+    interactive: int = 2
+    """Agents in colour, the ego included."""
+    step: int = 0
+    """Step at which boxes and lights are shown."""
+
+    def run(self) -> None:
+        """Draw it."""
+        from symphony.data.selection import interactive_agents
+        from symphony.data.store import SegmentStore
+        from symphony.render import plot_segment
+
+        store = SegmentStore(self.store)
+        known = self.segment in store.ids
+        by_number = not known and self.segment.isdecimal() and int(self.segment) < len(store)
+        segment = store[int(self.segment) if by_number else store.index_of(self.segment)]
+        if not 0 <= self.step < segment.num_steps:
+            raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
+        if self.interactive < 1:
+            raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
+        chosen = interactive_agents(segment, self.interactive)
+        plot_segment(segment, self.out, step=self.step, interactive=chosen.tolist())
+
+
+def _write(text: str) -> None:
+    # Not through rich, which would wrap and colour what another program is going to read.
+    print(text)  # noqa: T201
+
+
+def _print_report(report: Any, out: Path) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("", "segments", title=escape(str(out)), title_justify="left", title_style="bold")
+    table.columns[1].justify = "right"
+    table.add_row("converted", str(report.converted))
+    if report.present:
+        table.add_row("there already", str(report.present))
+    for reason, count in report.reasons.items():
+        table.add_row(f"skipped: {escape(reason)}", str(count))
+    Console().print(table)
+
+
+def _print_info(found: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    def span(name: str, unit: str = "") -> str:
+        values = found[name]
+        if not values:
+            return "none"
+        if values["min"] == values["max"]:
+            return f"{values['min']:g}{unit}"
+        return f"{values['min']:g} to {values['max']:g}{unit} (mean {values['mean']:g})"
+
+    sources = ", ".join(f"{count} from {source}" for source, count in found["sources"].items())
+    rows = [
+        ("segments", f"{found['segments']}" + (f" ({sources})" if sources else "")),
+        ("agents", f"{found['agents']}"),
+        ("traffic lights", f"{found['signals']}"),
+        ("steps", span("steps")),
+        ("duration", span("duration", " s")),
+        ("time step", span("dt", " s")),
+        ("maps", f"{found['maps']}"),
+        ("lanes per segment", span("lanes")),
+        ("map points per segment", span("map_points")),
+        ("size on disk", f"{found['bytes'] / 2**20:.1f} MiB"),
+        ("checksum", f"{found['checksum'][:16]}… (in full with --json)"),
+        ("skipped", f"{found['skipped']}"),
+        *((f"  {reason}", str(count)) for reason, count in found["reasons"].items()),
+    ]
+    table = Table(
+        show_header=False, box=None, pad_edge=False, title=escape(found["path"]), title_style="bold"
+    )
+    table.title_justify = "left"
+    for name, value in rows:
+        table.add_row(escape(name), escape(value))
+    Console().print(table)

@@ -1,0 +1,60 @@
+"""The whole way on the data that comes with the package."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from symphony.cli.evaluate import evaluate_with_bar
+from symphony.cli.tables import print_metrics, write_json
+from symphony.config import BCConfig, EvaluateConfig
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Learn from the built-in data, evaluate, and draw what came out: some minutes on a laptop."""
+
+    out: Path = Path("out/demo")
+    """Folder for the trained agent, the picture and the numbers; an earlier demo there is replaced."""
+    steps: int = 600
+    """Updates."""
+    rollouts: int = 16
+    """Simulations per run segment."""
+    seed: int = 0
+    """Of everything drawn at random."""
+
+    def run(self) -> None:
+        """Run it."""
+        import shutil
+
+        from rich.console import Console
+
+        from symphony.cli.pictures import draw_rollouts
+        from symphony.data.builtin import builtin_store
+        from symphony.trainers import load_agent, train
+
+        console = Console()
+        began = time.perf_counter()
+        run, picture, numbers = self.out / "bc", self.out / "rollouts.png", self.out / "metrics.json"
+        if (run / "config.json").is_file():
+            shutil.rmtree(run)
+        learn, judge = builtin_store("train"), builtin_store("test")
+        console.print(f"Learning to drive from {learn} (behavioural cloning, {self.steps} updates)")
+        train(BCConfig(data=learn, out=run, steps=self.steps, seed=self.seed, wandb="disabled"))
+        console.print(f"Simulating {judge}, which it has not seen")
+        config = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
+        results = [
+            evaluate_with_bar(name, judge, config) for name in ("playback", "constant_velocity", str(run))
+        ]
+        rows = [{**result.numbers(), "agent": name} for result, name in zip(results, NAMES, strict=True)]
+        print_metrics(rows, title="Built-in test segments")
+        seconds = time.perf_counter() - began
+        write_json(numbers, {"rows": rows, "steps": self.steps, "seconds": round(seconds, 1)})
+        draw_rollouts(load_agent(str(run)), judge, picture, results[-1].interactive, seed=self.seed)
+        console.print(f"Done in {seconds:.0f} s.")
+        for what, where in (("picture of rollouts", picture), ("numbers", numbers), ("trained agent", run)):
+            console.print(f"{what + ':':21}{where}", soft_wrap=True)
+
+
+NAMES = ("log playback", "constant velocity", "behavioural cloning")

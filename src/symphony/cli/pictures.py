@@ -1,0 +1,65 @@
+"""Pictures of simulated rollouts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from symphony.trainers import Agent, Rollouts
+
+PANELS = 6
+"""Run segments in one picture."""
+SHOWN = 8
+"""Rollouts drawn per run segment."""
+
+
+def draw_rollouts(
+    agent: Agent, data: Path, path: Path, interactive: int, *, seed: int = 0, panels: int = PANELS
+) -> None:
+    """Draw rollouts of some run segments, spread evenly over a store, beside the log.
+
+    Args:
+        agent: what drives the interactive agents.
+        data: the store.
+        path: picture to write.
+        interactive: agents per segment that are driven.
+        seed: of the rollouts.
+        panels: how many segments.
+    """
+    from symphony.data.store import SegmentStore
+    from symphony.render import plot_grid, plot_rollout
+    from symphony.trainers.dataset import SceneDataset
+    from symphony.trainers.evaluation import playback, simulated
+
+    store = SegmentStore(data)
+    panels = min(panels, len(store))
+    chosen = [i * len(store) // panels for i in range(panels)]
+    dataset = SceneDataset(store, interactive, agent.dynamics)
+
+    def panel(i: int) -> Callable[[Any], Any]:
+        segment, scene = dataset.segment(i), dataset.scene(i)
+        runs: Rollouts = playback(scene) if agent.policy is None else simulated(agent, scene, SHOWN, seed)
+        state = runs.state[0].transpose(1, 2)
+        flags = {
+            name: getattr(runs, name)[0].transpose(1, 2).numpy() for name in ("collision", "offroad", "counted")
+        }
+
+        def draw(axes: Any) -> Any:
+            return plot_rollout(
+                segment,
+                state[:, :, 1:, :2].numpy(),
+                state[:, :, 1:, 2].numpy(),
+                scene.interactive[0].numpy(),
+                axes,
+                start=1,
+                valid=flags["counted"],
+                collision=flags["collision"],
+                offroad=flags["offroad"],
+            )
+
+        return draw
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_grid([panel(i) for i in chosen], path)

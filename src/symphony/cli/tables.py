@@ -1,0 +1,63 @@
+"""Tables and files of results."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+COLUMNS = (
+    ("collision_rate", "collisions\n% of rollouts", 2),
+    ("offroad_time", "off-road\n% of time", 2),
+    ("ade", "ADE\nm", 2),
+    ("min_sade", "minSADE\nm", 2),
+    ("curvature_jsd", "curvature\nJSD, nats", 3),
+)
+
+
+def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
+    """Print results of agents as one table, standard errors beside the numbers."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("agent", title=escape(title) or None, title_justify="left")
+    for _, heading, _ in COLUMNS:
+        table.add_column(heading, justify="right")
+    for row in rows:
+        cells = [_cell(row[name], row.get(f"{name}_se"), digits) for name, _, digits in COLUMNS]
+        table.add_row(escape(str(row["agent"])), *cells)
+    console = Console()
+    console.print(table)
+    first = rows[0]
+    most = max(row["rollouts"] for row in rows)
+    console.print(
+        f"{first['segments']} run segments, {first['interactive']} interactive agents each, up to {most} "
+        f"rollouts; ± standard error over segments; seed {first['seed']}",
+        style="dim",
+    )
+
+
+def _cell(value: float, error: float | None, digits: int) -> str:
+    if math.isnan(value):
+        return "–"
+    text = f"{value:.{digits}f}"
+    return text if error is None or math.isnan(error) else f"{text} ± {error:.{digits}f}"
+
+
+def write_json(path: Path, result: Any) -> None:
+    """Write a result as JSON; numbers that are not finite become null."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(_finite(result), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,1 @@
+"""Run segments, their readers and the store on disk."""

@@ -1,0 +1,165 @@
+"""Changing a run segment's time step, and smoothing noisy logs.
+
+Both are choices of the one who prepares the data; readers keep to the log.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import RunSegment, validate
+from symphony.errors import ConfigError
+
+Doubles = NDArray[np.float64]
+
+SLOW, FAST = 1.0, 2.0
+"""m/s between which the heading goes over from the logged one to the direction of motion when smoothing."""
+
+
+def resample(segment: RunSegment, dt: float) -> RunSegment:
+    """The same segment at another time step, beginning at the same moment.
+
+    Where ``dt`` is a whole multiple of the segment's own step (10 Hz to 5 Hz), steps are picked and nothing is
+    computed. Otherwise positions and velocities are interpolated linearly, and headings along the shorter arc,
+    between two neighbouring valid steps; an agent is valid where both are. A light keeps the state of the latest
+    logged step, and ``current_step`` becomes the latest new step not after the old one.
+
+    Args:
+        segment: a valid segment.
+        dt: seconds between the new steps.
+
+    Raises:
+        ConfigError: ``dt`` is not positive.
+        DataError: fewer than two steps would remain, or the ego would be valid at none.
+    """
+    if not (np.isfinite(dt) and dt > 0):
+        raise ConfigError(f"dt must be positive, is {dt}")
+    ratio = dt / segment.dt
+    every = round(ratio)
+    if every >= 1 and abs(ratio - every) < 1e-6 * every:
+        return validate(_pick(segment, every, dt))
+    return validate(_interpolate(segment, ratio, dt))
+
+
+def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
+    return segment.replace(
+        dt=dt,
+        position=segment.position[:, ::every].copy(),
+        heading=segment.heading[:, ::every].copy(),
+        velocity=segment.velocity[:, ::every].copy(),
+        valid=segment.valid[:, ::every].copy(),
+        signal_state=segment.signal_state[:, ::every].copy(),
+        current_step=segment.current_step // every,
+    )
+
+
+def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
+    last = segment.num_steps - 1
+    where = np.arange(int(np.floor(last / ratio + 1e-6)) + 1) * ratio
+    before = np.minimum(np.floor(where + 1e-6).astype(np.int64), last)
+    share = np.clip(where - before, 0, 1)
+    share[share < 1e-6] = 0
+    # A moment that coincides with a logged step needs no second neighbour.
+    after = np.where(share > 0, np.minimum(before + 1, last), before)
+    valid = segment.valid[:, before] & segment.valid[:, after]
+
+    def between(array: NDArray[Any]) -> Doubles:
+        part = share.reshape(1, -1, *[1] * (array.ndim - 2))
+        first, second = array[:, before].astype(np.float64), array[:, after].astype(np.float64)
+        return first + part * (second - first)
+
+    heading = segment.heading.astype(np.float64)
+    turn = wrap(heading[:, after] - heading[:, before])
+    return segment.replace(
+        dt=dt,
+        position=_masked(between(segment.position), valid),
+        heading=_masked(heading[:, before] + share * turn, valid),
+        velocity=_masked(between(segment.velocity), valid),
+        valid=valid,
+        signal_state=segment.signal_state[:, before],
+        current_step=max(int(np.searchsorted(where, segment.current_step + 1e-6, side="right")) - 1, 0),
+    )
+
+
+def smooth(segment: RunSegment, sigma: float) -> RunSegment:
+    """Remove position noise with a Gaussian window (NGSIM: 0.3 to 0.5 s before actions are fitted).
+
+    Each position becomes the value, and each velocity the slope, of a straight line fitted to the agent's valid
+    positions with Gaussian weights in time, out to 4 sigma. Inside a track that is a Gaussian filter; unlike one
+    it does not pull a moving agent inwards at the ends of its track or beside gaps. Above 2 m/s the heading
+    becomes the direction of motion (or its opposite, for an agent that reverses), below 1 m/s it is the logged
+    one, smoothed likewise, and in between it goes over from one to the other. A track of a single valid step,
+    and the validity of all, stay as they are.
+
+    Args:
+        segment: a valid segment.
+        sigma: standard deviation of the window in seconds; 0 changes nothing.
+
+    Raises:
+        ConfigError: ``sigma`` is negative or not finite.
+    """
+    if not (np.isfinite(sigma) and sigma >= 0):
+        raise ConfigError(f"sigma must not be negative, is {sigma}")
+    if sigma == 0:
+        return segment
+    valid = segment.valid
+    position, slope, fitted = _local_line(segment.position.astype(np.float64), valid, segment.dt, sigma)
+    velocity = np.where(fitted[..., None], slope[..., :2], segment.velocity)
+    logged = segment.heading.astype(np.float64)
+    steady, _, _ = _local_line(_unwrapped(logged, valid)[..., None], valid, segment.dt, sigma)
+    steady = steady[..., 0]
+    speed = np.hypot(velocity[..., 0], velocity[..., 1])
+    turn = wrap(np.arctan2(velocity[..., 1], velocity[..., 0]) - steady)
+    turn = np.where(np.abs(turn) > np.pi / 2, wrap(turn + np.pi), turn)
+    share = np.clip((speed - SLOW) / (FAST - SLOW), 0, 1)
+    # Unwrapping must not show: the result stays on the logged heading's branch.
+    heading = logged + wrap(steady + share * turn - logged)
+    return dataclasses.replace(
+        segment,
+        position=_masked(position, valid),
+        velocity=_masked(velocity, valid),
+        heading=_masked(np.where(fitted, heading, logged), valid),
+    )
+
+
+def _local_line(
+    values: Doubles, valid: NDArray[np.bool_], dt: float, sigma: float
+) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+    """(value, slope, where a line could be fitted) at each step, of values [A, T, D]; values elsewhere."""
+    lag = (np.arange(valid.shape[1])[None] - np.arange(valid.shape[1])[:, None]) * dt
+    weight = np.where(np.abs(lag) <= 4 * sigma, np.exp(-0.5 * (lag / sigma) ** 2), 0.0)
+    there = valid.astype(np.float64)
+    # Offsets from the agent's mean keep the sums small, so that nothing is lost to cancellation.
+    total = np.maximum(there.sum(axis=1), 1)[:, None, None]
+    mean = (values * there[..., None]).sum(axis=1, keepdims=True) / total
+    masked = (values - mean) * there[..., None]
+    s0, s1, s2 = (there @ (weight * lag**k).T for k in range(3))
+    y0, y1 = (np.einsum("ts,asd->atd", weight * lag**k, masked) for k in range(2))
+    spread = s0 * s2 - s1**2
+    fitted = valid & (spread > 1e-9 * s0**2 * sigma**2)
+    safe = np.where(fitted, spread, 1.0)[..., None]
+    value = (s2[..., None] * y0 - s1[..., None] * y1) / safe + mean
+    slope = (s0[..., None] * y1 - s1[..., None] * y0) / safe
+    return np.where(fitted[..., None], value, values), np.where(fitted[..., None], slope, 0.0), fitted
+
+
+def _unwrapped(heading: Doubles, valid: NDArray[np.bool_]) -> Doubles:
+    """[A, T] headings without jumps of 2π between an agent's successive valid steps."""
+    result = heading.copy()
+    for agent in np.flatnonzero(valid.any(axis=1)):
+        result[agent, valid[agent]] = np.unwrap(heading[agent, valid[agent]])
+    return result
+
+
+def wrap(angle: Doubles) -> Doubles:
+    """The same angles in [-π, π)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _masked(array: Doubles, valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    mask = valid.reshape(*valid.shape, *[1] * (array.ndim - 2))
+    return np.where(mask, array, 0).astype(np.float32)

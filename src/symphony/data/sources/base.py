@@ -1,0 +1,83 @@
+"""What every reader of a log format offers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import Floats, RunSegment, validate
+from symphony.errors import DataError
+
+Item = RunSegment | DataError
+"""One record of a file: a valid run segment, or why there is none."""
+
+
+class Reader(ABC):
+    """Turns the files of one format into run segments at the log's own rate.
+
+    Attributes:
+        name: name of the format, also :attr:`RunSegment.source`.
+        patterns: file-name patterns the format's files go by, for searching a folder.
+    """
+
+    name: ClassVar[str]
+    patterns: ClassVar[tuple[str, ...]]
+
+    def read(self, path: str | Path) -> Iterator[Item]:
+        """Yield one item per record of a file, in file order; never raises :class:`DataError`.
+
+        A record that can't be used is yielded as an error naming file, segment (where known) and field, so
+        that the caller can count it and go on. Where the rest of the file can't be read, such an error comes
+        last.
+        """
+        path = Path(path)
+        try:
+            if path.is_dir():
+                raise DataError("is a folder, expected a file", file=path)
+            for item in self._read(path):
+                yield self._checked(item, path)
+        except DataError as error:
+            yield error.at(file=path)
+        except OSError as error:
+            yield DataError(f"can't be read: {error.strerror or error}", file=path)
+
+    @staticmethod
+    def _checked(item: Item, path: Path) -> Item:
+        if isinstance(item, DataError):
+            return item.at(file=path)
+        try:
+            return validate(item)
+        except DataError as error:
+            return DataError(error.message, file=path, segment=error.segment, field=error.field)
+
+    @abstractmethod
+    def _read(self, path: Path) -> Iterator[Item]:
+        """Yield the records, not validated yet; may raise :class:`DataError` where it can't read on."""
+
+
+def to_float32(array: NDArray[np.float64]) -> Floats:
+    """Narrow, letting numbers out of range become infinite (validation reports them) without a warning."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(array).astype(np.float32)
+
+
+def codes(values: NDArray[np.int64], count: int, field: str) -> NDArray[np.uint8]:
+    """Enumeration values as uint8.
+
+    Raises:
+        DataError: a value is outside 0 … count - 1.
+    """
+    bad = np.unique(values[(values < 0) | (values >= count)])
+    if len(bad):
+        raise DataError(f"unknown value {bad[0]}, expected 0 … {count - 1}", field=field)
+    return values.astype(np.uint8)
+
+
+def pairs(links: list[tuple[int, int]]) -> NDArray[np.int32]:
+    """[E, 2] int32 without repeats, in order of first appearance."""
+    return np.array(list(dict.fromkeys(links)), np.int32).reshape(-1, 2)

@@ -1,0 +1,90 @@
+"""Simulated driving from SUMO: random networks and traffic, cut into run segments.
+
+SUMO's programs come with the optional extra ``symphony[sumo]`` and run as subprocesses in a temporary folder.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from symphony.data.segment import RunSegment
+from symphony.data.sources.sumo.demand import write_demand
+from symphony.data.sources.sumo.extract import DT, RULES, STATES, CropRule, cut_segments
+from symphony.data.sources.sumo.networks import NETWORKS
+from symphony.data.sources.sumo.process import sumo_home
+from symphony.data.sources.sumo.roads import read_network
+from symphony.data.sources.sumo.simulate import simulate
+from symphony.errors import ConfigError
+
+__all__ = ["DT", "KINDS", "STATES", "CropRule", "Generated", "generate", "generate_run", "sumo_home"]
+
+KINDS = tuple(NETWORKS)
+"""Kinds of network that :func:`generate` knows."""
+WARM_UP = 30.0
+"""Simulated seconds before the first segment starts."""
+SUBLANE_SHARE = 1 / 3
+
+
+@dataclass(frozen=True)
+class Generated:
+    """One simulation's segments.
+
+    Attributes:
+        segments: those accepted.
+        reasons: how many windows gave none, and why.
+    """
+
+    segments: list[RunSegment]
+    reasons: Counter[str] = field(default_factory=Counter)
+
+
+def generate(
+    kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None
+) -> list[RunSegment]:
+    """Make one network, simulate its traffic once and cut run segments of 10 s at 5 Hz out of it.
+
+    The light of a movement is attached to the connector lane inside the junction, which only that movement
+    takes; its stop point is the end of the lane before. Equal arguments give equal segments.
+
+    Args:
+        kind: one of :data:`KINDS`.
+        seed: of every random choice; another seed is another network.
+        duration: recorded seconds, after :data:`WARM_UP`.
+        rule: how maps and egos are chosen; the kind's own where not given.
+
+    Returns:
+        Validated segments; those of one focus share one map object.
+
+    Raises:
+        ConfigError: unknown kind, a bad duration or seed.
+        DataError: SUMO is not installed or failed (with its message).
+    """
+    return generate_run(kind, seed, duration, rule=rule).segments
+
+
+def generate_run(kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None) -> Generated:
+    """As :func:`generate`, with the reasons for which windows were left out."""
+    if kind not in NETWORKS:
+        raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
+    if not duration >= STATES * DT:
+        raise ConfigError(f"duration must be at least {STATES * DT:.1f} s, is {duration}")
+    if seed < 0:
+        raise ConfigError(f"seed must not be negative, is {seed}")
+    roads_rng, demand_rng, drive_rng, cut_rng = (
+        np.random.default_rng(s) for s in np.random.SeedSequence([seed, KINDS.index(kind)]).spawn(4)
+    )
+    with tempfile.TemporaryDirectory(prefix="symphony-sumo-") as name:
+        folder = Path(name)
+        file = NETWORKS[kind](roads_rng, folder)
+        network = read_network(file)
+        sublane = bool(drive_rng.random() < SUBLANE_SHARE)
+        end = WARM_UP + duration
+        demand = write_demand(network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane)
+        traffic = simulate(file, network, demand, drive_rng, end, WARM_UP, sublane=sublane)
+    segments, reasons = cut_segments(f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule or RULES[kind])
+    return Generated(segments, reasons)

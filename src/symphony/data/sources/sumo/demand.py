@@ -1,0 +1,115 @@
+"""Vehicles: a mix of drivers and bodies, and random walks through the network as routes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.sources.sumo.roads import Network
+
+# Share, (least, most) length, width and height in metres, SUMO's vehicle class.
+_BODIES = (
+    (0.78, (4.0, 5.1), (1.72, 1.95), (1.4, 1.8), "passenger"),
+    (0.12, (5.2, 6.2), (1.95, 2.1), (2.0, 2.6), "delivery"),
+    (0.07, (7.0, 9.5), (2.2, 2.45), (2.8, 3.6), "truck"),
+    (0.03, (10.5, 12.0), (2.45, 2.55), (3.0, 3.4), "bus"),
+)
+_DRIVERS = ("IDM", "EIDM", "Krauss")
+TYPES = 24
+DEPART_WITHIN = 15.0
+"""Seconds in which the vehicles of a closed network enter it."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What was asked of SUMO: vehicle k (its id in SUMO) has the box ``size[k]`` (length, width, height)."""
+
+    file: Path
+    size: NDArray[np.float32]
+
+
+def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], NDArray[np.float32], NDArray[np.float64]]:
+    """XML, boxes [TYPES, 3] and shares [TYPES] of the vehicle types."""
+    # At least one type per body, so that a run's mix has all of them.
+    bodies = np.concatenate([np.arange(len(_BODIES)), rng.choice([0, 0, 0, 0, 1, 2], TYPES - len(_BODIES))])
+    counts = np.bincount(bodies, minlength=len(_BODIES))
+    lines, sizes, shares = [], [], []
+    for k, body in enumerate(bodies):
+        share, length, width, height, name = _BODIES[body]
+        size = [rng.uniform(*length), rng.uniform(*width), rng.uniform(*height)]
+        heavy = 0.75 if body >= 2 else 1.0
+        tau = float(np.clip(rng.normal(1.3, 0.3), 0.9, 2.2))
+        extra = ' latAlignment="center" maxSpeedLat="0.8"' if sublane else ""
+        lines.append(
+            f'<vType id="t{k}" vClass="{name}" length="{size[0]:.2f}" width="{size[1]:.2f}" '
+            f'height="{size[2]:.2f}" carFollowModel="{rng.choice(_DRIVERS)}" sigma="{rng.uniform(0.1, 0.5):.2f}" '
+            f'speedFactor="normc(0.98,0.08,0.6,1.3)" tau="{tau:.2f}" accel="{heavy * rng.uniform(1.6, 2.9):.2f}" '
+            f'decel="{rng.uniform(2.8, 4.2):.2f}" minGap="{rng.uniform(1.6, 3.2):.2f}"{extra}/>'
+        )
+        sizes.append(np.round(size, 2))
+        shares.append(share / counts[body])
+    return lines, np.asarray(sizes, np.float32), np.asarray(shares) / np.sum(shares)
+
+
+def _walk(
+    rng: np.random.Generator, start: int, following: list[list[int]], length: NDArray[np.float64], reach: float
+) -> list[int]:
+    """Edges of a random walk (uniform among the edges that follow) until it is ``reach`` metres long or ends."""
+    route, total = [start], float(length[start])
+    while total < reach and following[route[-1]]:
+        route.append(following[route[-1]][int(rng.integers(len(following[route[-1]])))])
+        total += float(length[route[-1]])
+    return route
+
+
+def write_demand(
+    network: Network, rng: np.random.Generator, folder: Path, duration: float, *, through: bool, sublane: bool
+) -> Demand:
+    """Write vehicle types and vehicles with their routes.
+
+    Args:
+        network: the roads.
+        rng: source of every random choice.
+        folder: where ``traffic.rou.xml`` is written.
+        duration: simulated seconds that the routes must last.
+        through: traffic enters at the sources of the network during the whole run and leaves it at the end;
+            else a fixed number of vehicles starts everywhere and circulates.
+        sublane: the run uses the sublane model.
+    """
+    types, sizes, shares = _types(rng, sublane)
+    following, length, lanes = network.edge_graph()
+    speed = network.edge_speed()
+    if through:
+        # Sources are edges nothing leads into; each lane carries 600-1 300 vehicles per hour.
+        entered = {edge for edges in following for edge in edges}
+        sources = [edge for edge in range(len(length)) if edge not in entered]
+        departs, starts = [], []
+        for edge in sources:
+            flow = lanes[edge] * rng.uniform(600, 1300) / 3600
+            times = np.cumsum(rng.exponential(1 / flow, int(flow * duration * 1.5) + 5))
+            departs += times[times < duration].tolist()
+            starts += [edge] * int((times < duration).sum())
+        place = 'departPos="base" departLane="best" departSpeed="avg"'
+    else:
+        count = max(8, round(float((lanes * length).sum()) / 1000 * rng.uniform(6, 15)))
+        departs = rng.uniform(0, DEPART_WITHIN, count).tolist()
+        weight = lanes * length
+        starts = rng.choice(len(length), count, p=weight / weight.sum()).tolist()
+        place = 'departPos="random_free" departLane="best" departSpeed="speedLimit"'
+    order = np.argsort(departs, kind="stable")
+    kinds = rng.choice(TYPES, len(order), p=shares)
+    lines = ["<routes>", *types]
+    for k, i in enumerate(order):
+        reach = (duration - departs[i] + 30) * float(speed.max())
+        route = _walk(rng, starts[i], following, length, reach)
+        edges = " ".join(network.edge_names[e] for e in route)
+        lines.append(
+            f'<vehicle id="{k}" type="t{kinds[k]}" depart="{departs[i]:.2f}" {place}>'
+            f'<route edges="{edges}"/></vehicle>'
+        )
+    file = folder / "traffic.rou.xml"
+    file.write_text("\n".join([*lines, "</routes>"]))
+    return Demand(file, sizes[kinds])

@@ -1,0 +1,253 @@
+"""Cutting run segments out of a simulation, and leaving out those that are not physical."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from symphony.data.segment import AgentType, RunSegment, validate
+from symphony.data.selection import MOVING
+from symphony.data.sources.sumo.roads import Crop, Network, crop_network
+from symphony.data.sources.sumo.simulate import STEP, Traffic
+
+DT = 0.2
+STATES = 51
+"""Steps of a segment: 10 s, that is 50 decisions after the first state."""
+EVERY = round(DT / STEP)
+
+MAX_OVERLAP = 0.05
+MAX_ACCELERATION = 7.5
+MAX_YAW_RATE = 1.6
+MAX_LATERAL_SPEED = 1.5
+_EGO_TRAVEL = 8.0
+_MIN_STEPS = 5
+_TURN, _NEAR, _SPEED_CHANGE = 0.5, 6.0, 4.0
+
+
+@dataclass(frozen=True)
+class CropRule:
+    """How maps and egos are chosen.
+
+    Attributes:
+        radius: metres around the focus that the map covers.
+        ego_radius: metres within which the ego stays throughout, so that road lies ahead of it.
+        agent_radius: metres within which other vehicles are seen.
+        partner_distance: metres from the ego to the nearest other vehicle that moves, at the first step.
+        focuses: how many points of the network, at most.
+        per_focus: how many segments share one map, at most.
+    """
+
+    radius: float = 110.0
+    ego_radius: float = 78.0
+    agent_radius: float = 95.0
+    partner_distance: float = 40.0
+    focuses: int = 6
+    per_focus: int = 12
+
+
+RULES = {
+    "town": CropRule(),
+    "grid": CropRule(),
+    "ramp": CropRule(radius=190, ego_radius=165, agent_radius=180, focuses=4),
+}
+"""Defaults per kind of network: freeways need longer maps for the same ten seconds."""
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Traffic at the steps of segments, shapes as in :class:`Traffic`; ``unphysical`` is [V, N]."""
+
+    position: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    present: NDArray[np.bool_]
+    unphysical: NDArray[np.bool_]
+    size: NDArray[np.float32]
+    lights: dict[str, NDArray[np.uint8]]
+
+
+def cut_segments(
+    name: str, network: Network, traffic: Traffic, rng: np.random.Generator, rule: CropRule
+) -> tuple[list[RunSegment], Counter[str]]:
+    """Cut ten-second segments, one ego each, from windows that do not overlap at each focus.
+
+    Segments of one focus share one :class:`RoadMap` object and one origin.
+
+    Args:
+        name: start of the segments' names.
+        network: the roads.
+        traffic: the simulation.
+        rng: source of every random choice.
+        rule: how maps and egos are chosen.
+
+    Returns:
+        The segments, and why windows gave none.
+    """
+    tracks = _at_steps(traffic)
+    segments: list[RunSegment] = []
+    reasons: Counter[str] = Counter()
+    for focus, center in enumerate(_focuses(network, rng, rule)):
+        crop = crop_network(network, center, rule.radius)
+        shapely.prepare(crop.drivable)
+        found = 0
+        offset = int(rng.integers(0, STATES // 2))
+        for window, start in enumerate(range(offset, tracks.present.shape[1] - STATES + 1, STATES)):
+            if found == rule.per_focus:
+                break
+            result = _cut(f"{name}-f{focus}-w{window:02d}", crop, tracks, start, rng, rule)
+            if isinstance(result, str):
+                reasons[result] += 1
+            else:
+                segments.append(result)
+                found += 1
+    return segments, reasons
+
+
+def _focuses(network: Network, rng: np.random.Generator, rule: CropRule) -> list[NDArray[np.float64]]:
+    """Junctions, rounded to metres, at least half a radius apart."""
+    chosen: list[NDArray[np.float64]] = []
+    for center in np.round(rng.permutation(network.centers)):
+        near = [float(np.linalg.norm(center - other)) < rule.radius / 2 for other in chosen]
+        if len(chosen) < rule.focuses and not any(near):
+            chosen.append(center)
+    return chosen
+
+
+def _at_steps(traffic: Traffic) -> _Tracks:
+    velocity, heading = traffic.velocity, traffic.heading
+    with np.errstate(invalid="ignore"):
+        # Over 0.2 s, as the limits were measured.
+        acceleration = (velocity[:, EVERY:] - velocity[:, :-EVERY]) / DT
+        yaw_rate = (heading[:, EVERY:] - heading[:, :-EVERY]) / DT
+        sideways = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)
+        wild = np.abs(sideways) > MAX_LATERAL_SPEED
+        wild[:, EVERY:] |= np.linalg.norm(acceleration, axis=-1) > MAX_ACCELERATION
+        wild[:, EVERY:] |= np.abs(yaw_rate) > MAX_YAW_RATE
+    pick = slice(None, None, EVERY)
+    return _Tracks(
+        traffic.position[:, pick],
+        heading[:, pick],
+        velocity[:, pick],
+        traffic.present[:, pick],
+        wild[:, pick],
+        traffic.size,
+        {light: states[:, pick] for light, states in traffic.lights.items()},
+    )
+
+
+def _cut(
+    name: str, crop: Crop, tracks: _Tracks, start: int, rng: np.random.Generator, rule: CropRule
+) -> RunSegment | str:
+    """One segment, or why there is none."""
+    window = slice(start, start + STATES)
+    position = tracks.position[:, window] - crop.center
+    away = np.linalg.norm(position, axis=-1)
+    with np.errstate(invalid="ignore"):
+        valid = tracks.present[:, window] & (away <= rule.agent_radius)
+        stays = valid.all(1) & (away <= rule.ego_radius).all(1)
+    agents = np.flatnonzero(valid.sum(1) >= _MIN_STEPS)
+    if not stays[agents].any():
+        return "no vehicle stays near the focus"
+    position, valid, stays = position[agents], valid[agents], stays[agents]
+    heading, velocity = tracks.heading[agents, window], tracks.velocity[agents, window]
+    size = tracks.size[agents]
+    travel = _travel(position, valid)
+    weight = _interest(position, heading, velocity, valid, travel, rule) * (stays & (travel > _EGO_TRAVEL))
+    if weight.sum() == 0:
+        return "no moving ego with a moving partner"
+    if (tracks.unphysical[agents, window] & valid).any():
+        return "unphysical motion"
+    if _overlap(position, heading, size, valid, travel > MOVING):
+        return "overlap"
+    if not shapely.contains_xy(crop.drivable, *position[valid].T).all():
+        return "off the road"
+    ego = int(rng.choice(len(agents), p=weight / weight.sum()))
+    lights = [tracks.lights[light][link, window] for light, link in crop.signals]
+    mask = valid[..., None]
+    # Unwrapped since the vehicle appeared; whole turns before the window mean nothing here.
+    turns = np.round(np.nan_to_num(heading[np.arange(len(agents)), valid.argmax(1)]) / (2 * np.pi))
+    heading = heading - 2 * np.pi * turns[:, None]
+    return validate(
+        RunSegment(
+            segment_id=f"{name}-v{agents[ego]}",
+            source="sumo",
+            dt=DT,
+            ego=ego,
+            agent_id=agents.astype(np.int64),
+            agent_type=np.full(len(agents), AgentType.VEHICLE, np.uint8),
+            size=size,
+            position=np.where(mask, np.pad(position, ((0, 0), (0, 0), (0, 1))), 0).astype(np.float32),
+            heading=np.where(valid, heading, 0).astype(np.float32),
+            velocity=np.where(mask, velocity, 0).astype(np.float32),
+            valid=valid,
+            road=crop.road,
+            signal_lane=crop.signal_lane,
+            signal_point=crop.signal_point,
+            signal_state=np.array(lights, np.uint8).reshape(len(lights), STATES),
+            origin=np.array([*crop.center, 0.0]),
+        )
+    )
+
+
+def _travel(position: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """[A] the farthest each vehicle gets from where it is first seen."""
+    first = position[np.arange(len(position)), valid.argmax(1)]
+    away = np.linalg.norm(position - first[:, None], axis=-1)
+    return np.where(valid, away, 0).max(1)
+
+
+def _interest(
+    position: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    travel: NDArray[np.float64],
+    rule: CropRule,
+) -> NDArray[np.float64]:
+    """[A] chance of being the ego: turning, closeness to others and changes of speed count; 0 without partner."""
+    distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
+    distance = np.where(valid[:, None] & valid[None], distance, np.inf)
+    distance[np.arange(len(position)), np.arange(len(position))] = np.inf
+    partner = valid.all(1) & (travel > MOVING)
+    has_partner = (distance[:, partner, 0] < rule.partner_distance).any(1)
+    whole = valid.all(1)
+    speed = np.where(whole[:, None], np.linalg.norm(velocity, axis=-1), 0)
+    turns = np.where(whole, np.abs(heading[:, -1] - heading[:, 0]), 0) > _TURN
+    near = distance.min((1, 2)) < _NEAR
+    changes = speed.max(1) - speed.min(1) > _SPEED_CHANGE
+    return has_partner * (0.3 + 1.2 * turns + 0.5 * near + 0.5 * changes)
+
+
+def _overlap(
+    position: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    size: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    moving: NDArray[np.bool_],
+) -> bool:
+    """Whether the boxes of two vehicles, one of them moving, ever share more than :data:`MAX_OVERLAP` metres."""
+    first, second = np.triu_indices(len(position), 1)
+    keep = moving[first] | moving[second]
+    first, second = first[keep], second[keep]
+    half = size[:, :2].astype(np.float64) / 2
+    reach = np.linalg.norm(half, axis=-1)
+    gap = np.linalg.norm(position[first] - position[second], axis=-1)
+    close = valid[first] & valid[second] & (np.nan_to_num(gap, nan=np.inf) < (reach[first] + reach[second])[:, None])
+    pair, step = np.nonzero(close)
+    a, b = first[pair], second[pair]
+    between = position[b, step] - position[a, step]
+    depth = np.full(len(pair), np.inf)
+    for owner in (a, b):
+        for turn in (0.0, np.pi / 2):
+            angle = heading[owner, step] + turn
+            axis = np.stack([np.cos(angle), np.sin(angle)], -1)
+            extent = np.zeros(len(pair))
+            for box in (a, b):
+                relative = heading[box, step] - angle
+                extent += half[box, 0] * np.abs(np.cos(relative)) + half[box, 1] * np.abs(np.sin(relative))
+            depth = np.minimum(depth, extent - np.abs((between * axis).sum(-1)))
+    return bool((depth > MAX_OVERLAP).any())

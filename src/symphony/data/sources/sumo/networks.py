@@ -1,0 +1,363 @@
+"""Random road networks, written as plain XML and compiled by ``netconvert`` or made by ``netgenerate``.
+
+All networks are for driving on the right. Every random choice comes from the generator that is passed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.sources.sumo.process import run_program
+
+Point = NDArray[np.float64]
+_COMMON = [
+    "--no-turnarounds",
+    "true",
+    "--junctions.corner-detail",
+    "8",
+    "--junctions.internal-link-detail",
+    "20",
+    "--junctions.limit-turn-speed",
+    "3.5",
+    "--default.connection.cont-pos",
+    "0",
+    "--tls.yellow.time",
+    "3",
+    "--tls.allred.time",
+    "2",
+    "--no-warnings",
+    "true",
+]
+
+
+@dataclass
+class PlainNetwork:
+    """Nodes, edges and explicit connections, as lines of SUMO's plain XML."""
+
+    nodes: list[str] = field(default_factory=list)
+    edges: list[str] = field(default_factory=list)
+    connections: list[str] = field(default_factory=list)
+
+    def node(self, name: str, point: Point, control: str, radius: float | None = None) -> None:
+        """Add a junction."""
+        size = "" if radius is None else f' radius="{radius:.2f}"'
+        self.nodes.append(f'<node id="{name}" x="{point[0]:.2f}" y="{point[1]:.2f}" type="{control}"{size}/>')
+
+    def edge(
+        self,
+        start: str,
+        end: str,
+        *,
+        lanes: int,
+        speed: float,
+        width: float,
+        priority: int,
+        shape: Point | None = None,
+        spread: str = "right",
+    ) -> str:
+        """Add a one-way edge and return its id."""
+        name = f"{start}_{end}"
+        points = "" if shape is None else " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
+        line = f' shape="{points}"' if points else ""
+        self.edges.append(
+            f'<edge id="{name}" from="{start}" to="{end}" numLanes="{lanes}" speed="{speed:.2f}" '
+            f'width="{width:.2f}" priority="{priority}" spreadType="{spread}"{line}/>'
+        )
+        return name
+
+    def connect(self, start: str, end: str, pairs: list[tuple[int, int]]) -> None:
+        """Allow exactly these lane-to-lane connections between two edges."""
+        self.connections += [
+            f'<connection from="{start}" to="{end}" fromLane="{i}" toLane="{j}"/>' for i, j in pairs
+        ]
+
+    def compile(self, folder: Path, options: list[str]) -> Path:
+        """Write the XML and run ``netconvert``; returns the network file."""
+        arguments = ["--output-file", "net.net.xml", *_COMMON, *options]
+        parts = (
+            ("node", "nodes", self.nodes),
+            ("edge", "edges", self.edges),
+            ("connection", "connections", self.connections),
+        )
+        for kind, root, lines in parts:
+            if lines:
+                (folder / f"net.{kind[:3]}.xml").write_text("\n".join([f"<{root}>", *lines, f"</{root}>"]))
+                arguments += [f"--{kind}-files", f"net.{kind[:3]}.xml"]
+        run_program("netconvert", arguments, folder)
+        return folder / "net.net.xml"
+
+
+def _signal_layout(rng: np.random.Generator) -> str:
+    # "opposites" makes left turns wait for gaps; with it alone, dense junctions lock up.
+    return "opposites" if rng.random() < 0.25 else "incoming"
+
+
+# Towns ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A two-way street between nodes a and b; its centre line runs from a to b."""
+
+    a: int
+    b: int
+    line: Point
+    arterial: bool
+
+
+def _town_links(rng: np.random.Generator, columns: int, rows: int) -> list[tuple[int, int]]:
+    """Neighbouring nodes of the grid, some pairs dropped while every node keeps two streets and all connect."""
+    index = np.arange(columns * rows).reshape(rows, columns)
+    across = zip(index[:, :-1].ravel(), index[:, 1:].ravel(), strict=True)
+    down = zip(index[:-1].ravel(), index[1:].ravel(), strict=True)
+    every = [(int(a), int(b)) for a, b in [*across, *down]]
+    pairs, to_drop = list(every), round(0.18 * len(every))
+    for k in rng.permutation(len(every)):
+        trial = [p for p in pairs if p != every[k]]
+        enough = np.bincount(np.ravel(trial), minlength=index.size).min() >= 2
+        if to_drop > 0 and enough and _connected(trial, index.size):
+            pairs, to_drop = trial, to_drop - 1
+    return pairs
+
+
+def _connected(pairs: list[tuple[int, int]], count: int) -> bool:
+    label = np.arange(count)
+    for _ in range(count):
+        before = label.copy()
+        for a, b in pairs:
+            label[a] = label[b] = min(label[a], label[b])
+        if (label == before).all():
+            break
+    return bool((label == 0).all())
+
+
+def _bezier(start: Point, end: Point, bend: Point, count: int = 12) -> Point:
+    """Cubic curve [count, 2] from start to end whose two control points are moved sideways by ``bend``."""
+    along = end - start
+    normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    first, second = start + along / 3 + normal * bend[0], start + 2 * along / 3 + normal * bend[1]
+    t = np.linspace(0, 1, count)[:, None]
+    return (1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * first + 3 * t**2 * (1 - t) * second + t**3 * end
+
+
+def town(rng: np.random.Generator, folder: Path) -> Path:
+    """A jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts."""
+    columns, rows = int(rng.integers(3, 6)), int(rng.integers(3, 5))
+    step = rng.uniform(75, 115, 2)
+    gx, gy = np.meshgrid(np.arange(columns), np.arange(rows))
+    flat = np.stack([gx.ravel() * step[0], gy.ravel() * step[1]], -1)
+    flat += rng.normal(0, 9, flat.shape).clip(-18, 18)
+    turn = rng.uniform(0, 2 * np.pi)
+    spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    nodes = flat @ spin.T
+    main_rows = set(rng.choice(rows, 1 + (rows > 3), replace=False).tolist())
+    main_columns = set(rng.choice(columns, 1, replace=False).tolist())
+
+    def is_main(a: int, b: int) -> bool:
+        same_row, same_column = a // columns == b // columns, a % columns == b % columns
+        return (same_row and a // columns in main_rows) or (same_column and a % columns in main_columns)
+
+    links = []
+    for a, b in _town_links(rng, columns, rows):
+        sideways = rng.normal(0, 9, 2).clip(-16, 16) * (rng.random() < 0.6)
+        links.append(_Link(a, b, _bezier(nodes[a], nodes[b], sideways), is_main(a, b)))
+
+    net = PlainNetwork()
+    rings = _add_nodes(net, rng, nodes, links)
+    width = rng.uniform(3.2, 3.7)
+    arterial_speed, collector_speed = rng.choice([13.89, 15.65, 16.67]), rng.choice([8.94, 11.18, 13.41])
+    arterial_lanes, collector_lanes = int(rng.choice([2, 2, 3])), int(rng.choice([1, 1, 2]))
+    for link in links:
+        lanes = arterial_lanes if link.arterial else collector_lanes
+        speed = arterial_speed if link.arterial else collector_speed
+        line, start, end = link.line, f"n{link.a}", f"n{link.b}"
+        if link.a in rings:
+            start, line = rings[link.a].enter(start, line)
+        if link.b in rings:
+            end, line = rings[link.b].enter(end, line[::-1])
+            line = line[::-1]
+        priority = 5 if link.arterial else 3
+        net.edge(start, end, lanes=lanes, speed=speed, width=width, priority=priority, shape=line)
+        net.edge(end, start, lanes=lanes, speed=speed, width=width, priority=priority, shape=line[::-1])
+    for name, ring in rings.items():
+        ring.write(net, f"n{name}", width + 0.8)
+    options = ["--tls.layout", _signal_layout(rng), "--default.junctions.radius", f"{rng.uniform(5, 10):.2f}"]
+    return net.compile(folder, options)
+
+
+@dataclass
+class _Ring:
+    """A roundabout around a point; streets are cut where they meet it."""
+
+    center: Point
+    radius: float
+    arms: list[tuple[float, str]] = field(default_factory=list)
+
+    def enter(self, name: str, line: Point) -> tuple[str, Point]:
+        """Cut a line that starts at the centre where it leaves the ring; returns the ring's node and the rest."""
+        outside = np.linalg.norm(line - self.center, axis=-1) > self.radius + 6
+        rest = line[int(np.argmax(outside)) :]
+        towards = rest[0] - self.center
+        angle = float(np.arctan2(towards[1], towards[0]))
+        arm = f"{name}r{len(self.arms)}"
+        self.arms.append((angle, arm))
+        return arm, np.concatenate([[self._at(angle)], rest])
+
+    def _at(self, angle: float | NDArray[np.float64]) -> Point:
+        return self.center + self.radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+
+    def write(self, net: PlainNetwork, name: str, width: float) -> None:
+        """Add the ring's junctions and its one-way edges, counter-clockwise."""
+        arms = sorted(self.arms)
+        names = []
+        for (angle, node), (following, end) in zip(arms, [*arms[1:], arms[0]], strict=True):
+            net.node(node, self._at(angle), "priority", radius=6.0)
+            sweep = (following - angle) % (2 * np.pi)
+            arc = self._at(angle + np.linspace(0, sweep, max(4, int(sweep * 8))))
+            names.append(
+                net.edge(node, end, lanes=1, speed=7.5, width=width, priority=9, shape=arc, spread="center")
+            )
+        nodes = " ".join(node for _, node in arms)
+        net.edges.append(f'<roundabout nodes="{nodes}" edges="{" ".join(names)}"/>')
+
+
+def _add_nodes(
+    net: PlainNetwork, rng: np.random.Generator, nodes: Point, links: list[_Link]
+) -> dict[int, _Ring]:
+    """Add a junction per node, except where a roundabout takes its place; returns the roundabouts."""
+    rings: dict[int, _Ring] = {}
+    wanted = int(rng.integers(0, 3))
+    for k in rng.permutation(len(nodes)):
+        arms = [link.line[4] if link.a == k else link.line[-5] for link in links if k in (link.a, link.b)]
+        big = [link.arterial for link in links if k in (link.a, link.b)]
+        angles = np.sort([np.arctan2(*(p - nodes[k])[::-1]) for p in arms])
+        gaps = np.diff([*angles, angles[0] + 2 * np.pi])
+        if len(rings) < wanted and len(arms) >= 3 and gaps.min() > 1.0:
+            rings[int(k)] = _Ring(nodes[k], float(rng.uniform(14, 20)))
+            continue
+        if len(arms) == 2:
+            control = "priority"
+        elif sum(big) >= 3:
+            control = "traffic_light"
+        elif any(big):
+            control = str(rng.choice(["traffic_light", "priority", "priority_stop"], p=[0.55, 0.3, 0.15]))
+        else:
+            minor = ["priority", "allway_stop", "right_before_left", "traffic_light"]
+            control = str(rng.choice(minor, p=[0.25, 0.35, 0.2, 0.2]))
+        net.node(f"n{k}", nodes[k], control)
+    return rings
+
+
+# Grids ----------------------------------------------------------------------------------------------------------
+
+
+def grid(rng: np.random.Generator, folder: Path) -> Path:
+    """A perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
+    control = str(rng.choice(["traffic_light", "priority", "allway_stop", "right_before_left"]))
+    length, spread = rng.uniform(100, 140), rng.uniform(4, 12)
+    arguments = ["--grid", "--grid.x-number", str(rng.integers(3, 5)), "--grid.y-number", str(rng.integers(3, 5))]
+    arguments += ["--grid.x-length", f"{length:.2f}", "--grid.y-length", f"{length * rng.uniform(0.85, 1.2):.2f}"]
+    arguments += ["--turn-lanes", "1", "--turn-lanes.length", f"{rng.uniform(30, 45):.1f}"]
+    arguments += ["--perturb-x", f"norm(0,{spread:.2f})", "--perturb-y", f"norm(0,{spread:.2f})"]
+    arguments += ["--default-junction-type", control, "--default.lanenumber", str(rng.integers(1, 3))]
+    arguments += ["--default.lanewidth", f"{rng.uniform(3.2, 3.7):.2f}"]
+    arguments += ["--default.speed", f"{rng.choice([11.18, 13.89]):.2f}"]
+    arguments += ["--default.junctions.radius", f"{rng.uniform(5, 10):.2f}"]
+    arguments += ["--tls.layout", _signal_layout(rng), "--seed", str(rng.integers(1, 2**30))]
+    run_program("netgenerate", [*arguments, "--output-file", "net.net.xml", *_COMMON], folder)
+    return folder / "net.net.xml"
+
+
+# Freeway ramps --------------------------------------------------------------------------------------------------
+
+
+def ramp(rng: np.random.Generator, folder: Path) -> Path:
+    """Two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane."""
+    net = PlainNetwork()
+    width = rng.uniform(3.5, 3.75)
+    speed = float(rng.choice([24.6, 26.8, 29.1]))
+    direction = rng.uniform(0, 2 * np.pi)
+    curvature = rng.uniform(-1, 1) / 1500
+    for side in range(2):
+        lanes = int(rng.integers(2, 4))
+        _carriageway(net, rng, side, (lanes, speed, width), direction + side * np.pi, curvature * (1 - 2 * side))
+    return net.compile(folder, ["--default.junctions.radius", "4", "--junctions.scurve-stretch", "1.5"])
+
+
+def _carriageway(
+    net: PlainNetwork,
+    rng: np.random.Generator,
+    side: int,
+    road: tuple[int, float, float],
+    direction: float,
+    curvature: float,
+) -> None:
+    """One direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
+    lanes, speed, width = road
+    weaving = rng.random() < 0.4
+    stations = np.cumsum([0, 300, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
+    stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
+    stations = np.append(stations, stations[-1] + 300)
+    shift = stations[-1] / 2
+    median = 5.0
+
+    def along(s: NDArray[np.float64], right: float | NDArray[np.float64]) -> Point:
+        """Points at stations s, so far to the right of the edge of the median."""
+        u = s - shift
+        x, y = u, curvature * u**2 / 2
+        normal = np.stack([curvature * u, -np.ones_like(u)], -1)
+        out = np.stack([x, y], -1) + normal * (median + np.asarray(right))[..., None]
+        spin = np.array(
+            [[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]]
+        )
+        return out @ spin.T
+
+    def stretch(a: float, b: float, right: float = 0.0) -> Point:
+        return along(np.linspace(a, b, 12), right)
+
+    marks = [stations[0], stations[1], stations[2], *([] if weaving else [stations[3], stations[4]]), stations[5]]
+    extra = [0, 1, 0] if weaving else [0, 1, 0, 1, 0]
+    names = [f"c{side}m{k}" for k in range(len(marks))]
+    for name, mark in zip(names, marks, strict=True):
+        net.node(name, along(np.array([mark]), 0.0)[0], "priority")
+    ids = []
+    for k, more in enumerate(extra):
+        total = lanes + more
+        # The line given to SUMO is the left edge of the carriageway (spread to the right).
+        ids.append(
+            net.edge(
+                names[k],
+                names[k + 1],
+                lanes=total,
+                speed=speed,
+                width=width,
+                priority=9,
+                shape=stretch(marks[k], marks[k + 1]),
+            )
+        )
+    for k in range(len(extra) - 1):
+        pairs = [(i + extra[k], i + extra[k + 1]) for i in range(lanes)]
+        net.connect(ids[k], ids[k + 1], pairs)
+
+    ramp_speed, edge = rng.uniform(15.5, 20), lanes * width
+    on, off = 1, len(extra) - 1
+    reach = np.linspace(1, 0, 14)
+    gap = 3 * reach + 30 * reach**2
+    start = along(marks[on] - 150 * reach, edge + gap)
+    end = along(marks[off] + 150 * reach[::-1], edge + gap[::-1])
+    net.node(f"c{side}on", start[0], "priority")
+    net.node(f"c{side}off", end[-1], "priority")
+    options = {"lanes": 1, "width": width, "priority": 4}
+    first = net.edge(f"c{side}on", names[on], speed=ramp_speed, shape=start, **options)  # type: ignore[arg-type]
+    last = net.edge(names[off], f"c{side}off", speed=ramp_speed, shape=end, **options)  # type: ignore[arg-type]
+    net.connect(first, ids[on], [(0, 0)])
+    net.connect(ids[off - 1], last, [(0, 0)])
+
+
+NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {"town": town, "grid": grid, "ramp": ramp}
+"""Kinds of network; each function writes files into a folder and returns the path of the network."""

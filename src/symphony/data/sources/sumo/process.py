@@ -1,0 +1,57 @@
+"""Finding SUMO's programs and running them as subprocesses."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+from functools import cache
+from pathlib import Path
+
+from symphony.errors import DataError
+
+TIMEOUT_SECONDS = 600.0
+
+
+@cache
+def sumo_home() -> Path:
+    """Folder of the installed SUMO.
+
+    Raises:
+        DataError: the optional dependency is not installed.
+    """
+    spec = importlib.util.find_spec("sumo")
+    folders = [Path(p) for p in (spec.submodule_search_locations or [])] if spec is not None else []
+    for folder in folders:
+        if (folder / "bin").is_dir():
+            return folder
+    raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony[sumo]'")
+
+
+def run_program(name: str, arguments: list[str], folder: Path) -> str:
+    """Run one of SUMO's programs in a folder and return its standard error.
+
+    Raises:
+        DataError: the program failed or ran out of time; the message ends with its standard error.
+    """
+    home = sumo_home()
+    environment = {**os.environ, "SUMO_HOME": str(home)}
+    command = [str(home / "bin" / name), *arguments, "--xml-validation", "never"]
+    try:
+        # The program comes from the installed wheel and the arguments are ours.
+        done = subprocess.run(  # noqa: S603
+            command,
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=TIMEOUT_SECONDS,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise DataError(f"{name} did not finish within {TIMEOUT_SECONDS:.0f} s") from error
+    except OSError as error:
+        raise DataError(f"{name} could not be started: {error}") from error
+    if done.returncode != 0:
+        raise DataError(f"{name} failed with exit status {done.returncode}:\n{done.stderr[-4000:].strip()}")
+    return done.stderr

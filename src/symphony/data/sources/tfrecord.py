@@ -1,0 +1,81 @@
+"""TFRecord framing without TensorFlow.
+
+A record is its length (uint64), the masked CRC-32C of those 8 bytes (uint32), the payload, and the payload's
+masked CRC-32C (uint32), all little endian.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import google_crc32c
+
+from symphony.errors import DataError
+
+_HEADER = struct.Struct("<QI")
+_CHECK = struct.Struct("<I")
+_MASK_DELTA = 0xA282EAD8
+
+
+def masked_crc32c(data: bytes) -> int:
+    """CRC-32C rotated right by 15 bits plus a constant, so that a CRC of data holding CRCs stays sound."""
+    crc = google_crc32c.value(data)
+    return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
+
+
+def read_records(path: Path) -> Iterator[bytes | DataError]:
+    """Yield the payload of each record; both checksums are verified.
+
+    A payload with a wrong checksum is yielded as a :class:`DataError`, and reading goes on with the next
+    record.
+
+    Raises:
+        DataError: the file is empty or cut short, or a length has a wrong checksum, so that there is no
+            telling where the next record begins.
+        OSError: the file can't be opened or read.
+    """
+    with path.open("rb") as file:
+        left = os.fstat(file.fileno()).st_size
+        if left == 0:
+            raise DataError("the file is empty", file=path)
+        index = 0
+        while left > 0:
+            where = f"record {index}"
+            header = file.read(_HEADER.size)
+            if len(header) < _HEADER.size:
+                raise DataError(
+                    f"cut short: {len(header)} of {_HEADER.size} header bytes", file=path, field=where
+                )
+            length, check = _HEADER.unpack(header)
+            if masked_crc32c(header[:8]) != check:
+                kind = "not a TFRecord file, or damaged" if index == 0 else "damaged"
+                raise DataError(
+                    f"{kind}: the checksum of the record's length is wrong", file=path, field=where
+                )
+            left -= _HEADER.size
+            if length + _CHECK.size > left:
+                raise DataError(
+                    f"cut short: {left} of {length + _CHECK.size} payload bytes", file=path, field=where
+                )
+            payload = file.read(length)
+            tail = file.read(_CHECK.size)
+            left -= length + _CHECK.size
+            if len(payload) + len(tail) < length + _CHECK.size:
+                raise DataError("cut short while being read", file=path, field=where)
+            if masked_crc32c(payload) == _CHECK.unpack(tail)[0]:
+                yield payload
+            else:
+                yield DataError("damaged: the checksum of the payload is wrong", file=path, field=where)
+            index += 1
+
+
+def write_records(path: Path, payloads: Iterable[bytes]) -> None:
+    """Write a file that :func:`read_records` reads."""
+    with path.open("wb") as file:
+        for payload in payloads:
+            length = struct.pack("<Q", len(payload))
+            file.write(length + _CHECK.pack(masked_crc32c(length)))
+            file.write(payload + _CHECK.pack(masked_crc32c(payload)))

@@ -1,0 +1,271 @@
+"""Reader of the Waymo Open Motion Dataset: ``Scenario`` records in TFRecord files.
+
+How the format maps onto :class:`~symphony.data.segment.RunSegment`:
+
+- ``segment_id`` is the scenario id; the ego is the recording vehicle (``sdc_track_index``).
+- Coordinates are taken relative to the ego's first valid position, rounded to metres, before they become
+  float32.
+- A box size is the one logged at ``current_time_index``, or the median over the valid states where the track
+  is not valid then. Tracks that are valid at no step are left out.
+- Lanes are centre lines without width. Road edges of either kind are the boundary; they come oriented with
+  the drivable side on the left. Polygons (crosswalks, speed bumps, driveways) become closed rings among the
+  marks.
+- Lanes and road edges of fewer than two points are left out, as are references (exits, neighbours, lights,
+  objects of interest) to anything that is not in the record.
+- A light is one row per lane that has a state at any step; its stop point is the first one logged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
+from symphony.data.sources import womd_pb2 as pb
+from symphony.data.sources.base import Item, Reader, codes, pairs, to_float32
+from symphony.data.sources.tfrecord import read_records
+from symphony.errors import DataError
+
+MPS_PER_MPH = 0.44704
+
+_STATE = attrgetter(
+    "center_x",
+    "center_y",
+    "center_z",
+    "length",
+    "width",
+    "height",
+    "heading",
+    "velocity_x",
+    "velocity_y",
+    "valid",
+)
+_POINT = attrgetter("x", "y", "z")
+_MARKS = {
+    "road_line": ("polyline", MarkType.ROAD_LINE),
+    "crosswalk": ("polygon", MarkType.CROSSWALK),
+    "speed_bump": ("polygon", MarkType.SPEED_BUMP),
+    "driveway": ("polygon", MarkType.DRIVEWAY),
+}
+
+Doubles = NDArray[np.float64]
+
+
+class WomdReader(Reader):
+    """Reads WOMD ``Scenario`` files; the ``tf.Example`` flavour is not supported (its map is cut)."""
+
+    name = "womd"
+    patterns = ("*.tfrecord", "*.tfrecord-*-of-*")
+
+    def _read(self, path: Path) -> Iterator[Item]:
+        for index, payload in enumerate(read_records(path)):
+            yield (
+                payload if isinstance(payload, DataError) else self._convert(payload, path, f"record {index}")
+            )
+
+    def _convert(self, payload: bytes, path: Path, record: str) -> Item:
+        name = None
+        try:
+            scenario = pb.Scenario.FromString(payload)
+            name = scenario.scenario_id or None
+            # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
+            with np.errstate(over="ignore", invalid="ignore"):
+                return scenario_to_segment(scenario, file=path.name)
+        except (DecodeError, UnicodeDecodeError) as error:
+            return DataError(f"not a Scenario message: {error}", file=path, segment=name, field=record)
+        except DataError as error:
+            field = f"{record}, {error.field}" if error.field else record
+            return DataError(error.message, file=path, segment=name, field=field)
+
+
+def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
+    """Convert one decoded record; the result is not validated yet.
+
+    Raises:
+        DataError: naming the field of the format.
+    """
+    if not scenario.scenario_id:
+        raise DataError("missing; is this a WOMD Scenario record?", field="scenario_id")
+    dt, steps = _time_step(scenario)
+    states, kept, renumber = _tracks(scenario, steps)
+    ego = _index(scenario.sdc_track_index, renumber, "sdc_track_index")
+    if ego < 0:
+        raise DataError("the recording vehicle is valid at no step", field="sdc_track_index")
+    valid = states[..., 9] != 0
+    origin = np.round(states[ego, np.argmax(valid[ego]), :3])
+    road, lane_index = _road(scenario.map_features, origin)
+    signal_lane, signal_point, signal_state = _signals(scenario, steps, lane_index, road, origin)
+    tracks = [scenario.tracks[i] for i in kept]
+    ids = np.array([track.id for track in tracks], np.int64)
+    types = np.array([track.object_type for track in tracks], np.int64)
+    predict = [_index(p.track_index, renumber, "tracks_to_predict") for p in scenario.tracks_to_predict]
+    where = {track: i for i, track in enumerate(ids.tolist())}
+    interest = [where[track] for track in scenario.objects_of_interest if track in where]
+    masked = np.where(valid[..., None], states, 0.0)
+    return RunSegment(
+        segment_id=scenario.scenario_id,
+        source=WomdReader.name,
+        dt=dt,
+        ego=ego,
+        agent_id=ids,
+        agent_type=codes(types, len(AgentType), "tracks.object_type"),
+        size=to_float32(_sizes(states[..., 3:6], valid, scenario.current_time_index)),
+        position=to_float32(np.where(valid[..., None], masked[..., :3] - origin, 0.0)),
+        heading=to_float32(masked[..., 6]),
+        velocity=to_float32(masked[..., 7:9]),
+        valid=valid,
+        road=road,
+        signal_lane=signal_lane,
+        signal_point=signal_point,
+        signal_state=signal_state,
+        origin=origin,
+        current_step=scenario.current_time_index,
+        interest=np.array(interest, np.int32),
+        predict=np.array([p for p in predict if p >= 0], np.int32),
+        file=file,
+    )
+
+
+def _time_step(scenario: pb.Scenario) -> tuple[float, int]:
+    """(seconds per step to the millisecond, number of steps)."""
+    times = np.array(scenario.timestamps_seconds, np.float64)
+    if len(times) < 2:
+        raise DataError(f"{len(times)} steps, needs at least 2", field="timestamps_seconds")
+    if not np.isfinite(times).all():
+        raise DataError("not finite", field="timestamps_seconds")
+    gaps = np.diff(times)
+    dt = round(float(np.median(gaps)), 3)
+    if dt <= 0 or (np.abs(gaps - dt) > 0.1 * dt).any():
+        raise DataError(f"steps of {gaps.min():g} to {gaps.max():g} s are uneven", field="timestamps_seconds")
+    return dt, len(times)
+
+
+def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict[int, int]]:
+    """(states [A, T, 10], the tracks they are, track index in the record -> row or -1 where left out)."""
+    tracks = scenario.tracks
+    if not tracks:
+        raise DataError("has no agents", field="tracks")
+    for track in tracks:
+        if len(track.states) != steps:
+            raise DataError(
+                f"track {track.id} has {len(track.states)} states for {steps} steps", field="tracks.states"
+            )
+    numbers = chain.from_iterable(map(_STATE, chain.from_iterable(track.states for track in tracks)))
+    states = np.fromiter(numbers, np.float64, len(tracks) * steps * 10).reshape(len(tracks), steps, 10)
+    seen = (states[..., 9] != 0).any(axis=1)
+    kept = np.flatnonzero(seen).tolist()
+    rows = np.where(seen, np.cumsum(seen) - 1, -1)
+    return states[seen], kept, dict(enumerate(rows.tolist()))
+
+
+def _index(track: int, renumber: dict[int, int], field: str) -> int:
+    if track not in renumber:
+        raise DataError(f"track index {track} outside the {len(renumber)} tracks", field=field)
+    return renumber[track]
+
+
+def _sizes(sizes: Doubles, valid: NDArray[np.bool_], current: int) -> Doubles:
+    """[A, 3] from [A, T, 3]."""
+    if not 0 <= current < valid.shape[1]:
+        raise DataError(f"{current} outside the {valid.shape[1]} steps", field="current_time_index")
+    result = sizes[:, current].copy()
+    for agent in np.flatnonzero(~valid[:, current]):
+        result[agent] = np.median(sizes[agent, valid[agent]], axis=0)
+    return result
+
+
+def _points(points: Iterable[pb.MapPoint]) -> Doubles:
+    return np.fromiter(chain.from_iterable(map(_POINT, points)), np.float64).reshape(-1, 3)
+
+
+def _polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
+    return Polylines.of([to_float32(line - origin) for line in lines])
+
+
+def _road(features: Sequence[pb.MapFeature], origin: Doubles) -> tuple[RoadMap, dict[int, int]]:
+    """(the map, lane id -> lane index)."""
+    lanes: list[tuple[int, Any]] = []
+    lines: list[Doubles] = []
+    edges: list[Doubles] = []
+    marks: list[Doubles] = []
+    kinds: list[int] = []
+    for feature in features:
+        kind = feature.WhichOneof("feature_data")
+        if kind == "lane" and len(feature.lane.polyline) >= 2:
+            lanes.append((feature.id, feature.lane))
+            lines.append(_points(feature.lane.polyline))
+        elif kind == "road_edge" and len(feature.road_edge.polyline) >= 2:
+            edges.append(_points(feature.road_edge.polyline))
+        elif kind == "stop_sign" and feature.stop_sign.HasField("position"):
+            marks.append(_points([feature.stop_sign.position]))
+            kinds.append(MarkType.STOP_SIGN)
+        elif kind in _MARKS:
+            attribute, mark = _MARKS[kind]
+            points = _points(getattr(getattr(feature, kind), attribute))
+            if len(points):
+                marks.append(np.concatenate([points, points[:1]]) if attribute == "polygon" else points)
+                kinds.append(mark)
+    index = {lane_id: k for k, (lane_id, _) in enumerate(lanes)}
+
+    def links(references: attrgetter[Any]) -> NDArray[np.int32]:
+        found = ((k, references(lane)) for k, (_, lane) in enumerate(lanes))
+        return pairs([(k, index[other]) for k, others in found for other in _ids(others) if other in index])
+
+    speed = np.array([lane.speed_limit_mph for _, lane in lanes], np.float64) * MPS_PER_MPH
+    types = np.array([lane.type for _, lane in lanes], np.int64)
+    road = RoadMap(
+        lanes=_polylines(lines, origin),
+        lane_id=np.array([lane_id for lane_id, _ in lanes], np.int64),
+        lane_type=codes(types, len(LaneType), "map_features.lane.type"),
+        speed_limit=to_float32(np.where(speed == 0, np.nan, speed)),
+        lane_width=np.full(len(lanes), np.nan, np.float32),
+        successors=links(attrgetter("exit_lanes")),
+        left_neighbors=links(attrgetter("left_neighbors")),
+        right_neighbors=links(attrgetter("right_neighbors")),
+        boundary=_polylines(edges, origin),
+        marks=_polylines(marks, origin),
+        mark_type=np.array(kinds, np.uint8),
+    )
+    return road, index
+
+
+def _ids(references: Iterable[Any]) -> Iterator[int]:
+    for reference in references:
+        yield reference if isinstance(reference, int) else reference.feature_id
+
+
+def _signals(
+    scenario: pb.Scenario, steps: int, lane_index: dict[int, int], road: RoadMap, origin: Doubles
+) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.uint8]]:
+    """(lane [Q], stop point [Q, 3], state [Q, T]); a lane is listed once."""
+    logged = scenario.dynamic_map_states
+    if logged and len(logged) != steps:
+        raise DataError(f"{len(logged)} entries for {steps} steps", field="dynamic_map_states")
+    rows: dict[int, int] = {}
+    points: list[NDArray[np.float32]] = []
+    entries: list[tuple[int, int, int]] = []
+    for step, now in enumerate(logged):
+        for light in now.lane_states:
+            lane = lane_index.get(light.lane)
+            if lane is None:
+                continue
+            if lane not in rows:
+                rows[lane] = len(rows)
+                stop = _points([light.stop_point])[0] - origin if light.HasField("stop_point") else None
+                points.append(road.lanes[lane][0] if stop is None else to_float32(stop))
+            entries.append((rows[lane], step, light.state))
+    table = np.array(entries, np.int64).reshape(-1, 3)
+    state = np.full((len(rows), steps), SignalState.UNKNOWN, np.uint8)
+    state[table[:, 0], table[:, 1]] = codes(table[:, 2], len(SignalState), "dynamic_map_states.state")
+    return (
+        np.array(list(rows), np.int32),
+        np.array(points, np.float32).reshape(-1, 3),
+        state,
+    )

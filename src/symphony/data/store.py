@@ -1,0 +1,382 @@
+"""Many run segments in one directory: memory-mapped, without padding, append-only (see ``store_format``)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import operator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, SupportsIndex, cast, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data import store_format as layout
+from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
+from symphony.data.store_format import MAPS, SEGMENTS, TableWriter
+from symphony.errors import DataError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+
+class StoreWriter:
+    """Adds segments to a store, one at a time; each is on record once :meth:`append` returns.
+
+    Opening for append cuts off what a writer that died left unfinished. Only one writer at a time.
+
+    Args:
+        path: the store's directory; created, or must be empty unless ``append``.
+        append: continue an existing store (or start one).
+
+    Raises:
+        DataError: the directory holds something else, is damaged, of another version, or being written.
+    """
+
+    def __init__(self, path: str | Path, *, append: bool = False) -> None:
+        self.path = Path(path).absolute()
+        if self.path.exists() and not self.path.is_dir():
+            raise DataError("not a directory", file=self.path)
+        fresh = not (self.path / layout.HEADER).exists()
+        if fresh and not _is_blank(self.path):
+            raise DataError("not empty and not a segment store: refusing to write into it", file=self.path)
+        if not fresh:
+            layout.check_header(self.path)
+            if not append:
+                raise DataError("already a segment store (append to it, or choose another)", file=self.path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._lock: BinaryIO | None = _lock(self.path)
+        try:
+            self._open(fresh)
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _open(self, fresh: bool) -> None:
+        if fresh:
+            _create(self.path)
+        segments, maps = _read_indices(self.path)
+        for table, records in ((SEGMENTS, segments), (MAPS, maps)):
+            layout.check_columns(self.path, table, records)
+        self._ids = dict.fromkeys(_read_ids(self.path, segments))
+        self._roads = {record.tobytes(): k for k, record in enumerate(maps["hash"])}
+        self._maps = TableWriter(self.path, MAPS, maps)
+        self._segments = TableWriter(self.path, SEGMENTS, segments)
+
+    def __len__(self) -> int:
+        return self._segments.count
+
+    def has(self, segment_id: str) -> bool:
+        """Whether a segment of that name is in the store."""
+        return segment_id in self._ids
+
+    def append(self, segment: RunSegment, *, tags: Mapping[str, Any] | None = None) -> int:
+        """Add one segment.
+
+        Args:
+            segment: validated here.
+            tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`.
+
+        Returns:
+            Its index.
+
+        Raises:
+            DataError: the segment breaks the schema, or one of that name is there already.
+        """
+        if self._lock is None:
+            raise ValueError("the writer is closed")
+        segment = _plain(validate(segment))
+        try:
+            if self.has(segment.segment_id):
+                raise DataError("a segment of this name is in the store already", field="segment_id")
+            return self._append(segment, json.dumps(tags, ensure_ascii=False) if tags else "")
+        except DataError as error:
+            raise error.at(file=segment.file or None, segment=segment.segment_id) from error
+
+    def _append(self, segment: RunSegment, tags: str) -> int:
+        if segment.origin.dtype != np.float64:
+            raise DataError(f"dtype {segment.origin.dtype}, expected float64", field="origin")
+        key = bytes.fromhex(content_hash(cast(Any, segment.road)))
+        road = self._roads.get(key)
+        if road is None:
+            road = self._roads[key] = self._maps.append(_road_values(segment.road), key)
+        values = {c.name: getattr(segment, c.name) for c in SEGMENTS.columns if c.name != "tags"}
+        for name in ("segment_id", "source", "file"):
+            values[name] = np.frombuffer(values[name].encode(), np.uint8)
+        number = self._segments.append(
+            values | {"tags": np.frombuffer(tags.encode(), np.uint8)},
+            bytes.fromhex(content_hash(segment)),
+            map=road,
+            steps=segment.num_steps,
+            ego=segment.ego,
+            current_step=segment.current_step,
+            dt=segment.dt,
+            origin=segment.origin,
+        )
+        self._ids[segment.segment_id] = None
+        return number
+
+    def write_report(self, report: Mapping[str, Any]) -> None:
+        """Replace the conversion report kept with the store."""
+        layout.write_json(self.path / layout.REPORT, report)
+
+    def close(self) -> None:
+        """Bring everything to the disk and let the next writer in."""
+        if self._lock is not None:
+            self._maps.close()
+            self._segments.close()
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> StoreWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class SegmentStore(Sequence[RunSegment]):
+    """Read access to a store: ``store[i]`` reads that segment only, as read-only views of the mapped files.
+
+    Holds what was complete when it was opened. Pickles as its path, so each process maps the files itself.
+
+    Args:
+        path: the store's directory.
+
+    Raises:
+        DataError: not a store, of another version, or a file is missing, truncated or damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path).absolute()
+        layout.check_header(self.path)
+        self._segments, self._maps = _read_indices(self.path)
+        self._columns = layout.map_columns(self.path, SEGMENTS, self._segments)
+        self._road_columns = layout.map_columns(self.path, MAPS, self._maps)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SegmentStore, (str(self.path),)
+
+    def __len__(self) -> int:
+        return len(self._segments)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> RunSegment: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[RunSegment]: ...
+    def __getitem__(self, index: SupportsIndex | slice) -> RunSegment | list[RunSegment]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        record = self._segments[self._row(index)]
+        parts = _rows(SEGMENTS, self._columns, record)
+        agents, steps, lights = len(parts["agent_id"]), int(record["steps"]), len(parts["signal_lane"])
+        parts.pop("tags")
+        for name in ("segment_id", "source", "file"):
+            parts[name] = bytes(parts[name]).decode()
+        for name in ("position", "heading", "velocity", "valid"):
+            parts[name] = parts[name].reshape(agents, steps, *parts[name].shape[1:])
+        parts["signal_state"] = parts["signal_state"].reshape(lights, steps)
+        return RunSegment(
+            **parts,
+            road=self.road(int(record["map"])),
+            dt=float(record["dt"]),
+            ego=int(record["ego"]),
+            current_step=int(record["current_step"]),
+            origin=record["origin"].copy(),
+        )
+
+    def __iter__(self) -> Iterator[RunSegment]:
+        return (self[i] for i in range(len(self)))
+
+    def _row(self, index: SupportsIndex) -> int:
+        i = operator.index(index)
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"segment {i} of {len(self)}")
+        return i % len(self)
+
+    def road(self, number: int) -> RoadMap:
+        """One of the distinct maps (see :attr:`map_index`)."""
+        if not 0 <= number < len(self._maps):
+            raise IndexError(f"map {number} of {len(self._maps)}")
+        parts = _rows(MAPS, self._road_columns, self._maps[number])
+        for name in ("lanes", "boundary", "marks"):
+            parts[name] = Polylines(parts.pop(f"{name}.points"), parts.pop(f"{name}.offsets"))
+        return RoadMap(**parts)
+
+    @property
+    def num_maps(self) -> int:
+        """Number of distinct maps."""
+        return len(self._maps)
+
+    @property
+    def map_index(self) -> NDArray[np.int64]:
+        """[segments] which distinct map each segment lies on."""
+        return self._segments["map"]
+
+    @cached_property
+    def ids(self) -> list[str]:
+        """Segment ids in order of insertion."""
+        return _read_ids(self.path, self._segments)
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.ids)}
+
+    def index_of(self, segment_id: str) -> int:
+        """Index of a segment.
+
+        Raises:
+            DataError: there is none of that name.
+        """
+        if segment_id not in self._places:
+            raise DataError("no such segment in the store", file=self.path, segment=segment_id)
+        return self._places[segment_id]
+
+    def tags(self, index: SupportsIndex) -> dict[str, Any]:
+        """What was given as ``tags`` when the segment was appended."""
+        text = self._text("tags", self._row(index))
+        return json.loads(text) if text else {}
+
+    def _text(self, column: str, row: int) -> str:
+        axis = SEGMENTS.axes[column]
+        begin, count = (int(self._segments[row][key][axis]) for key in ("begin", "count"))
+        return bytes(self._columns[column][begin : begin + count]).decode()
+
+    def checksum(self) -> str:
+        """SHA-256 over the segments' content hashes sorted by id: the order of insertion and the report,
+        say, do not enter.
+        """
+        digest = hashlib.sha256()
+        for i in sorted(range(len(self)), key=self.ids.__getitem__):
+            digest.update(self._segments["hash"][i].tobytes())
+        return digest.hexdigest()
+
+    def verify(self) -> None:
+        """Read everything and compare it with the content hashes written with it.
+
+        Raises:
+            DataError: naming the first segment whose data changed on disk.
+        """
+        for i, segment_id in enumerate(self.ids):
+            if content_hash(self[i]) != self._segments["hash"][i].tobytes().hex():
+                raise DataError("content does not match its hash", file=self.path, segment=segment_id)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The conversion report (empty where none was written)."""
+        path = self.path / layout.REPORT
+        return layout.read_json(path) if path.exists() else {}
+
+    def summary(self) -> dict[str, Any]:
+        """Counts and ranges over the whole store, as JSON can hold them; reads no agent or map data."""
+        segments, maps = self._segments, self._maps
+        steps, dt = segments["steps"], segments["dt"]
+        used = segments["map"]
+
+        def per_map(*axes: str) -> NDArray[np.int64]:
+            return sum((maps["count"][:, MAPS.axes[axis]] for axis in axes), np.zeros(len(maps), np.int64))
+
+        points = per_map("lanes.points", "boundary.points", "marks.points")
+        return {
+            "segments": len(self),
+            "agents": int(segments["count"][:, SEGMENTS.axes["agents"]].sum()),
+            "signals": int(segments["count"][:, SEGMENTS.axes["signals"]].sum()),
+            "sources": dict(sorted(Counter(self._text("source", i) for i in range(len(self))).items())),
+            "steps": _span(steps),
+            "dt": _span(dt),
+            "duration": _span((steps - 1) * dt),
+            "maps": len(maps),
+            "lanes": _span(per_map("lanes")[used]),
+            "map_points": _span(points[used]),
+            "bytes": sum(file.stat().st_size for file in self.path.rglob("*") if file.is_file()),
+        }
+
+
+def _span(values: NDArray[Any]) -> dict[str, float]:
+    """Smallest, mean and largest, to a microsecond; empty for no values."""
+    if len(values) == 0:
+        return {}
+    return {"min": values.min().item(), "mean": round(float(values.mean()), 6), "max": values.max().item()}
+
+
+def _plain(segment: RunSegment) -> RunSegment:
+    """Python scalars in place of NumPy's, which would enter the content hash."""
+    return segment.replace(dt=float(segment.dt), ego=int(segment.ego), current_step=int(segment.current_step))
+
+
+def _road_values(road: RoadMap) -> dict[str, NDArray[Any]]:
+    return {column.name: operator.attrgetter(column.name)(road) for column in MAPS.columns}
+
+
+def _rows(table: layout.Table, columns: Mapping[str, NDArray[Any]], record: Any) -> dict[str, Any]:
+    """Views of one record's rows of every column."""
+    begin, count = record["begin"].tolist(), record["count"].tolist()
+    found = {}
+    for column in table.columns:
+        axis = table.axes[column.axis]
+        found[column.name] = columns[column.name][begin[axis] : begin[axis] + count[axis]]
+    return found
+
+
+def _read_indices(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Records of the segments, and of the maps they lie on."""
+    segments = layout.read_index(path, SEGMENTS)
+    count, axes = segments["count"], SEGMENTS.axes
+    agents, lights, steps = count[:, axes["agents"]], count[:, axes["signals"]], segments["steps"]
+    sound = (
+        (count[:, axes["states"]] == agents * steps)
+        & (count[:, axes["signal_states"]] == lights * steps)
+        & (segments["ego"] >= 0)
+        & (segments["ego"] < agents)
+        & (segments["map"] >= 0)
+    )
+    if not sound.all():
+        message = f"record {int(np.argmin(sound))} contradicts itself: the file is damaged"
+        raise DataError(message, file=SEGMENTS.index_path(path))
+    # Maps no segment points at belong to an append that never finished.
+    return segments, layout.read_index(path, MAPS, limit=int(segments["map"].max(initial=-1)) + 1)
+
+
+def _read_ids(path: Path, segments: NDArray[Any]) -> list[str]:
+    axis = SEGMENTS.axes["segment_id"]
+    column = next(c for c in SEGMENTS.columns if c.name == "segment_id")
+    data = SEGMENTS.column_path(path, column).read_bytes()
+    begin, count = segments["begin"][:, axis].tolist(), segments["count"][:, axis].tolist()
+    return [data[b : b + n].decode() for b, n in zip(begin, count, strict=True)]
+
+
+def _is_blank(path: Path) -> bool:
+    """Nothing there, or only the empty files of a writer that died before it had begun."""
+    own = {layout.LOCK, f"{layout.HEADER}.tmp"}
+    files = path.rglob("*") if path.is_dir() else ()
+    return all(
+        f.is_dir() or f.name in own or (f.suffix in {".idx", ".bin"} and not f.stat().st_size) for f in files
+    )
+
+
+def _create(path: Path) -> None:
+    """Empty files first and the header last: with a header, a store is whole."""
+    (path / layout.COLUMNS).mkdir(exist_ok=True)
+    for table in layout.TABLES:
+        for file in (table.index_path(path), *(table.column_path(path, c) for c in table.columns)):
+            file.touch()
+    layout.write_json(path / layout.HEADER, layout.header())
+
+
+def _lock(path: Path) -> BinaryIO:
+    file = (path / layout.LOCK).open("ab")
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            raise DataError("is being written by another process", file=path) from error
+    return file

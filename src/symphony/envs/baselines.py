@@ -1,0 +1,36 @@
+"""Policies that need no learning."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from symphony import keys
+from symphony.envs.dynamics import Bicycle, Displacement
+
+
+class ConstantVelocity(TensorDictModuleBase):
+    """Keeps speed and heading: the weakest prediction a learned agent has to beat.
+
+    Args:
+        dynamics: action space to act in.
+        dt: seconds per step.
+    """
+
+    in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
+    out_keys = [keys.ACTION]  # noqa: RUF012
+
+    def __init__(self, dynamics: Bicycle | Displacement, dt: float = 0.2) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+        self.dt = dt
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action [..., N] or [..., N, 2]."""
+        speed = tensordict.get(keys.STATE)[..., 3]
+        if isinstance(self.dynamics, Bicycle):
+            action = torch.full_like(speed, self.dynamics.num_actions // 2, dtype=torch.int64)
+        else:
+            action = torch.stack([speed * self.dt, torch.zeros_like(speed)], -1)
+        return tensordict.set(keys.ACTION, action)

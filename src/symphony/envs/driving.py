@@ -1,0 +1,253 @@
+"""The driving environment: interactive agents act, everyone else is played back from the log."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from symphony import keys
+from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.flags import collision_flags, offroad_flags
+from symphony.envs.observation import (
+    OBJECT_FEATURES,
+    POINT_FEATURES,
+    SELF_FEATURES,
+    Objects,
+    ObservationConfig,
+    objects_at,
+    observe,
+)
+from symphony.envs.scene import SceneBatch
+
+
+class DrivingEnv(EnvBase):
+    """A batch of logged scenes in which N agents are driven by actions (paper, section III).
+
+    All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity
+    (``stream``) and the state of the interactive agents. The environment holds only constants, so forking a
+    branch is an index and one instance serves every batch shape. An episode ends (``truncated``) at the last
+    logged step.
+
+    Args:
+        scenes: static data of B segments, all with the same number of interactive agents.
+        dynamics: :class:`Bicycle` (joint discrete actions) or :class:`Displacement` (metres).
+        observation: what the agents see.
+        dt: seconds per step; must be that of the scenes.
+        seed: of the scenes drawn by :meth:`reset` when none is named.
+
+    ``reset`` starts the scenes named in the ``scene`` entry of its argument, or draws them at random if there is
+    none; ``reset(state, set_state=True)`` starts from the given simulation state.
+    """
+
+    batch_locked = False
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        scenes: SceneBatch,
+        dynamics: Bicycle | Displacement | None = None,
+        observation: ObservationConfig | None = None,
+        *,
+        dt: float = 0.2,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(device=scenes.log_state.device, batch_size=[])
+        self.scenes = scenes
+        self.dynamics = Bicycle() if dynamics is None else dynamics
+        self.observation = ObservationConfig() if observation is None else observation
+        self.dt = dt
+        self.rng = torch.Generator(device=scenes.log_state.device)
+        self._make_specs()
+        self._set_seed(seed)
+
+    @property
+    def num_agents(self) -> int:
+        """N, interactive agents per scene."""
+        return self.scenes.interactive.shape[1]
+
+    def _make_specs(self) -> None:
+        n, config, device = self.num_agents, self.observation, self.scenes.log_state.device
+
+        def floats(*shape: int) -> Unbounded:
+            return Unbounded(shape=shape, dtype=torch.float32, device=device)
+
+        def flags(*shape: int) -> Binary:
+            return Binary(shape=shape, dtype=torch.bool, device=device)
+
+        def numbers() -> Unbounded:
+            return Unbounded(shape=(1,), dtype=torch.int64, device=device)
+
+        seen = Composite(
+            {
+                "own": floats(n, SELF_FEATURES),
+                "objects": floats(n, config.num_objects, OBJECT_FEATURES),
+                "objects_mask": flags(n, config.num_objects),
+                "points": floats(n, config.num_points, POINT_FEATURES),
+                "points_mask": flags(n, config.num_points),
+            },
+            shape=(n,),
+        )
+        agents = {"observation": seen, "valid": flags(n), "state": floats(n, 4)}
+        outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
+        progress = {"scene": numbers(), "step": numbers(), "stream": numbers()}
+        self.observation_spec = Composite(
+            {**progress, "agents": Composite({**agents, **outcome}, shape=(n,))}
+        )
+        self.state_spec = Composite(
+            {
+                **{name: spec.clone() for name, spec in progress.items()},
+                "agents": Composite({"valid": flags(n), "state": floats(n, 4)}, shape=(n,)),
+            }
+        )
+        if self.dynamics.discrete:
+            action = Categorical(self.dynamics.num_actions, shape=(n,), dtype=torch.int64, device=device)
+        else:
+            action = floats(n, 2)
+        self.action_spec = Composite({"agents": Composite({"action": action}, shape=(n,))})
+        self.reward_spec = Composite({"agents": Composite({"reward": floats(n, 1)}, shape=(n,))})
+        self.done_spec = Composite({name: flags(1) for name in ("done", "terminated", "truncated")})
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.rng.manual_seed(seed)
+
+    def start(self, scene: Int[Tensor, "*b"], rollout: Int[Tensor, "*b"] | int = 0) -> TensorDict:
+        """State at the first logged step, as :meth:`reset` returns it.
+
+        Args:
+            scene: rows of the scene batch; its shape is the batch size.
+            rollout: number of the rollout (branch, repetition) within its scene, so that each draws numbers of
+                its own whatever batch it runs in.
+        """
+        rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
+        stream = self.scenes.stream[scene] + rollout * _STRIDE
+        return self._from_state(
+            scene, torch.zeros_like(scene), stream, self._logged_state(scene), self._valid(scene)
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        if tensordict is None:
+            tensordict = TensorDict({}, batch_size=[], device=self.device)
+        if kwargs.get("set_state"):
+            return self._from_state(*self._read(tensordict))
+        partial = tensordict.get("_reset", None)
+        named = tensordict.get(keys.SCENE, None)
+        shape = tensordict.batch_size
+        if named is None or partial is not None:
+            scene = torch.randint(len(self.scenes), tuple(shape), generator=self.rng, device=self.rng.device)
+        else:
+            scene = named.squeeze(-1)
+        rollout = torch.randint(1 << 31, tuple(shape), generator=self.rng, device=self.rng.device)
+        fresh = self.start(scene, rollout)
+        if partial is None:
+            return fresh
+        kept = tensordict.select(*fresh.keys(True, True), strict=False)
+        return fresh.named_apply(
+            lambda name, new, old: new if old is None else torch.where(_like(partial, new), new, old),
+            kept,
+            nested_keys=True,
+            default=None,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        scene, step, stream, state, valid = self._read(tensordict)
+        index = self.scenes.interactive[scene]
+        size = _rows(self.scenes.box_size, scene, index)
+        after = self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
+        after = torch.where(valid[..., None], after, state)
+        out = self._from_state(scene, step + 1, stream, after, valid)
+        bad = out.get(keys.COLLISION) | out.get(keys.OFFROAD)
+        out.set(keys.REWARD, -bad.to(after.dtype))
+        return out
+
+    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
+        return scene, step, stream, tensordict.get(keys.STATE), tensordict.get(keys.VALID)
+
+    def _valid(self, scene: Tensor) -> Bool[Tensor, "*b N"]:
+        return self.scenes.interactive_valid[scene]
+
+    def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
+        logged = _rows(self.scenes.log_state[:, 0], scene, self.scenes.interactive[scene])
+        heading, velocity = logged[..., 2], logged[..., 3:]
+        speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
+        return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
+
+    def _from_state(
+        self, scene: Tensor, step: Tensor, stream: Tensor, state: Tensor, valid: Tensor
+    ) -> TensorDict:
+        """Observation, flags and end of the episode, all functions of the simulation state."""
+        shape = scene.shape
+        row, at = scene.flatten(), step.flatten()
+        moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
+        index = self.scenes.interactive[row]
+        objects = objects_at(self.scenes, row, at, moved, index, real)
+        seen = observe(self.scenes, row, at, objects, index, self.observation)
+        collision, offroad = self._flags(row, objects, index, real)
+        truncated = at >= self.scenes.last_step[row]
+
+        def back(value: Tensor) -> Tensor:
+            return value.reshape((*shape, *value.shape[1:]))
+
+        return TensorDict(
+            {
+                "scene": scene[..., None],
+                "step": step[..., None],
+                "stream": stream[..., None],
+                "agents": TensorDict(
+                    {
+                        "observation": TensorDict(
+                            {
+                                "own": back(seen.own),
+                                "objects": back(seen.objects),
+                                "objects_mask": back(seen.objects_mask),
+                                "points": back(seen.points),
+                                "points_mask": back(seen.points_mask),
+                            },
+                            batch_size=[*shape, self.num_agents],
+                        ),
+                        "valid": valid,
+                        "state": state,
+                        "collision": back(collision)[..., None],
+                        "offroad": back(offroad)[..., None],
+                    },
+                    batch_size=[*shape, self.num_agents],
+                ),
+                "done": back(truncated)[..., None],
+                "truncated": back(truncated)[..., None],
+                "terminated": back(torch.zeros_like(truncated))[..., None],
+            },
+            batch_size=shape,
+            device=self.device,
+        )
+
+    @torch.no_grad()
+    def _flags(
+        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor
+    ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
+        position = _rows_of(objects.state, index)[..., :2]
+        collision = collision_flags(objects, index) & valid
+        return collision, offroad_flags(self.scenes, scene, position) & valid
+
+
+_STRIDE = 0xD1B54A32D192ED03 - (1 << 64)
+"""Odd 64-bit constant that sets the streams of one scene's rollouts apart; int64 wraps around."""
+
+
+def _rows_of(values: Tensor, index: Tensor) -> Tensor:
+    return values.gather(-2, index[..., None].expand(*index.shape, values.shape[-1]))
+
+
+def _rows(table: Float[Tensor, "B A F"], scene: Int[Tensor, "*b"], index: Int[Tensor, "*b N"]) -> Tensor:
+    """table[scene, index] for scene [...] and index [..., N]."""
+    return table[scene[..., None], index]
+
+
+def _like(mask: Tensor, value: Tensor) -> Tensor:
+    """mask [..., 1] with trailing dimensions of one, to broadcast against value."""
+    flat = mask.squeeze(-1)
+    return flat.reshape(flat.shape + (1,) * (value.ndim - flat.ndim))

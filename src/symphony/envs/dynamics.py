@@ -1,0 +1,264 @@
+"""How an agent moves: kinematic bicycle with discrete actions, and continuous displacement.
+
+State: x, y, heading, speed of the box centre (metres, radians, m/s). Everything is differentiable and out of
+place. Shapes: ``...`` any batch, T steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from symphony.geometry.frames import rotate, wrap
+
+WHEELBASE = 0.6
+"""Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""
+
+
+def bicycle_step(
+    state: Float[Tensor, "*b 4"],
+    acceleration: Float[Tensor, "*b"],
+    steering: Float[Tensor, "*b"],
+    length: Float[Tensor, "*b"],
+    dt: float,
+) -> Float[Tensor, "*b 4"]:
+    """One step of the kinematic bicycle about the box centre.
+
+    With slip angle tan(beta) = tan(steering) / 2 (axles at equal distance from the centre), mean speed u of the
+    step and wheelbase W: dheading = 2 u dt sin(beta) / W, and the centre moves u dt along heading +
+    dheading / 2 + beta. Speed never becomes negative.
+
+    Args:
+        state: x, y, heading, speed.
+        acceleration: m/s^2.
+        steering: radians of the front wheel, positive to the left.
+        length: of the box, metres.
+        dt: seconds.
+    """
+    speed = state[..., 3]
+    after = (speed + acceleration * dt).clamp_min(0.0)
+    travel = 0.5 * (speed + after) * dt
+    slip = torch.atan(0.5 * torch.tan(steering))
+    turn = 2.0 * travel * torch.sin(slip) / (WHEELBASE * length)
+    course = state[..., 2] + 0.5 * turn + slip
+    return torch.stack(
+        [
+            state[..., 0] + travel * torch.cos(course),
+            state[..., 1] + travel * torch.sin(course),
+            state[..., 2] + turn,
+            after,
+        ],
+        dim=-1,
+    )
+
+
+def bicycle_inverse(
+    state: Float[Tensor, "*b 4"], after: Float[Tensor, "*b 4"], length: Float[Tensor, "*b"], dt: float
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Acceleration and steering that take the speed and heading of ``state`` to those of ``after``.
+
+    Exact where :func:`bicycle_step` produced ``after`` and the agent moved; steering is 0 at standstill and
+    saturates at a turn no bicycle can make.
+    """
+    acceleration = (after[..., 3] - state[..., 3]) / dt
+    travel = 0.5 * (state[..., 3] + after[..., 3]) * dt
+    moving = travel > 1e-6
+    turn = wrap(after[..., 2] - state[..., 2])
+    sine = turn * WHEELBASE * length / (2.0 * torch.where(moving, travel, torch.ones_like(travel)))
+    slip = torch.asin(sine.clamp(-0.999, 0.999))
+    return acceleration, torch.where(moving, torch.atan(2.0 * torch.tan(slip)), torch.zeros_like(slip))
+
+
+def displacement_step(
+    state: Float[Tensor, "*b 4"],
+    displacement: Float[Tensor, "*b 2"],
+    length: Float[Tensor, "*b"],
+    dt: float,
+) -> Float[Tensor, "*b 4"]:
+    """Move the box centre by ``displacement`` (x forward, y left, metres, in the agent's own frame).
+
+    The rear axle, half a wheelbase r behind the centre, is dragged along (a tractrix, dheading = sin(phi) / r
+    per metre at an angle phi between motion and heading), here by the implicit midpoint rule: a turn of
+    atan2(y, r + x / 2). So heading errors die out instead of swinging, and a step too small to have a direction
+    hardly turns the agent. Reversing turns it as the step sideways alone would.
+    """
+    forward, left = displacement.unbind(-1)
+    distance = (forward.square() + left.square() + 1e-12).sqrt()
+    arm = 0.5 * WHEELBASE * length
+    turn = torch.atan2(left, arm + 0.5 * forward.clamp_min(0.0))
+    moved = state[..., :2] + rotate(displacement, state[..., 2])
+    return torch.cat([moved, (state[..., 2] + turn)[..., None], (distance / dt)[..., None]], dim=-1)
+
+
+def displacement_inverse(state: Float[Tensor, "*b 4"], after: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 2"]:
+    """The displacement in the frame of ``state`` that leads to the position of ``after`` (exact)."""
+    return rotate(after[..., :2] - state[..., :2], -state[..., 2])
+
+
+class Dynamics(Protocol):
+    """What the environment needs of a motion model."""
+
+    discrete: bool
+
+    def step(
+        self, state: Float[Tensor, "*b 4"], action: Tensor, size: Float[Tensor, "*b 2"], dt: float
+    ) -> Float[Tensor, "*b 4"]:
+        """The state after one action."""
+        ...
+
+    def fit(
+        self,
+        position: Float[Tensor, "*b T 2"],
+        heading: Float[Tensor, "*b T"],
+        speed: Float[Tensor, "*b T"],
+        valid: Bool[Tensor, "*b T"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> tuple[Tensor, Float[Tensor, "*b T 4"]]:
+        """Actions [*b, T - 1(, 2)] that follow a log, and the states they lead through."""
+        ...
+
+
+@dataclass(frozen=True)
+class Bicycle:
+    """Kinematic bicycle with a grid of discrete actions (paper, section V-A: 7 accelerations x 21 steering angles).
+
+    The joint index of an action is ``acceleration_index * num_steering + steering_index``. Steering angles are
+    spaced quadratically, so that they are dense near straight ahead.
+
+    Attributes:
+        max_acceleration: m/s^2, the grid is symmetric.
+        num_acceleration: size of the acceleration grid (odd, so that 0 is in it).
+        max_steering: radians.
+        num_steering: size of the steering grid (odd).
+        heading_weight: metres that one radian of heading error counts for in the greedy fit.
+        speed_weight: metres that one m/s of speed error counts for in the greedy fit.
+    """
+
+    max_acceleration: float = 4.0
+    num_acceleration: int = 7
+    max_steering: float = 0.5
+    num_steering: int = 21
+    heading_weight: float = 1.0
+    speed_weight: float = 0.1
+    discrete: Literal[True] = True
+
+    @property
+    def num_actions(self) -> int:
+        """Number of joint actions."""
+        return self.num_acceleration * self.num_steering
+
+    def grid(self, like: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+        """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
+        half, wide = self.num_acceleration // 2, self.num_steering // 2
+        # Counted from the middle, so that the middle is exactly zero.
+        acceleration = (torch.arange(self.num_acceleration) - half) * (self.max_acceleration / half)
+        unit = (torch.arange(self.num_steering) - wide) / wide
+        steering = self.max_steering * unit * unit.abs()
+        return (
+            acceleration.repeat_interleave(self.num_steering).to(like),
+            steering.repeat(self.num_acceleration).to(like),
+        )
+
+    def step(
+        self,
+        state: Float[Tensor, "*b 4"],
+        action: Int[Tensor, "*b"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> Float[Tensor, "*b 4"]:
+        """Apply joint action indices."""
+        acceleration, steering = self.grid(state)
+        return bicycle_step(state, acceleration[action], steering[action], size[..., 0], dt)
+
+    @torch.no_grad()
+    def fit(
+        self,
+        position: Float[Tensor, "*b T 2"],
+        heading: Float[Tensor, "*b T"],
+        speed: Float[Tensor, "*b T"],
+        valid: Bool[Tensor, "*b T"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> tuple[Int[Tensor, "*b Tm1"], Float[Tensor, "*b T 4"]]:
+        """Greedy fit of a log: at each step the action whose next state is nearest the logged one.
+
+        Continues from the *fitted* state, so errors do not accumulate unseen. Where the next logged step is not
+        valid the agent keeps its speed and course, and where it reappears the fit starts anew from the log.
+
+        Returns:
+            Joint action indices [*b, T - 1] and fitted states [*b, T, 4].
+        """
+        acceleration, steering = self.grid(position)
+        logged = torch.cat([position, heading[..., None], speed.clamp_min(0.0)[..., None]], -1)
+        coast = self.num_actions // 2
+        state, states, actions = logged[..., 0, :], [logged[..., 0, :]], []
+        for t in range(1, position.shape[-2]):
+            target = logged[..., t, :]
+            after = bicycle_step(
+                state[..., None, :].expand(*state.shape[:-1], self.num_actions, 4),
+                acceleration,
+                steering,
+                size[..., :1],
+                dt,
+            )
+            error = (
+                (after[..., :2] - target[..., None, :2]).square().sum(-1)
+                + (self.heading_weight * wrap(after[..., 2] - target[..., None, 2])).square()
+                + (self.speed_weight * (after[..., 3] - target[..., None, 3])).square()
+            )
+            known = valid[..., t - 1] & valid[..., t]
+            action = torch.where(known, error.argmin(-1), torch.full_like(error.argmin(-1), coast))
+            index = action[..., None, None].expand(*action.shape, 1, 4)
+            state = after.gather(-2, index).squeeze(-2)
+            restart = valid[..., t] & ~valid[..., t - 1]
+            state = torch.where(restart[..., None], target, state)
+            states.append(state)
+            actions.append(action)
+        return torch.stack(actions, -1), torch.stack(states, -2)
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Continuous displacement in the agent's own frame (the action space the paper uses for MGAIL)."""
+
+    discrete: Literal[False] = False
+
+    def step(
+        self,
+        state: Float[Tensor, "*b 4"],
+        action: Float[Tensor, "*b 2"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> Float[Tensor, "*b 4"]:
+        """Apply displacements in metres."""
+        return displacement_step(state, action, size[..., 0], dt)
+
+    @torch.no_grad()
+    def fit(
+        self,
+        position: Float[Tensor, "*b T 2"],
+        heading: Float[Tensor, "*b T"],
+        speed: Float[Tensor, "*b T"],
+        valid: Bool[Tensor, "*b T"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
+        """Displacements that reach every valid logged position exactly; headings follow from the motion."""
+        logged = torch.cat([position, heading[..., None], speed[..., None]], -1)
+        state, states, actions = logged[..., 0, :], [logged[..., 0, :]], []
+        for t in range(1, position.shape[-2]):
+            target = logged[..., t, :]
+            known = (valid[..., t - 1] & valid[..., t])[..., None]
+            coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)
+            action = torch.where(known, displacement_inverse(state, target), coast)
+            state = displacement_step(state, action, size[..., 0], dt)
+            restart = (valid[..., t] & ~valid[..., t - 1])[..., None]
+            state = torch.where(restart, target, state)
+            states.append(state)
+            actions.append(action)
+        return torch.stack(actions, -2), torch.stack(states, -2)

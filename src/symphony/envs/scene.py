@@ -1,0 +1,254 @@
+"""From run segments to the padded tensors a simulation reads: the static part, stored once per segment.
+
+Shapes: B scenes, A agents, N interactive agents, T logged steps, P map and light points, Q lights, E boundary
+segments. World frame of the segment, SI units.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from shapely import LineString
+from tensordict import TensorClass
+from torch import Tensor
+
+from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
+from symphony.data.selection import interactive_agents
+from symphony.errors import DataError
+from symphony.geometry.polylines import segments_of
+
+SPACING = 2.0
+"""Metres between the points that stand for a polyline in the observation."""
+BOUNDARY_TOLERANCE = 0.02
+"""Metres by which the simplified road boundary may depart from the given one."""
+
+
+class PointType(IntEnum):
+    """What a point of the observation stands for."""
+
+    LANE = 0
+    BIKE_LANE = 1
+    BOUNDARY = 2
+    ROAD_LINE = 3
+    CROSSWALK = 4
+    STOP_SIGN = 5
+    OTHER = 6
+    LIGHT = 7
+
+
+_MARKS = {
+    MarkType.ROAD_LINE: PointType.ROAD_LINE,
+    MarkType.CROSSWALK: PointType.CROSSWALK,
+    MarkType.STOP_SIGN: PointType.STOP_SIGN,
+}
+
+
+class SceneBatch(TensorClass):
+    """B run segments as padded tensors; a mask travels with every padded field.
+
+    Attributes:
+        log_state: [B, T, A, 5] x, y, heading, velocity x, velocity y (step-major, so that one step is one row).
+        log_valid: [B, T, A].
+        box_size: [B, A, 2] length, width.
+        agent_type: [B, A] int64.
+        interactive: [B, N] int64 rows of A; 0 for padding.
+        interactive_valid: [B, N].
+        last_step: [B] int64, the segment's last logged step.
+        point: [B, P, 2].
+        point_direction: [B, P, 2] unit vector along the line; for lights from the stop point to where their lane
+            leads.
+        point_type: [B, P] int64, :class:`PointType`.
+        point_speed: [B, P] speed limit of the lane, m/s, 0 where unknown.
+        point_light: [B, P] int64 row of Q for lights, else -1.
+        point_valid: [B, P].
+        light: [B, T, Q] int64, ``SignalState``.
+        edge_start: [B, E, 2] boundary segments, the drivable side on their left.
+        edge_end: [B, E, 2].
+        edge_previous: [B, E] int64 segment that ends where this one starts, -1 if none.
+        edge_following: [B, E] int64.
+        edge_valid: [B, E].
+        stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
+    """
+
+    log_state: Tensor
+    log_valid: Tensor
+    box_size: Tensor
+    agent_type: Tensor
+    interactive: Tensor
+    interactive_valid: Tensor
+    last_step: Tensor
+    point: Tensor
+    point_direction: Tensor
+    point_type: Tensor
+    point_speed: Tensor
+    point_light: Tensor
+    point_valid: Tensor
+    light: Tensor
+    edge_start: Tensor
+    edge_end: Tensor
+    edge_previous: Tensor
+    edge_following: Tensor
+    edge_valid: Tensor
+    stream: Tensor
+
+
+def scene(segment: RunSegment, interactive: int | Sequence[int] = 2) -> SceneBatch:
+    """One run segment as a batch of one scene, without padding.
+
+    Args:
+        segment: a validated run segment.
+        interactive: how many agents are interactive (chosen by the paper's rule), or their rows.
+
+    Raises:
+        DataError: if the segment has fewer usable agents.
+    """
+    if isinstance(interactive, int):
+        chosen = interactive_agents(segment, interactive)
+    else:
+        chosen = np.asarray(interactive, dtype=np.int64)
+        if not (segment.valid[chosen, 0]).all():
+            raise DataError(
+                "an interactive agent is not valid at the first step",
+                segment=segment.segment_id,
+                field="interactive",
+            )
+    log = np.concatenate(
+        [segment.position[..., :2], segment.heading[..., None], segment.velocity], axis=-1
+    ).swapaxes(0, 1)
+    start, end, previous, following = _edges(segment.road.boundary)
+    fields: dict[str, NDArray[Any]] = {
+        "log_state": log,
+        "log_valid": segment.valid.T,
+        "box_size": segment.size[:, :2],
+        "agent_type": segment.agent_type.astype(np.int64),
+        "interactive": chosen.astype(np.int64),
+        "interactive_valid": np.ones(len(chosen), bool),
+        "last_step": np.array(segment.num_steps - 1),
+        "light": segment.signal_state.T.astype(np.int64),
+        "edge_start": start,
+        "edge_end": end,
+        "edge_previous": previous,
+        "edge_following": following,
+        "edge_valid": np.ones(len(start), bool),
+        "stream": np.array(stream_of(segment.segment_id)),
+        **_points(segment),
+    }
+    return SceneBatch(
+        **{name: torch.from_numpy(np.array(value))[None] for name, value in fields.items()}, batch_size=[1]
+    )
+
+
+def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
+    """Stack scenes into one batch, padded to the largest of each size.
+
+    Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``.
+    """
+    fields = {}
+    for name in SceneBatch.__annotations__:
+        values = [getattr(item, name) for item in scenes]
+        shape = [max(sizes) for sizes in zip(*(v.shape[1:] for v in values), strict=True)]
+        fill = -1 if name in _INDEX_FIELDS else 0
+        out = values[0].new_full((sum(len(v) for v in values), *shape), fill)
+        row = 0
+        for value in values:
+            block = out[row : row + len(value)]
+            block[tuple(slice(0, size) for size in value.shape)] = value
+            row += len(value)
+        fields[name] = out
+    return SceneBatch(**fields, batch_size=[len(fields["stream"])])
+
+
+_INDEX_FIELDS = {"point_light", "edge_previous", "edge_following"}
+
+
+def stream_of(segment_id: str) -> int:
+    """A 63-bit number derived from a segment id alone."""
+    return int.from_bytes(hashlib.sha256(segment_id.encode()).digest()[:8], "little") >> 1
+
+
+def _edges(boundary: Polylines) -> tuple[NDArray[Any], ...]:
+    lines = [
+        np.asarray(LineString(boundary[k][:, :2].astype(np.float64)).simplify(BOUNDARY_TOLERANCE).coords)
+        for k in range(len(boundary))
+    ]
+    simple = Polylines.of(lines)
+    return segments_of(simple.points[:, :2], simple.offsets)
+
+
+def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
+    """Lanes, boundary and marks as evenly spaced points, then one point per light."""
+    road = segment.road
+    bike = np.where(road.lane_type == LaneType.BIKE_LANE, PointType.BIKE_LANE, PointType.LANE)
+    marks = np.array([_MARKS.get(MarkType(kind), PointType.OTHER) for kind in road.mark_type], np.int64)
+    groups: list[tuple[Polylines, NDArray[Any], NDArray[Any]]] = [
+        (road.lanes, bike, np.nan_to_num(road.speed_limit)),
+        (road.boundary, np.full(len(road.boundary), PointType.BOUNDARY), np.zeros(len(road.boundary))),
+        (road.marks, marks, np.zeros(len(road.marks))),
+    ]
+    point, direction, kind, speed = [], [], [], []
+    for lines, types, limits in groups:
+        where, along, line = resample_lines(lines, SPACING)
+        point.append(where)
+        direction.append(along)
+        kind.append(types[line])
+        speed.append(limits[line])
+    lights = len(segment.signal_lane)
+    ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32).reshape(-1, 2)
+    point.append(segment.signal_point[:, :2])
+    direction.append(_unit(ends - segment.signal_point[:, :2]))
+    kind.append(np.full(lights, PointType.LIGHT))
+    speed.append(np.zeros(lights))
+    light = np.concatenate([np.full(sum(map(len, point[:-1])), -1), np.arange(lights)])
+    return {
+        "point": np.concatenate(point).astype(np.float32),
+        "point_direction": np.concatenate(direction).astype(np.float32),
+        "point_type": np.concatenate(kind).astype(np.int64),
+        "point_speed": np.concatenate(speed).astype(np.float32),
+        "point_light": light.astype(np.int64),
+        "point_valid": np.ones(len(light), bool),
+    }
+
+
+def resample_lines(
+    lines: Polylines, spacing: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
+    """Points [P, 2] at most ``spacing`` metres apart along each line (ends included), unit directions [P, 2] and
+    the line each belongs to [P]. A line without length is one point with direction 0.
+    """
+    xy = lines.points[:, :2].astype(np.float64)
+    owner = lines.line_index
+    if len(xy) == 0:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
+    step = np.zeros(len(xy))
+    inside = owner[1:] == owner[:-1]
+    step[1:][inside] = np.linalg.norm(np.diff(xy, axis=0), axis=-1)[inside]
+    # One running arc length over all lines, a metre apart, lets one interpolation serve all.
+    step[1:][~inside] = 1.0
+    arc = np.cumsum(step)
+    first, last = arc[lines.offsets[:-1]], arc[lines.offsets[1:] - 1]
+    length = last - first
+    # A length within a thousandth of a multiple counts as that multiple, so that rounding adds no point.
+    pieces = np.maximum(np.ceil(length / spacing - 1e-3).astype(np.int64), 1)
+    count = np.where(length > 0, pieces + 1, 1)
+    line = np.repeat(np.arange(len(lines)), count)
+    rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    share = rank / np.maximum(count[line] - 1, 1)
+    at = first[line] + share * length[line]
+    point = np.stack([np.interp(at, arc, xy[:, axis]) for axis in (0, 1)], -1)
+    half = np.minimum(0.5 * spacing, 0.5 * length[line])
+    ahead, behind = np.minimum(at + half, last[line]), np.maximum(at - half, first[line])
+    chord = np.stack(
+        [np.interp(ahead, arc, xy[:, axis]) - np.interp(behind, arc, xy[:, axis]) for axis in (0, 1)], -1
+    )
+    return point.astype(np.float32), _unit(chord).astype(np.float32), line
+
+
+def _unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(norm > 1e-6, norm, 1.0)

@@ -1,0 +1,45 @@
+"""Errors a user can meet, each naming where it happened."""
+
+from __future__ import annotations
+
+
+class SymphonyError(Exception):
+    """Base of every error this package raises on bad input; the command line prints it without a traceback."""
+
+
+class DataError(SymphonyError):
+    """Bad or unusable data.
+
+    Args:
+        message: what is wrong.
+        file: the file it was read from.
+        segment: the id of the run segment.
+        field: the field of the segment, as written in the schema or the format.
+    """
+
+    def __init__(
+        self, message: str, *, file: object = None, segment: str | None = None, field: str | None = None
+    ) -> None:
+        self.message, self.file, self.segment, self.field = message, file, segment, field
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        places = (("file", self.file), ("segment", self.segment), ("field", self.field))
+        where = ", ".join(f"{name} {value}" for name, value in places if value is not None)
+        return f"{where}: {self.message}" if where else self.message
+
+    def at(self, *, file: object = None, segment: str | None = None) -> DataError:
+        """The same error (same class) with the places that were still unknown filled in."""
+        error = type(self).__new__(type(self))
+        DataError.__init__(
+            error,
+            self.message,
+            file=self.file if self.file is not None else file,
+            segment=self.segment if self.segment is not None else segment,
+            field=self.field,
+        )
+        return error
+
+
+class ConfigError(SymphonyError):
+    """An argument or a saved configuration that can't be used."""

@@ -1,0 +1,20 @@
+"""Pure batched tensor functions: frames, oriented boxes, signed distances."""
+
+from __future__ import annotations
+
+from symphony.geometry.boxes import box_corners, box_gap, boxes_overlap
+from symphony.geometry.frames import from_frame, rotate, to_frame, wrap
+from symphony.geometry.polylines import NO_BOUNDARY, segments_of, signed_distance
+
+__all__ = [
+    "NO_BOUNDARY",
+    "box_corners",
+    "box_gap",
+    "boxes_overlap",
+    "from_frame",
+    "rotate",
+    "segments_of",
+    "signed_distance",
+    "to_frame",
+    "wrap",
+]

@@ -1,0 +1,39 @@
+"""Angles and planar frames. Angles in radians counter-clockwise from +x, any leading dimensions."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def wrap(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angle in [-pi, pi); one already there comes back bit for bit. The gradient is 1 everywhere."""
+    turns = torch.floor((angle.detach() + math.pi) / (2 * math.pi))
+    wrapped = angle - turns * (2 * math.pi)
+    # Rounding can leave the result one turn off at either end of the interval.
+    wrapped = torch.where(wrapped < -math.pi, wrapped + 2 * math.pi, wrapped)
+    return torch.where(wrapped >= math.pi, wrapped - 2 * math.pi, wrapped)
+
+
+def rotate(vectors: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch 2"]:
+    """Turn vectors counter-clockwise by ``angle``; leading dimensions broadcast."""
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
+
+
+def to_frame(
+    points: Float[Tensor, "*batch 2"], origin: Float[Tensor, "*#batch 2"], heading: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch 2"]:
+    """World points in the frame at ``origin`` whose x axis points along ``heading`` (y to the left)."""
+    return rotate(points - origin, -heading)
+
+
+def from_frame(
+    points: Float[Tensor, "*batch 2"], origin: Float[Tensor, "*#batch 2"], heading: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch 2"]:
+    """Inverse of :func:`to_frame`."""
+    return rotate(points, heading) + origin

@@ -1,0 +1,241 @@
+"""Signed distance to oriented polylines, such as the edge of the drivable area."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+NO_BOUNDARY = -1e6
+"""Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
+
+CLOSED_WITHIN = 1e-3
+"""Metres between the ends of two lines (or of one line) below which they count as joined."""
+
+_BLOCK = 1 << 18
+"""Distances held at a time on the CPU, so that the temporaries stay in the cache."""
+
+_FOLD = 16
+"""Parts into which a row is folded to find its smallest element."""
+
+_FAR = 1e15
+"""Offset of a segment that is not there."""
+
+
+def signed_distance(
+    points: Float[Tensor, "B M 2"],
+    start: Float[Tensor, "B E 2"],
+    end: Float[Tensor, "B E 2"],
+    valid: Bool[Tensor, "B E"],
+    previous: Int[Tensor, "B E"] | None = None,
+    following: Int[Tensor, "B E"] | None = None,
+) -> Float[Tensor, "B M"]:
+    """Signed distance of points to the nearest oriented segment: positive on its right, negative on its left.
+
+    With the drivable side on the left (see ``RoadMap.boundary``) positive means off the road. The absolute
+    value is the Euclidean distance. Segments of no length and those not valid are ignored; a scene without
+    segments gives :data:`NO_BOUNDARY`. Differentiable in ``points`` (the nearest segment is held fixed).
+
+    Args:
+        points: [B, M, 2] metres.
+        start: [B, E, 2] first point of each segment.
+        end: [B, E, 2] last point of each segment.
+        valid: [B, E] which segments exist.
+        previous: [B, E] index of the segment that ends where this one starts, -1 if none. With it and
+            ``following`` the sign is right at corners too, where the nearest point is shared by two segments.
+        following: [B, E] index of the segment that starts where this one ends, -1 if none.
+    """
+    if start.shape[1] == 0:
+        return points.sum(-1) * 0 + NO_BOUNDARY
+    with torch.no_grad():
+        valid = valid & ((start[..., 0] != end[..., 0]) | (start[..., 1] != end[..., 1]))
+        nearest = _nearest_segment(points.detach(), start, end, valid)
+    here = _Side.of(points, _take(start, nearest), _take(end, nearest))
+    sign = here.sign
+    if previous is not None:
+        sign = torch.where(
+            here.fraction < 0, _corner_sign(points, start, end, valid, previous, nearest, here, False), sign
+        )
+    if following is not None:
+        sign = torch.where(
+            here.fraction > 1, _corner_sign(points, start, end, valid, following, nearest, here, True), sign
+        )
+    inner = (here.fraction >= 0) & (here.fraction <= 1)
+    distance = torch.where(inner, here.offset, sign * here.to_end)
+    return torch.where(valid.any(-1, keepdim=True), distance, NO_BOUNDARY)
+
+
+class _Side:
+    """Where points [B, M, 2] lie relative to one segment each."""
+
+    def __init__(self, fraction: Tensor, offset: Tensor, to_end: Tensor, direction: Tensor) -> None:
+        self.fraction, self.offset, self.to_end, self.direction = fraction, offset, to_end, direction
+
+    @classmethod
+    def of(cls, points: Tensor, start: Tensor, end: Tensor) -> _Side:
+        along = end - start
+        squared = along.square().sum(-1)
+        squared = torch.where(squared > 0, squared, 1.0)
+        away = points - start
+        fraction = ((away * along).sum(-1) / squared).detach()
+        # Positive to the right of the direction of travel.
+        offset = (away[..., 0] * along[..., 1] - away[..., 1] * along[..., 0]) * squared.rsqrt()
+        gap = (away - (fraction > 0.5)[..., None] * along).square().sum(-1)
+        apart = gap > 0
+        to_end = torch.where(apart, torch.where(apart, gap, 1.0).sqrt(), 0.0)
+        return cls(fraction, offset, to_end, along)
+
+    @property
+    def sign(self) -> Tensor:
+        """+1 on the right, -1 on the left and on the line itself."""
+        return torch.where(self.offset.detach() > 0, 1.0, -1.0).to(self.offset.dtype)
+
+
+def _corner_sign(
+    points: Tensor,
+    start: Tensor,
+    end: Tensor,
+    valid: Tensor,
+    neighbor: Tensor,
+    nearest: Tensor,
+    here: _Side,
+    ahead: bool,
+) -> Tensor:
+    """Sign at a corner: right of either segment where the line turns left, of both where it turns right."""
+    index = neighbor.gather(1, nearest)
+    exists = (index >= 0) & valid.gather(1, index.clamp(min=0))
+    index = index.clamp(min=0)
+    other = _Side.of(points, _take(start, index), _take(end, index))
+    first, second = (here, other) if ahead else (other, here)
+    left = _cross(first.direction, second.direction) > 0
+    both = torch.where(left, torch.maximum(here.sign, other.sign), torch.minimum(here.sign, other.sign))
+    return torch.where(exists, both, here.sign)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _take(values: Tensor, index: Tensor) -> Tensor:
+    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def _nearest_segment(points: Tensor, start: Tensor, end: Tensor, valid: Tensor) -> Tensor:
+    """Index [B, M] of the nearest valid segment."""
+    batch, count, _ = points.shape
+    edges = start.shape[1]
+    if batch == 0 or count == 0:
+        return torch.zeros(batch, count, dtype=torch.long, device=points.device)
+    # Coordinates relative to the points' centre keep float32 rounding well below a millimetre.
+    center = points.mean(1, keepdim=True)
+    x, y = (points - center)[..., None].unbind(2)
+    axes = _segment_axes(start, end, valid, center)
+    width, group = edges, batch
+    if points.device.type == "cpu":
+        width = min(edges, max(1, _BLOCK // count))
+        group = min(batch, max(1, _BLOCK // (count * width)))
+    # Each block of distances is written into the same two buffers: fresh ones would cost page faults.
+    buffers = points.new_empty(2, group * count * width)
+    result = torch.empty(batch, count, dtype=torch.long, device=points.device)
+    for b in range(0, batch, group):
+        rows = slice(b, b + group)
+        best = points.new_full((min(group, batch - b), count), torch.inf)
+        for e in range(0, edges, width):
+            unit_x, unit_y, along, across, half = axes[:, rows, None, e : e + width]
+            shape = len(best), count, unit_x.shape[-1]
+            beyond, side = (buffer[: shape[0] * count * shape[2]].view(shape) for buffer in buffers)
+            torch.addcmul(along, x[rows], unit_x, out=beyond).addcmul_(y[rows], unit_y)
+            beyond.abs_().sub_(half).clamp_(min=0).square_()
+            torch.addcmul(across, x[rows], unit_y, out=side).addcmul_(y[rows], unit_x, value=-1)
+            smallest, index = _argmin(beyond.addcmul_(side, side))
+            better = smallest < best
+            result[rows] = torch.where(better, index + e, result[rows] if e else index)
+            best = torch.where(better, smallest, best)
+    return result
+
+
+def _argmin(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Minimum over the last dimension and where it is.
+
+    In two levels, because on the CPU the index costs ten times as much as the minimum itself.
+    """
+    size = values.shape[-1]
+    fold = size // _FOLD
+    if fold < 2 or values.device.type != "cpu":
+        return values.min(-1)
+    body = values[..., : fold * _FOLD].unflatten(-1, (_FOLD, fold))
+    smallest, column = body.amin(-2).min(-1)
+    lane = body.gather(-1, column[..., None, None].expand(*column.shape, _FOLD, 1))[..., 0].min(-1).indices
+    index = lane * fold + column
+    if fold * _FOLD == size:
+        return smallest, index
+    rest, tail = values[..., fold * _FOLD :].min(-1)
+    return torch.minimum(rest, smallest), torch.where(rest < smallest, tail + fold * _FOLD, index)
+
+
+def _segment_axes(start: Tensor, end: Tensor, valid: Tensor, center: Tensor) -> Tensor:
+    """Each segment's unit vector, offsets along (from its middle) and across, and half length: [5, B, E].
+
+    Component by component: operations on a last dimension of 2 are ten times slower.
+    """
+    # Padding may hold anything, NaN included.
+    zero = start.new_zeros(())
+    x0, y0 = (
+        torch.where(valid, v - c, zero) for v, c in zip(start.unbind(-1), center.unbind(-1), strict=True)
+    )
+    x1, y1 = (torch.where(valid, v - c, zero) for v, c in zip(end.unbind(-1), center.unbind(-1), strict=True))
+    out = start.new_empty(5, *valid.shape)
+    unit_x, unit_y, along, across, half = out.unbind()
+    torch.sub(x1, x0, out=unit_x)
+    torch.sub(y1, y0, out=unit_y)
+    torch.hypot(unit_x, unit_y, out=half)
+    inverse = torch.where(valid, half, 1.0).reciprocal_()
+    unit_x.mul_(inverse)
+    unit_y.mul_(inverse)
+    half.mul_(0.5)
+    x, y = x0.add_(x1).mul_(-0.5), y0.add_(y1).mul_(-0.5)
+    torch.mul(x, unit_x, out=along).addcmul_(y, unit_y)
+    torch.mul(x, unit_y, out=across).addcmul_(y, unit_x, value=-1)
+    across.masked_fill_(~valid, _FAR)
+    return out
+
+
+def segments_of(
+    points: NDArray[Any], offsets: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.int64], NDArray[np.int64]]:
+    """Cut ragged polylines into the segments :func:`signed_distance` takes.
+
+    Line k is ``points[offsets[k]:offsets[k + 1]]``. A line whose last point lies within :data:`CLOSED_WITHIN`
+    of its first one is a ring; a line that starts where exactly one other line ends continues it. Repeated
+    points are dropped.
+
+    Args:
+        points: [P, 2 or more] of which x and y are used.
+        offsets: [K + 1].
+
+    Returns:
+        Start [E, 2], end [E, 2], and the indices [E] of the previous and the following segment (-1: none).
+    """
+    points = np.asarray(points)[:, :2]
+    counts = np.diff(offsets)
+    line = np.repeat(np.arange(len(counts)), counts)
+    joined = np.flatnonzero((line[1:] == line[:-1]) & (points[1:] != points[:-1]).any(-1))
+    start, end, line = points[joined], points[joined + 1], line[joined]
+    number = np.arange(len(line))
+    same = np.append(line[1:] == line[:-1], False)[: len(line)]
+    following = np.where(same, number + 1, -1)
+    previous = np.where(np.roll(same, 1), number - 1, -1)
+    first, last = np.flatnonzero(previous < 0), np.flatnonzero(following < 0)
+    meet = np.abs(end[last, None] - start[None, first]).max(-1) <= CLOSED_WITHIN
+    own = meet & (line[last, None] == line[None, first])
+    # A ring's own ends come first; other lines are joined only where the match is one to one.
+    other = meet & ~own.any(1)[:, None] & ~own.any(0)[None]
+    other &= (other.sum(1) == 1)[:, None] & (other.sum(0) == 1)[None]
+    tail, head = np.nonzero(own | other)
+    following[last[tail]] = first[head]
+    previous[first[head]] = last[tail]
+    return start, end, previous.astype(np.int64), following.astype(np.int64)

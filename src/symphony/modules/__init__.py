@@ -1,0 +1,25 @@
+"""Encoders and policy heads as TensorDict modules."""
+
+from __future__ import annotations
+
+from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+from symphony.modules.policy import NoiseSampler, discrete_policy
+from symphony.modules.pooling import pool_elements
+from symphony.modules.rows import in_blocks, mlp
+from symphony.modules.sampling import fold_in, inverse_cdf, stream_of, uniform
+
+__all__ = [
+    "ElementGroup",
+    "NoiseSampler",
+    "SceneEncoder",
+    "SceneNetwork",
+    "discrete_policy",
+    "fold_in",
+    "in_blocks",
+    "inverse_cdf",
+    "mlp",
+    "pool_elements",
+    "scene_module",
+    "stream_of",
+    "uniform",
+]

@@ -1,0 +1,101 @@
+"""From what an agent observes to one vector: its own features and pooled sets of elements around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from symphony.keys import OWN, VALID
+from symphony.modules.pooling import PoolMode, pool_elements
+from symphony.modules.rows import in_blocks, mlp
+
+
+@dataclass(frozen=True)
+class ElementGroup:
+    """One type of element that an agent observes (objects, road points, a route): an encoder and a pool of its own.
+
+    Attributes:
+        key: float `[..., N, K, features]`; K may differ from call to call.
+        mask_key: bool `[..., N, K]`, True where an element is valid.
+        features: features of one element.
+    """
+
+    key: NestedKey
+    mask_key: NestedKey
+    features: int
+
+
+class SceneEncoder(nn.Module):
+    """Encode each element by an MLP, max-pool per group, concatenate with the encoded own features (paper, III-C).
+
+    Masked elements, padded agents (`valid` False: all their inputs count as absent) and the other agents of
+    the batch have no influence on an agent's vector. Features should come scaled to order one.
+
+    Args:
+        own_features: features of the agent itself.
+        group_features: features of one element, per group.
+        hidden: width of every encoder.
+        pool: how to pool, see :func:`symphony.modules.pool_elements`.
+
+    Attributes:
+        width: size D of the vector, `hidden * (1 + number of groups)`.
+    """
+
+    def __init__(
+        self, own_features: int, group_features: Sequence[int], *, hidden: int = 64, pool: PoolMode = "auto"
+    ) -> None:
+        super().__init__()
+        self.own = mlp((own_features, hidden, hidden))
+        self.groups = nn.ModuleList(mlp((features, hidden, hidden)) for features in group_features)
+        self.pool: PoolMode = pool
+        self.width = hidden * (1 + len(self.groups))
+
+    def forward(self, own: Tensor, valid: Tensor, *elements_and_masks: Tensor) -> Tensor:
+        """Own features `[..., N, Fs]`, mask `[..., N]`, then elements and mask of each group; `[..., N, D]`."""
+        if len(elements_and_masks) != 2 * len(self.groups):
+            raise ValueError(
+                f"expected elements and mask of {len(self.groups)} groups, got {len(elements_and_masks)} tensors"
+            )
+        parts = [in_blocks(self.own, torch.where(valid[..., None], own, 0.0))]
+        pairs = zip(elements_and_masks[::2], elements_and_masks[1::2], strict=True)
+        for encoder, (elements, mask) in zip(self.groups, pairs, strict=True):
+            parts.append(pool_elements(encoder, elements, mask & valid[..., None], mode=self.pool))
+        # ReLU is monotone: after the maximum it is the same as before it, and far cheaper.
+        return torch.relu(torch.cat(parts, -1))
+
+
+class SceneNetwork(nn.Module):
+    """A :class:`SceneEncoder` and an MLP head on its vector, giving `[..., N, outputs]`.
+
+    Args:
+        encoder: the encoder; not shared with another network unless the same object is passed to both.
+        outputs: size of the result.
+        head: widths of the head's hidden layers.
+    """
+
+    def __init__(self, encoder: SceneEncoder, outputs: int, *, head: Sequence[int] = (128, 128)) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.head = mlp((encoder.width, *head, outputs))
+
+    def forward(self, own: Tensor, valid: Tensor, *elements_and_masks: Tensor) -> Tensor:
+        """Inputs as for :class:`SceneEncoder`."""
+        return in_blocks(self.head, self.encoder(own, valid, *elements_and_masks))
+
+
+def scene_module(
+    network: SceneEncoder | SceneNetwork,
+    groups: Sequence[ElementGroup],
+    out_key: NestedKey,
+    *,
+    own_key: NestedKey = OWN,
+    valid_key: NestedKey = VALID,
+) -> TensorDictModule:
+    """Wrap a network over scenes so that it reads its inputs, in order, from a TensorDict."""
+    pairs = [key for group in groups for key in (group.key, group.mask_key)]
+    return TensorDictModule(network, in_keys=[own_key, valid_key, *pairs], out_keys=[out_key])

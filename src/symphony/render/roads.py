@@ -1,0 +1,177 @@
+"""The map below the agents: road surface, lanes, boundary, marks and lights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+from numpy.typing import NDArray
+
+from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
+from symphony.render.style import BOUNDARY, CAUTION, GO, INK, LANE, MARK, ROAD, STOP, View
+
+DEFAULT_WIDTH = 3.6
+"""Metres, for lanes whose width the source does not give."""
+BIKE_WIDTH = 1.6
+SLIT = 0.4
+ARROW_SPACING = 14.0
+ARROW = np.array([(-0.7, 0.7), (0.0, 0.0), (-0.7, -0.7)])
+"""Metres: a chevron whose tip is at the origin, pointing along +x."""
+
+# Shape as well as colour, so that the lights can be told apart without seeing red and green.
+SIGNALS = {
+    "stop": ("s", STOP, {SignalState.STOP, SignalState.ARROW_STOP, SignalState.FLASHING_STOP}),
+    "caution": ("D", CAUTION, {SignalState.CAUTION, SignalState.ARROW_CAUTION, SignalState.FLASHING_CAUTION}),
+    "go": ("o", GO, {SignalState.GO, SignalState.ARROW_GO}),
+}
+
+
+def draw_roads(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
+    """Draw the part of a map that touches the view.
+
+    Returns:
+        Legend entries for what needs explaining.
+    """
+    surface = shapely.union_all([road_ribbon(road, k) for k in _visible(road.lanes, view)])
+    # Closes the slits where one lane meets the next at an angle.
+    surface = surface.buffer(SLIT, quad_segs=2).buffer(-SLIT, quad_segs=2)
+    for polygon in () if surface.is_empty else shapely.get_parts(surface):
+        axes.add_patch(
+            PathPatch(_outline(polygon), facecolor=ROAD, edgecolor="none", zorder=1, gid="surface")
+        )
+    entries = _draw_marks(axes, road, view)
+    lanes = [road.lanes[k][:, :2] for k in _visible(road.lanes, view)]
+    axes.add_collection(
+        LineCollection(lanes, colors=LANE, linewidths=0.6, zorder=3, gid="lanes"), autolim=False
+    )
+    chevrons = [arrow for lane in lanes for arrow in lane_arrows(lane)]
+    axes.add_collection(
+        LineCollection(chevrons, colors="#AEB4BC", linewidths=0.7, zorder=3, gid="directions"), autolim=False
+    )
+    edges = [road.boundary[k][:, :2] for k in _visible(road.boundary, view)]
+    axes.add_collection(
+        LineCollection(edges, colors=BOUNDARY, linewidths=1.2, zorder=4, gid="boundary"), autolim=False
+    )
+    return entries
+
+
+def draw_signals(axes: Axes, segment: RunSegment, step: int, view: View) -> list[Line2D]:
+    """Draw the lights at their stop points as they are at a step.
+
+    Returns:
+        Legend entries for the states that can be seen.
+    """
+    point, state = segment.signal_point[:, :2], segment.signal_state[:, step]
+    inside = _inside(point, view)
+    entries: list[Line2D] = []
+    for name, (marker, color, states) in SIGNALS.items():
+        chosen = inside & np.isin(state, [int(s) for s in states])
+        if chosen.any():
+            style: dict[str, Any] = {"marker": marker, "zorder": 6, "linewidths": 0.7, "edgecolors": "white"}
+            axes.scatter(point[chosen, 0], point[chosen, 1], s=26, c=color, gid=f"signals-{name}", **style)
+            entries.append(_marker_entry(marker, color, f"light: {name}"))
+    unknown = inside & (state == SignalState.UNKNOWN)
+    if unknown.any():
+        axes.scatter(
+            point[unknown, 0],
+            point[unknown, 1],
+            s=16,
+            c="none",
+            edgecolors=INK,
+            linewidths=0.6,
+            zorder=6,
+            gid="signals-unknown",
+        )
+    return entries
+
+
+def _marker_entry(marker: str, color: str, label: str) -> Line2D:
+    return Line2D([], [], linestyle="none", marker=marker, color=color, markersize=5.5, label=label)
+
+
+def _draw_marks(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
+    lines, signs = [], []
+    for k in _visible(road.marks, view):
+        points, kind = road.marks[k][:, :2], road.mark_type[k]
+        if kind == MarkType.STOP_SIGN:
+            signs.append(points[0])
+        elif kind in {MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.DRIVEWAY} and len(points) > 2:
+            stripes = "||||" if kind == MarkType.CROSSWALK else None
+            axes.add_patch(
+                PathPatch(
+                    Outline(np.concatenate([points, points[:1]]), closed=True),
+                    facecolor="#EFEDE8",
+                    edgecolor=MARK,
+                    hatch=stripes,
+                    linewidth=0.5,
+                    zorder=2,
+                    gid=f"mark-{MarkType(kind).name.lower()}",
+                )
+            )
+        else:
+            lines.append(points)
+    axes.add_collection(
+        LineCollection(lines, colors=MARK, linewidths=0.8, zorder=2, gid="marks"), autolim=False
+    )
+    if not signs:
+        return []
+    x, y = np.stack(signs).T
+    axes.scatter(
+        x, y, s=34, marker="8", c="white", edgecolors=STOP, linewidths=1.5, zorder=5, gid="stop-signs"
+    )
+    style: dict[str, Any] = {"linestyle": "none", "markersize": 5.5, "markeredgewidth": 1.5}
+    return [Line2D([], [], marker="8", color="white", markeredgecolor=STOP, label="stop sign", **style)]
+
+
+def road_ribbon(road: RoadMap, lane: int) -> Any:
+    """Area covered by one lane: its centre line widened to its width."""
+    width = road.lane_width[lane]
+    if not np.isfinite(width):
+        width = BIKE_WIDTH if road.lane_type[lane] == LaneType.BIKE_LANE else DEFAULT_WIDTH
+    # A little wider than the lane, or hairlines of land would show between neighbours.
+    return shapely.LineString(road.lanes[lane][:, :2]).buffer(width / 2 + 0.15, quad_segs=4, cap_style="flat")
+
+
+def lane_arrows(line: NDArray[Any], spacing: float = ARROW_SPACING) -> NDArray[Any]:
+    """[K, 3, 2] chevrons along a polyline [P, 2], pointing the way it runs."""
+    delta = np.diff(line.astype(np.float64), axis=0)
+    length = np.hypot(delta[:, 0], delta[:, 1])
+    total = float(length.sum())
+    if total < spacing / 2:
+        return np.zeros((0, 3, 2))
+    count = max(1, int(total / spacing))
+    at = (np.arange(count) + 0.5) * total / count
+    ends = np.cumsum(length)
+    piece = np.minimum(np.searchsorted(ends, at, side="right"), len(length) - 1)
+    direction = delta[piece] / length[piece, None]
+    tip = line[piece] + direction * (at - (ends - length)[piece])[:, None]
+    left = np.stack([-direction[:, 1], direction[:, 0]], -1)
+    return tip[:, None] + ARROW[:, :1] * direction[:, None] + ARROW[:, 1:] * left[:, None]
+
+
+def _outline(polygon: Any) -> Outline:
+    """A polygon with its holes as one path."""
+    rings = [polygon.exterior, *polygon.interiors]
+    return Outline.make_compound_path(
+        *(Outline(np.asarray(ring.coords)[:, :2], closed=True) for ring in rings)
+    )
+
+
+def _visible(lines: Polylines, view: View) -> Iterator[int]:
+    """Indices of the polylines whose bounding box meets the view."""
+    for k in range(len(lines)):
+        low, high = lines[k][:, :2].min(0), lines[k][:, :2].max(0)
+        if low[0] <= view[1] and high[0] >= view[0] and low[1] <= view[3] and high[1] >= view[2]:
+            yield k
+
+
+def _inside(points: NDArray[Any], view: View) -> NDArray[np.bool_]:
+    x, y = points[:, 0], points[:, 1]
+    return (x >= view[0]) & (x <= view[1]) & (y >= view[2]) & (y <= view[3])

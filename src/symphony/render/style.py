@@ -1,0 +1,186 @@
+"""Colours and the frame of a picture: figure, view, scale bar, saving."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.lines import Line2D
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+from numpy.typing import NDArray
+
+from symphony.errors import ConfigError
+
+# From Okabe and Ito's and Tol's palettes: apart from each other, from playback and from the road for the
+# common kinds of colour blindness too.
+AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#882255", "#332288", "#D9C400")
+"""Ego first, then the interactive agents; repeats after the last."""
+PLAYBACK = "#A9AEB5"
+INK = "#2B2F36"
+LAND = "#F3F1EC"
+ROAD = "#FFFFFF"
+BOUNDARY = "#6F6A62"
+LANE = "#C9CDD3"
+MARK = "#DAD6CE"
+STOP = "#B3122B"
+CAUTION = "#E69F00"
+GO = "#009E73"
+
+FORMATS = ("png", "pdf", "svg")
+
+Corner = Literal["upper right", "upper left", "lower right"]
+Target = str | Path | Axes
+View = tuple[float, float, float, float]
+"""x from, x to, y from, y to, in metres."""
+
+
+def agent_color(rank: int) -> str:
+    """Colour of the agent of that rank among the highlighted ones (0: ego)."""
+    return AGENT_COLORS[rank % len(AGENT_COLORS)]
+
+
+def new_figure(width: float = 8.0, height: float = 8.0) -> Figure:
+    """An empty figure (inches) that belongs to no window and no global state."""
+    figure = Figure(figsize=(width, height), dpi=130, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def open_target(target: Target, view: View) -> tuple[Axes, Path | None]:
+    """Axes to draw on, and where to save them afterwards (None for axes given by the caller)."""
+    if isinstance(target, Axes):
+        return target, None
+    path = picture_path(target)
+    width, height = view[1] - view[0], view[3] - view[2]
+    inches = 8.0 / max(width, height)
+    # Room for the title above.
+    return new_figure(width * inches, height * inches + 0.5).add_subplot(), path
+
+
+def picture_path(path: str | Path) -> Path:
+    """The path, if its name says one of the kinds of picture that can be written."""
+    path = Path(path)
+    if path.suffix[1:].lower() not in FORMATS:
+        raise ConfigError(
+            f"{path}: a picture's name must end in one of {', '.join('.' + f for f in FORMATS)}"
+        )
+    return path
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a figure, creating the folder it goes into."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Without the date, equal pictures are equal files.
+    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    figure.savefig(path, metadata=undated.get(path.suffix[1:].lower()))
+
+
+def view_around(points: NDArray[Any], margin: float = 20.0, least: float = 70.0) -> View:
+    """A rectangle around points [P, 2] with a margin, the longer side at least ``least`` metres, the shorter
+    at least 0.6 of it.
+    """
+    points = points[np.isfinite(points).all(-1)]
+    if len(points) == 0:
+        points = np.zeros((1, 2))
+    low, high = points.min(0), points.max(0)
+    x, y = (low + high).tolist()
+    sides = high - low + 2 * margin
+    longer = max(float(sides.max()), least)
+    width, height = np.maximum(sides, 0.6 * longer).tolist() if longer > least else (least, least)
+    return (x - width) / 2, (x + width) / 2, (y - height) / 2, (y + height) / 2
+
+
+def frame(axes: Axes, view: View, title: str, subtitle: str) -> None:
+    """Equal aspect, limits, no ticks, title and scale bar."""
+    axes.set_facecolor(LAND)
+    axes.set_xlim(view[0], view[1])
+    axes.set_ylim(view[2], view[3])
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("#C8C4BC")
+    title_style: dict[str, Any] = {"fontweight": "bold", "color": INK, "parse_math": False}
+    axes.set_title(title, loc="left", fontsize=_font(axes, 11, title), pad=20, **title_style)
+    place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
+    caption = axes.annotate(
+        subtitle, (0, 1), (0, 6), fontsize=_font(axes, 8.5, subtitle), color="#5B616B", **place
+    )
+    # The title's padding has made its room; its width must not squeeze the picture.
+    caption.set_in_layout(False)
+    add_scale_bar(axes, view)
+
+
+def _width(axes: Axes) -> float:
+    """Inches that the axes' slot in the figure is wide, before layout."""
+    figure = axes.get_figure(root=True)
+    return axes.get_position(original=True).width * figure.get_figwidth() if figure else 8.0
+
+
+def _font(axes: Axes, size: float, text: str = "") -> float:
+    """A font size in points for these axes, smaller on narrow ones and such that the text fits."""
+    room = 72 * _width(axes) / max(0.62 * len(text), 1)
+    return max(3.0, min(size * float(np.clip(_width(axes) / 5, 0.6, 1)), room))
+
+
+def scale_length(span: float) -> float:
+    """A round length (1, 2 or 5 times a power of ten) of at most a fifth of the span, both in metres."""
+    raw = span / 5
+    power = 10.0 ** math.floor(math.log10(raw))
+    return max(step * power for step in (1, 2, 5) if step * power <= raw)
+
+
+def add_scale_bar(axes: Axes, view: View) -> None:
+    """A bar of a round length in the lower left corner."""
+    length = scale_length(max(view[1] - view[0], view[3] - view[2]))
+    bar = AnchoredSizeBar(
+        axes.transData,
+        length,
+        f"{length:g} m",
+        "lower left",
+        pad=0.4,
+        borderpad=0.6,
+        sep=4,
+        frameon=True,
+        size_vertical=max(view[1] - view[0], view[3] - view[2]) / 250,
+        color=INK,
+        fontproperties=FontProperties(size=_font(axes, 8.5)),
+    )
+    bar.patch.set(alpha=0.85, edgecolor="none")
+    bar.set_zorder(20)
+    axes.add_artist(bar)
+
+
+def add_legend(axes: Axes, handles: Sequence[Line2D | Any], points: NDArray[Any]) -> None:
+    """A legend above everything drawn, in the corner that hides the fewest of the points [P, 2]."""
+    legend = axes.legend(
+        handles=list(handles),
+        loc=free_corner(points, (*axes.get_xlim(), *axes.get_ylim())),
+        fontsize=_font(axes, 8.5),
+        framealpha=0.9,
+        edgecolor="#C8C4BC",
+        handlelength=1.8,
+        borderpad=0.6,
+    )
+    legend.set_zorder(20)
+
+
+def free_corner(points: NDArray[Any], view: View) -> Corner:
+    """The corner with the fewest points [P, 2], but for the one of the scale bar."""
+    x = (points[:, 0] - view[0]) / (view[1] - view[0])
+    y = (points[:, 1] - view[2]) / (view[3] - view[2])
+    inside = (x >= 0) & (x <= 1) & (y >= 0) & (y <= 1)
+    right, upper = x > 0.6, y > 0.65
+    corners: dict[Corner, NDArray[np.bool_]] = {
+        "upper right": right & upper,
+        "upper left": (x < 0.4) & upper,
+        "lower right": right & (y < 0.35),
+    }
+    return min(corners, key=lambda name: int((corners[name] & inside).sum()))

@@ -1,0 +1,30 @@
+"""Lanes, routes, branching regions and the road boundary."""
+
+from __future__ import annotations
+
+from symphony.roadgraph.assign import lane_of, starting_lanes
+from symphony.roadgraph.branches import visited_curvatures, visited_regions
+from symphony.roadgraph.graph import LaneGraph, Regions
+from symphony.roadgraph.routes import (
+    Route,
+    feasible_routes,
+    ground_truth_route,
+    route_errors,
+    route_polyline,
+    routes,
+)
+
+__all__ = [
+    "LaneGraph",
+    "Regions",
+    "Route",
+    "feasible_routes",
+    "ground_truth_route",
+    "lane_of",
+    "route_errors",
+    "route_polyline",
+    "routes",
+    "starting_lanes",
+    "visited_curvatures",
+    "visited_regions",
+]

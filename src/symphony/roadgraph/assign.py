@@ -1,0 +1,101 @@
+"""Which lane a vehicle is on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.roadgraph.graph import LaneGraph
+from symphony.roadgraph.lines import Indices, Near, turn_between
+
+LATERAL = 3.0
+"""Metres from a centre line within which a vehicle can be on a lane."""
+
+TURN = math.pi / 3
+"""Largest angle between a vehicle and its lane."""
+
+_TIE = 0.25
+"""Metres by which distances must differ to decide between lanes before the heading does."""
+
+_TURN_TIE = 1e-3
+
+
+def lane_of(
+    graph: LaneGraph,
+    position: NDArray[Any],
+    heading: NDArray[Any],
+    *,
+    tolerance: float = LATERAL,
+    max_turn: float = TURN,
+) -> Indices:
+    """Lane of each vehicle, -1 where there is none.
+
+    The nearest centre line that points the same way within ``max_turn``. Lanes within a quarter of a metre of the
+    nearest are told apart by heading, then by index.
+
+    Args:
+        graph: the lane graph.
+        position: [..., 2] metres.
+        heading: [...] radians.
+        tolerance: largest distance from the centre line, metres.
+        max_turn: largest angle to the lane, radians.
+    """
+    position = np.asarray(position, dtype=np.float64)
+    result = np.full(position.shape[:-1], -1, dtype=np.int64)
+    near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance, max_turn)
+    smallest = np.full(result.size, np.inf)
+    np.minimum.at(smallest, near.point, near.distance)
+    close = near.distance <= smallest[near.point] + _TIE
+    order = np.lexsort((near.line, np.round(turn / _TURN_TIE), ~close, near.point))
+    point, first = np.unique(near.point[order], return_index=True)
+    result.reshape(-1)[point] = graph.usable_lanes[near.line[order][first]]
+    return result
+
+
+def starting_lanes(
+    graph: LaneGraph,
+    position: NDArray[Any],
+    heading: float,
+    *,
+    margin: float = 1.0,
+    tolerance: float = LATERAL,
+    max_turn: float = TURN,
+) -> list[tuple[int, float]]:
+    """Every lane one vehicle may be on: inside a junction, where lanes overlap, usually several.
+
+    Lanes at most ``margin`` metres farther away than the nearest one. Of a lane and its successor only the one
+    that the vehicle is alongside is kept. The lane that :func:`lane_of` names comes first, then by distance.
+
+    Returns:
+        Pairs (lane, metres from the lane's start); empty if the vehicle is on no lane.
+    """
+    position = np.asarray(position, dtype=np.float64).reshape(1, 2)
+    near, _ = _compatible(graph, position, np.array([heading]), tolerance, max_turn)
+    if len(near.line) == 0:
+        return []
+    best = int(lane_of(graph, position[0], np.array(heading), tolerance=tolerance, max_turn=max_turn))
+    found = {
+        int(graph.usable_lanes[k]): (float(distance), float(along))
+        for k, distance, along in zip(near.line, near.distance, near.along, strict=True)
+        if distance <= near.distance.min() + margin or graph.usable_lanes[k] == best
+    }
+    past = {k for k in found if found[k][1] >= graph.length[k] - 1e-6}
+    gone = {k for k in past if any(s in found for s in graph.successors[k])}
+    gone |= {
+        s for k in found.keys() - past for s in graph.successors[k] if s in found and found[s][1] <= 1e-6
+    }
+    kept = sorted(found.keys() - gone, key=lambda k: (k != best, round(found[k][0], 3), k))
+    return [(k, found[k][1]) for k in kept]
+
+
+def _compatible(
+    graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], tolerance: float, max_turn: float
+) -> tuple[Near, NDArray[np.float64]]:
+    near = graph.index.near(position, tolerance)
+    turn = turn_between(near.heading, np.asarray(heading, dtype=np.float64)[near.point])
+    keep = turn <= max_turn
+    point, line, distance, along, direction = near
+    return Near(point[keep], line[keep], distance[keep], along[keep], direction[keep]), turn[keep]

@@ -1,0 +1,182 @@
+"""The lane graph of one map and the choices it offers. Metres, radians counter-clockwise, the map's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from symphony.errors import DataError
+from symphony.roadgraph.lines import Bools, Indices, LineIndex, Reals
+
+BIKE_LANE = 3
+"""The lane type that vehicles keep off (see ``LaneType``)."""
+
+
+class Lines(Protocol):
+    """Ragged polylines: line k is ``points[offsets[k]:offsets[k + 1]]``."""
+
+    @property
+    def points(self) -> NDArray[Any]:
+        """[P, 2 or more]."""
+
+    @property
+    def offsets(self) -> NDArray[Any]:
+        """[K + 1]."""
+
+
+class Road(Protocol):
+    """The part of ``symphony.data.segment.RoadMap`` that a lane graph needs."""
+
+    @property
+    def lanes(self) -> Lines:
+        """Centre lines in the direction of travel."""
+
+    @property
+    def lane_type(self) -> NDArray[Any]:
+        """[L]."""
+
+    @property
+    def successors(self) -> NDArray[Any]:
+        """[E, 2] lane indices (from, to)."""
+
+    @property
+    def left_neighbors(self) -> NDArray[Any]:
+        """[E', 2] lane indices (lane, the lane on its left)."""
+
+    @property
+    def right_neighbors(self) -> NDArray[Any]:
+        """[E'', 2] lane indices (lane, the lane on its right)."""
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Branching regions: the alternatives at each place where a lane has more than one successor.
+
+    Two regions with the same parent are alternatives of one choice. A lane with several branching predecessors
+    is a region once for each of them.
+
+    Attributes:
+        lane: [R] the lane that is the region.
+        parent: [R] the lane before it, at whose end the choice is made.
+        curvature: [R] average signed curvature of the lane, 1/m, positive to the left.
+        entry: [R, 2] first point of the lane.
+        entry_heading: [R] direction of the lane there.
+    """
+
+    lane: Indices
+    parent: Indices
+    curvature: Reals
+    entry: Reals
+    entry_heading: Reals
+
+    def __len__(self) -> int:
+        return len(self.lane)
+
+    def siblings(self, region: int) -> Indices:
+        """The other regions of the same choice."""
+        same = np.flatnonzero(self.parent == self.parent[region])
+        return same[same != region]
+
+
+class LaneGraph:
+    """Lanes, how they connect, and their shapes; built once per map.
+
+    Lanes of an excluded type keep their index but are not connected to anything and match no position.
+
+    Args:
+        road: the map.
+        exclude: lane types to leave out.
+
+    Raises:
+        DataError: a lane without two distinct points, or a connection to a lane that does not exist.
+
+    Attributes:
+        lines: centre lines [P_k, 2], float64, repeated points dropped.
+        arc: per lane, the metres [P_k] from its start to each of its points.
+        usable: [L] whether the lane's type is not excluded.
+        length: [L] metres.
+        curvature: [L] average signed curvature, total change of heading / length, 1/m, positive to the left.
+        start_heading: [L] direction of the first piece of each lane.
+        successors: per lane, the lanes its traffic flows into, ascending.
+        predecessors: per lane, the lanes that flow into it, ascending.
+        left: per lane, the lanes a change to the left reaches.
+        right: per lane, the lanes a change to the right reaches.
+        regions: the branching regions, by parent, then by lane.
+    """
+
+    def __init__(self, road: Road, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
+        points = np.asarray(road.lanes.points, dtype=np.float64)[:, :2]
+        self.lines = [_distinct(points[a:b], k) for k, (a, b) in enumerate(pairwise(road.lanes.offsets))]
+        self.arc = [_arc(line) for line in self.lines]
+        self.length: Reals = np.array([arc[-1] for arc in self.arc], dtype=np.float64)
+        self.usable: Bools = ~np.isin(np.asarray(road.lane_type), list(exclude))
+        self.successors = self._adjacency(road.successors, "road.successors")
+        self.predecessors = self._adjacency(np.asarray(road.successors)[:, ::-1], "road.successors")
+        self.left = self._adjacency(road.left_neighbors, "road.left_neighbors")
+        self.right = self._adjacency(road.right_neighbors, "road.right_neighbors")
+        headings = [np.arctan2(*np.diff(line, axis=0).T[::-1]) for line in self.lines]
+        self.start_heading = np.array([heading[0] for heading in headings], dtype=np.float64)
+        turns = [((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi).sum() for heading in headings]
+        self.curvature: Reals = np.array(turns, dtype=np.float64) / self.length
+        self.regions = self._branching()
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    @cached_property
+    def usable_lanes(self) -> Indices:
+        """Indices of the usable lanes."""
+        return np.flatnonzero(self.usable)
+
+    @property
+    def region_curvature(self) -> Reals:
+        """[R] average signed curvature of the branching regions, 1/m."""
+        return self.regions.curvature
+
+    @cached_property
+    def index(self) -> LineIndex:
+        """Spatial index over the usable lanes (line k is lane ``usable_lanes[k]``)."""
+        return LineIndex([self.lines[k] for k in self.usable_lanes])
+
+    @cached_property
+    def region_index(self) -> LineIndex:
+        """Spatial index over the branching regions."""
+        return LineIndex([self.lines[k] for k in self.regions.lane])
+
+    @cached_property
+    def entry_tree(self) -> shapely.STRtree:
+        """Spatial index over the entry points of the branching regions."""
+        return shapely.STRtree(shapely.points(self.regions.entry))
+
+    def _adjacency(self, pairs: NDArray[Any], field: str) -> list[tuple[int, ...]]:
+        pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
+        if len(pairs) and (pairs.min() < 0 or pairs.max() >= len(self)):
+            raise DataError(f"names a lane outside the {len(self)} lanes", field=field)
+        pairs = np.unique(pairs[self.usable[pairs].all(1) & (pairs[:, 0] != pairs[:, 1])], axis=0)
+        ends = np.searchsorted(pairs[:, 0], np.arange(len(self) + 1))
+        return [tuple(pairs[a:b, 1].tolist()) for a, b in pairwise(ends)]
+
+    def _branching(self) -> Regions:
+        pairs = [(parent, k) for parent, after in enumerate(self.successors) if len(after) > 1 for k in after]
+        parent, lane = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        entry = np.array([self.lines[k][0] for k in lane], dtype=np.float64).reshape(-1, 2)
+        return Regions(lane, parent, self.curvature[lane], entry, self.start_heading[lane])
+
+
+def _distinct(line: Reals, lane: int) -> Reals:
+    keep = np.concatenate(([True], (line[1:] != line[:-1]).any(1)))[: len(line)]
+    line = line[keep]
+    if len(line) < 2:
+        raise DataError(f"lane {lane} has fewer than two distinct points", field="road.lanes")
+    return line
+
+
+def _arc(line: Reals) -> Reals:
+    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))

@@ -1,0 +1,370 @@
+"""Checkpoints of a training run: atomic on disk, free of pickle, resumed to the last bit.
+
+A checkpoint is a folder `step-<number>` that holds one safetensors file per module, optimizer and for the random
+number generators, and `checkpoint.json` with everything that is not a tensor and a checksum of each file.
+
+Why not `torchrl.checkpoint` (0.14): it reads tensors through `tensordict.load`, which unpickles a file that the
+manifest doesn't mention, if one is planted beside them; it never flushes to the disk before the rename that
+publishes; and it restores component after component, so that a mismatch leaves the earlier ones overwritten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import re
+import shutil
+import uuid
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as decode_tensors
+from safetensors.torch import save as encode_tensors
+from torch import Tensor, nn
+
+from symphony.errors import DataError
+from symphony.trainers.plain import decode, encode
+
+FORMAT = 1
+MANIFEST = "checkpoint.json"
+_NAME = re.compile(r"step-(\d{12})")
+_PART = re.compile(r"[A-Za-z0-9_-]+")
+
+
+class CheckpointError(DataError):
+    """A checkpoint that can't be written, read, or fitted to what it is loaded into."""
+
+
+class Stateful(Protocol):
+    """An optimizer, a learning-rate schedule, or whatever else keeps a state of tensors and plain values."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> Any:
+        """Take the state over."""
+        ...
+
+
+@dataclass(frozen=True)
+class LoadedCheckpoint:
+    """What a checkpoint holds besides the states that were restored.
+
+    Attributes:
+        path: folder of the checkpoint.
+        step: the step it was saved at.
+        extra: the caller's own values.
+    """
+
+    path: Path
+    step: int
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+def save_checkpoint(
+    folder: Path,
+    *,
+    step: int,
+    modules: Mapping[str, nn.Module],
+    optimizers: Mapping[str, Stateful] | None = None,
+    generators: Mapping[str, torch.Generator] | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write `folder/step-<step>`, with the global random states of Python, numpy and torch.
+
+    The checkpoint appears complete or not at all; one of the same step is replaced. One process may write to
+    a folder at a time.
+
+    Args:
+        folder: of all checkpoints of the run, made if absent.
+        step: updates done so far.
+        modules: by name (letters, digits, `-`, `_`), saved by their `state_dict`.
+        optimizers: likewise, learning-rate schedules included.
+        generators: torch generators other than the global ones.
+        extra: JSON-like values (also tuples and tensors), handed back by :func:`load_checkpoint`.
+
+    Raises:
+        CheckpointError: if something can't be stored or the disk refuses; earlier checkpoints stay as they are.
+    """
+    folder = Path(folder)
+    final = folder / f"step-{step:012d}"
+    states = {"rng": _rng_state(generators or {}), "extra": dict(extra or {})}
+    for kind, items in (("module", modules), ("optimizer", optimizers or {})):
+        for name, item in items.items():
+            if not _PART.fullmatch(name):
+                raise CheckpointError(
+                    "names are made of letters, digits, '-' and '_'", field=f"{kind} {name!r}"
+                )
+            states[f"{kind}.{name}"] = item.state_dict()
+    manifest: dict[str, Any] = {"format": FORMAT, "step": step, "torch": torch.__version__, "parts": {}}
+    files: dict[str, bytes] = {}
+    for part, state in states.items():
+        tensors: dict[str, Tensor] = {}
+        try:
+            entry = {"state": encode(state, tensors, part)}
+        except TypeError as error:
+            raise CheckpointError(str(error), file=final) from error
+        if tensors:
+            content = encode_tensors(tensors)
+            files[f"{part}.safetensors"] = content
+            entry |= {"file": f"{part}.safetensors", "sha256": hashlib.sha256(content).hexdigest()}
+        manifest["parts"][part] = entry
+    files[MANIFEST] = (json.dumps(manifest, indent=1, allow_nan=False) + "\n").encode()
+    try:
+        _publish(folder, final, files)
+    except OSError as error:
+        raise CheckpointError(f"can't write the checkpoint: {error}", file=final) from error
+    return final
+
+
+def load_checkpoint(
+    path: Path,
+    *,
+    modules: Mapping[str, nn.Module] | None = None,
+    optimizers: Mapping[str, Stateful] | None = None,
+    generators: Mapping[str, torch.Generator] | None = None,
+    partial: bool = False,
+    restore_rng: bool = True,
+) -> LoadedCheckpoint:
+    """Restore what is passed from the checkpoint folder `path`; nothing is changed unless everything fits.
+
+    Args:
+        path: one checkpoint, as returned by :func:`save_checkpoint` or :func:`latest`.
+        modules: by the names they were saved under.
+        optimizers: likewise.
+        generators: likewise.
+        partial: allow the checkpoint to hold more than is asked for (evaluation needs the policy only).
+        restore_rng: also set the global random states of Python, numpy and torch.
+
+    Raises:
+        CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, or names,
+            shapes or types differ; names the file and the field.
+    """
+    path = Path(path)
+    manifest = _read_manifest(path)
+    asked: dict[str, Any] = {f"module.{name}": item for name, item in (modules or {}).items()}
+    asked |= {f"optimizer.{name}": item for name, item in (optimizers or {}).items()}
+    held = {part for part in manifest["parts"] if part not in ("rng", "extra")}
+    _match_names(path / MANIFEST, set(asked), held, partial, what="part")
+    states = {part: _read_part(path, manifest, part) for part in ("rng", "extra", *asked)}
+    rng = states["rng"]
+    own = generators or {}
+    _match_names(path / MANIFEST, set(own), set(rng["generators"]), partial, what="generator")
+    if restore_rng and len(rng["cuda"]) not in (0, torch.cuda.device_count()):
+        raise CheckpointError(
+            f"random states of {len(rng['cuda'])} CUDA devices saved, {torch.cuda.device_count()} present; "
+            "pass restore_rng=False to do without",
+            file=path / MANIFEST,
+            field="rng",
+        )
+    for part, item in asked.items():
+        where = path / f"{part}.safetensors"
+        if isinstance(item, nn.Module):
+            _match_module(where, item, states[part])
+        elif isinstance(item, torch.optim.Optimizer):
+            _match_optimizer(where, item, states[part])
+    for part, item in asked.items():
+        try:
+            item.load_state_dict(states[part])
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(str(error), file=path, field=part) from error
+    for name, generator in own.items():
+        generator.set_state(rng["generators"][name])
+    if restore_rng:
+        _set_rng_state(rng)
+    return LoadedCheckpoint(path, manifest["step"], states["extra"])
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """All complete checkpoints in `folder`, by ascending step."""
+    found: dict[int, Path] = {}
+    folder = Path(folder)
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        # A parked one, which sorts first, counts only if the crash came before its successor took its place.
+        match = _NAME.fullmatch(path.name.removeprefix(".old-"))
+        if match and (path / MANIFEST).is_file():
+            found[int(match[1])] = path
+    return [found[step] for step in sorted(found)]
+
+
+def latest(folder: Path) -> Path | None:
+    """The complete checkpoint of the highest step in `folder`, or None."""
+    found = checkpoints(folder)
+    return found[-1] if found else None
+
+
+def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> list[Path]:
+    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`; return them.
+
+    Raises:
+        CheckpointError: if the disk refuses.
+    """
+    if keep < 1:
+        raise ValueError(f"keep must be at least 1, is {keep}")
+    gone = [path for path in checkpoints(folder)[:-keep] if int(path.name[-12:]) not in protect]
+    try:
+        for path in gone:
+            # Without its manifest it counts no longer, however far the deletion gets.
+            (path / MANIFEST).unlink()
+            shutil.rmtree(path)
+            shutil.rmtree(path.with_name(f".old-{path.name}"), ignore_errors=True)
+    except OSError as error:
+        raise CheckpointError(f"can't delete the checkpoint: {error}", file=folder) from error
+    return gone
+
+
+def _publish(folder: Path, final: Path, files: Mapping[str, bytes]) -> None:
+    """Write all files to a new folder, flush them, and put it in place of `final` by renaming."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parked = folder / f".old-{final.name}"
+    for stale in folder.glob(".new-*"):
+        shutil.rmtree(stale, ignore_errors=True)
+    new = folder / f".new-{uuid.uuid4().hex}"
+    try:
+        new.mkdir()
+        for name, content in files.items():
+            with (new / name).open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        _flush_folder(new)
+        if final.exists():
+            if parked.exists():
+                shutil.rmtree(parked)
+            final.rename(parked)
+        try:
+            new.rename(final)
+        except OSError:
+            if parked.exists() and not final.exists():
+                parked.rename(final)
+            raise
+        _flush_folder(folder)
+        shutil.rmtree(parked, ignore_errors=True)
+    except OSError:
+        shutil.rmtree(new, ignore_errors=True)
+        raise
+
+
+def _flush_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    file = path / MANIFEST
+    try:
+        manifest = json.loads(file.read_text())
+    except OSError as error:
+        raise CheckpointError(f"no checkpoint here: {error.strerror}", file=file) from error
+    except ValueError as error:
+        raise CheckpointError(f"not JSON: {error}", file=file) from error
+    version = manifest.get("format") if isinstance(manifest, dict) else None
+    if version != FORMAT:
+        raise CheckpointError(f"format {version!r}, this version reads {FORMAT}", file=file, field="format")
+    parts = manifest.get("parts")
+    if (
+        not isinstance(manifest.get("step"), int)
+        or not isinstance(parts, dict)
+        or not {"rng", "extra"} <= set(parts)
+    ):
+        raise CheckpointError("step or parts missing", file=file, field="parts")
+    return manifest
+
+
+def _read_part(path: Path, manifest: dict[str, Any], part: str) -> Any:
+    entry = manifest["parts"][part]
+    file = path / f"{part}.safetensors"
+    tensors: dict[str, Tensor] = {}
+    try:
+        if "file" in entry:
+            content = file.read_bytes()
+            if hashlib.sha256(content).hexdigest() != entry.get("sha256"):
+                raise CheckpointError("damaged: its checksum differs from the recorded one", file=file)
+            tensors = decode_tensors(content)
+        return decode(entry["state"], tensors)
+    except OSError as error:
+        raise CheckpointError(f"can't be read: {error.strerror}", file=file, field=part) from error
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"can't be decoded: {error!r}", file=file, field=part) from error
+
+
+def _match_names(file: Path, asked: set[str], held: set[str], partial: bool, *, what: str) -> None:
+    absent, surplus = sorted(asked - held), sorted(held - asked)
+    if absent:
+        raise CheckpointError(
+            f"not in the checkpoint, which has {sorted(held)}", file=file, field=f"{what} {absent[0]}"
+        )
+    if surplus and not partial:
+        raise CheckpointError("in the checkpoint but not asked for", file=file, field=f"{what} {surplus[0]}")
+
+
+def _match_tensor(file: Path, name: str, own: Any, saved: Any) -> None:
+    if isinstance(own, Tensor) != isinstance(saved, Tensor):
+        raise CheckpointError("a tensor on one side only", file=file, field=name)
+    if isinstance(own, Tensor) and (own.shape != saved.shape or own.dtype != saved.dtype):
+        raise CheckpointError(
+            f"saved as {saved.dtype} {tuple(saved.shape)}, expected {own.dtype} {tuple(own.shape)}",
+            file=file,
+            field=name,
+        )
+
+
+def _match_module(file: Path, module: nn.Module, saved: dict[str, Any]) -> None:
+    own = module.state_dict()
+    for name in [*own, *saved]:
+        if name not in saved or name not in own:
+            where = "the module" if name in own else "the checkpoint"
+            raise CheckpointError(f"only {where} has it", file=file, field=name)
+        _match_tensor(file, name, own[name], saved[name])
+
+
+def _match_optimizer(file: Path, optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
+    groups = saved.get("param_groups", [])
+    sizes, own_sizes = [len(g["params"]) for g in groups], [len(g["params"]) for g in optimizer.param_groups]
+    if sizes != own_sizes:
+        raise CheckpointError(
+            f"saved for groups of {sizes} parameters, expected {own_sizes}", file=file, field="param_groups"
+        )
+    for group, own in zip(groups, optimizer.param_groups, strict=True):
+        if set(group) - {"initial_lr"} != set(own) - {"initial_lr"}:
+            names = sorted(set(group) ^ set(own))
+            raise CheckpointError(
+                f"another kind of optimizer: {names} differ", file=file, field="param_groups"
+            )
+        for index, parameter in zip(group["params"], own["params"], strict=True):
+            for name, value in saved["state"].get(index, {}).items():
+                if isinstance(value, Tensor) and value.ndim and value.shape != parameter.shape:
+                    raise CheckpointError(
+                        f"saved with shape {tuple(value.shape)}, expected {tuple(parameter.shape)}",
+                        file=file,
+                        field=f"state.{index}.{name}",
+                    )
+
+
+def _rng_state(generators: Mapping[str, torch.Generator]) -> dict[str, Any]:
+    return {
+        "python": random.getstate(),
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - whoever uses the global state must get it back
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
+        "generators": {name: generator.get_state() for name, generator in generators.items()},
+    }
+
+
+def _set_rng_state(state: dict[str, Any]) -> None:
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(state["torch"])
+    if state["cuda"]:
+        torch.cuda.set_rng_state_all(state["cuda"])

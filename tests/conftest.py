@@ -1,0 +1,22 @@
+"""Shared fixtures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+# Two torch threads on shared cores spin against each other otherwise; must precede the first torch import.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.setdefault("WANDB_MODE", "disabled")
+
+
+@pytest.fixture(scope="session")
+def samples() -> Path:
+    """Folder of the real samples; the test is skipped where it is absent."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("SYMPHONY_SAMPLES", default))
+    if not folder.is_dir():
+        pytest.skip(f"real samples not found at {folder} (set SYMPHONY_SAMPLES)")
+    return folder

@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import symphony.data.convert
+from helpers_segments import crossing, straight_road
+from symphony import __version__
+from symphony.cli import main
+from symphony.cli.data import Info
+from symphony.data.segment import RunSegment
+from symphony.data.sources import Reader
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import DataError
+
+HEAVY = {"torch", "torchrl", "tensordict", "wandb", "matplotlib", "numpy", "shapely", "google.protobuf"}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    path = tmp_path / "store"
+    with StoreWriter(path) as writer:
+        writer.append(crossing())
+        writer.append(straight_road(4, segment_id="straight"))
+    return path
+
+
+class MadeReader(Reader):
+    """Gives one good segment and two broken records for each file."""
+
+    name = "made"
+    patterns = ("*.made",)
+
+    def _read(self, path: Path) -> Iterator[RunSegment | DataError]:
+        yield straight_road(6, segment_id=path.stem)
+        yield DataError("has 3 wheels", file=path, segment="tricycle", field="agents")
+        yield DataError("has 5 wheels", file=path, segment="spare", field="agents")
+
+
+@pytest.fixture
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.setattr(symphony.data.convert, "get_reader", lambda name, **options: MadeReader())
+    files = [tmp_path / "one.made", tmp_path / "two.made"]
+    for file in files:
+        file.write_text("")
+    return [str(file) for file in files]
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        [],
+        ["data"],
+        ["data", "convert"],
+        ["data", "info"],
+        ["data", "plot"],
+        ["train"],
+        ["train", "bc"],
+        ["evaluate"],
+        ["demo"],
+    ],
+    ids=" ".join,
+)
+def test_help_explains_without_importing_anything_heavy(args: list[str]) -> None:
+    code = (
+        "import sys\n"
+        "from symphony.cli import main\n"
+        f"status = main({[*args, '--help']})\n"
+        f"print('loaded', sorted({HEAVY} & set(sys.modules)))\n"
+        "sys.exit(status)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(" ".join(["usage: symphony", *args]))
+    assert done.stdout.endswith("loaded []\n")
+    assert done.stderr == ""
+
+
+def test_installed_command_prints_the_version() -> None:
+    command = Path(sys.executable).with_name("symphony")
+    done = subprocess.run([command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"symphony {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        [],
+        ["nonsense"],
+        ["data"],
+        ["data", "convert", "nonsense", "x", "--out", "y"],
+        ["data", "convert", "womd", "x"],
+        ["data", "convert", "womd", "--out", "y"],
+        ["data", "convert", "womd", "x", "--out", "y", "--rate", "0"],
+        ["data", "convert", "womd", "x", "--out", "y", "--rate", "nan"],
+        ["data", "convert", "womd", "x", "--out", "y", "--interactive", "0"],
+        ["data", "convert", "womd", "x", "--out", "y", "--smooth", "-1"],
+        ["data", "info"],
+        ["train", "bc", "--data", "x", "--out", "y", "--steps", "many"],
+        ["train", "bc", "--data", "x", "--out", "y", "--steps", "0"],
+        ["evaluate", "--data", "x"],
+        ["evaluate", "playback", "--data", "x", "--unknown", "1"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_is_status_2(
+    args: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(args) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.strip()
+    assert "Traceback" not in captured.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (
+            DataError("is bent", file="a.xml", field="lane"),
+            1,
+            "symphony: error: file a.xml, field lane: is bent\n",
+        ),
+        (FileNotFoundError(2, "No such file or directory", "x/y"), 1, "x/y: No such file or directory\n"),
+        (OSError(28, "No space left on device"), 1, "symphony: error: No space left on device\n"),
+        (KeyboardInterrupt(), 130, "symphony: error: interrupted\n"),
+    ],
+)
+def test_failures_become_one_line_and_a_status(
+    error: BaseException,
+    status: int,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(self: Info) -> None:
+        raise error
+
+    monkeypatch.setattr(Info, "run", fail)
+    monkeypatch.delenv("SYMPHONY_DEBUG", raising=False)
+    assert main(["data", "info", "x"]) == status
+    captured = capsys.readouterr()
+    assert captured.err.endswith(message)
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_debugging_shows_the_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SYMPHONY_DEBUG", "1")
+    with pytest.raises(DataError):
+        main(["data", "info", str(tmp_path / "none")])
+
+
+def test_programming_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Info) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Info, "run", fail)
+    with pytest.raises(ZeroDivisionError):
+        main(["data", "info", "x"])
+
+
+def test_a_closed_pipe_is_no_traceback(store: Path) -> None:
+    reader, writer = (
+        [sys.executable, "-c", "import sys; sys.stdin.close()"],
+        [sys.executable, "-m", "symphony.cli", "data", "info", str(store), "--json"],
+    )
+    sink = subprocess.Popen(reader, stdin=subprocess.PIPE)
+    sink.wait()
+    done = subprocess.run(writer, stdout=sink.stdin, stderr=subprocess.PIPE, text=True, check=False)
+    assert sink.stdin is not None
+    sink.stdin.close()
+    assert done.stderr == ""
+    assert done.returncode == 1
+
+
+def test_convert_reports_what_it_did(
+    logs: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["data", "convert", "womd", *logs, "--out", str(out)]) == 0
+    captured = capsys.readouterr()
+    rows = {
+        line.split("│")[1].strip(): line.split("│")[2].strip()
+        for line in captured.out.splitlines()
+        if "│" in line
+    }
+    assert rows == {"converted": "2", "skipped: agents: has # wheels": "4"}
+    assert "2 converted, 4 skipped" in captured.err
+    assert SegmentStore(out).ids == ["one", "two"]
+
+
+def test_convert_passes_its_options_on(logs: list[str], tmp_path: Path) -> None:
+    out = str(tmp_path / "out")
+    options = ["--out", out, "--rate", "2.5", "--interactive", "3", "--smooth", "0.1"]
+    assert main(["data", "convert", "womd", logs[0], *options]) == 0
+    segment = SegmentStore(out)[0]
+    assert segment.dt == pytest.approx(0.4)
+    settings = SegmentStore(out).report["settings"]
+    assert (settings["rate"], settings["interactive"], settings["smooth"]) == (2.5, 3, 0.1)
+
+
+def test_convert_appends_only_when_told(
+    logs: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["data", "convert", "womd", "--out", str(tmp_path / "out")]
+    assert main([*command, logs[0]]) == 0
+    assert main([*command, logs[1]]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("symphony: error: ")
+    assert main([*command, *logs, "--append"]) == 0
+    assert SegmentStore(tmp_path / "out").ids == ["one", "two"]
+    assert "there already" in capsys.readouterr().out
+
+
+def test_convert_fails_when_nothing_could_be_used(
+    logs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(MadeReader, "_read", lambda self, path: iter([DataError("empty", file=path)]))
+    assert main(["data", "convert", "womd", *logs, "--out", str(tmp_path / "out")]) == 1
+    assert "empty" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_convert_reads_real_files(samples: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    source = samples / "womd"
+    assert main(["data", "convert", "womd", str(source), "--out", str(out)]) == 0
+    assert len(SegmentStore(out)) == 1
+    picture = tmp_path / "segment.png"
+    assert main(["data", "plot", str(out), "--segment", "0", "--out", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_info_as_json_and_as_text_agree(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "info", str(store), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["segments"] == 2
+    assert found["checksum"] == SegmentStore(store).checksum()
+    assert main(["data", "info", str(store)]) == 0
+    text = capsys.readouterr().out
+    rows = dict(line.split(maxsplit=1) for line in text.splitlines() if len(line.split()) > 1)
+    assert rows["segments"].startswith("2 (2 from made)")
+    assert rows["agents"].strip() == str(found["agents"])
+    assert rows["checksum"].startswith(found["checksum"][:16])
+
+
+def test_info_of_an_empty_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    StoreWriter(tmp_path / "empty").close()
+    assert main(["data", "info", str(tmp_path / "empty")]) == 0
+    assert "none" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("segment", ["straight", "1"])
+def test_plot_finds_a_segment_by_id_or_number(store: Path, segment: str, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "segment.svg"
+    assert main(["data", "plot", str(store), "--segment", segment, "--out", str(out)]) == 0
+    assert "straight" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"--segment": "nobody"},
+        {"--segment": "2"},
+        {"--out": "segment.docx"},
+        {"--step": "51"},
+        {"--step": "-1"},
+        {"--interactive": "9"},
+        {"--interactive": "0"},
+    ],
+    ids=str,
+)
+def test_plot_refuses_what_it_cannot_draw(
+    store: Path,
+    change: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = {"--segment": "straight", "--out": "segment.png"} | change
+    flat = [word for pair in arguments.items() for word in pair]
+    assert main(["data", "plot", str(store), *flat]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.startswith("symphony: error: ")
+    assert captured.err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]

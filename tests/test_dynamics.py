@@ -1,0 +1,188 @@
+"""Laws of the motion models."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symphony.envs.dynamics import (
+    Bicycle,
+    Displacement,
+    bicycle_inverse,
+    bicycle_step,
+    displacement_inverse,
+    displacement_step,
+)
+from symphony.geometry.frames import rotate, wrap
+
+DT = 0.2
+LENGTH = torch.tensor(4.6, dtype=torch.float64)
+
+
+def states(count: int = 64, seed: int = 0) -> torch.Tensor:
+    rng = torch.Generator().manual_seed(seed)
+    unit = torch.rand(count, 4, generator=rng, dtype=torch.float64)
+    return torch.stack([100 * unit[:, 0], 100 * unit[:, 1], 6 * unit[:, 2] - 3, 1 + 15 * unit[:, 3]], -1)
+
+
+def controls(count: int = 64, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    rng = torch.Generator().manual_seed(seed)
+    unit = torch.rand(3, count, generator=rng, dtype=torch.float64)
+    return 8 * unit[0] - 4, unit[1] - 0.5, 3 + 9 * unit[2]
+
+
+def test_bicycle_inverse_recovers_the_controls() -> None:
+    state, (acceleration, steering, length) = states(), controls()
+    after = bicycle_step(state, acceleration, steering, length, DT)
+    moved = after[:, 3] > 0  # a vehicle that stops within the step loses part of its braking
+    got = bicycle_inverse(state, after, length, DT)
+    torch.testing.assert_close(got[0][moved], acceleration[moved])
+    torch.testing.assert_close(got[1][moved], steering[moved])
+
+
+def test_bicycle_circles_with_the_radius_of_its_steering() -> None:
+    steering, length = torch.tensor(0.3, dtype=torch.float64), torch.tensor(5.0, dtype=torch.float64)
+    state = torch.tensor([0.0, 0.0, 0.0, 4.0], dtype=torch.float64)
+    slip = torch.atan(torch.tan(steering) / 2)
+    # The centre's distance from the turning centre: half the wheelbase over the sine of the slip angle.
+    radius = 0.6 * length / 2 / torch.sin(slip)
+    path = [state]
+    for _ in range(60):
+        path.append(bicycle_step(path[-1], torch.zeros(()).double(), steering, length, 0.05))
+    track = torch.stack(path)[:, :2]
+    normal = torch.stack([-torch.sin(slip), torch.cos(slip)])
+    distance = (track - radius * normal).norm(dim=-1)
+    torch.testing.assert_close(distance, radius.expand_as(distance), rtol=1e-3, atol=0)
+
+
+def test_bicycle_brakes_to_standstill_and_stays() -> None:
+    state = torch.tensor([0.0, 0.0, 1.0, 0.5])
+    one, zero, length = torch.tensor(-4.0), torch.tensor(0.4), torch.tensor(4.5)
+    for _ in range(5):
+        state = bicycle_step(state, one, zero, length, DT)
+    assert state[3] == 0
+    torch.testing.assert_close(bicycle_step(state, one, zero, length, DT), state)
+
+
+def test_displacement_inverse_and_forward_are_exact() -> None:
+    state, other = states(seed=2), states(seed=3)
+    action = displacement_inverse(state, other)
+    torch.testing.assert_close(displacement_step(state, action, LENGTH, DT)[:, :2], other[:, :2])
+    back = displacement_inverse(state, displacement_step(state, action, LENGTH, DT))
+    torch.testing.assert_close(back, action)
+
+
+@pytest.mark.parametrize("radius", [8.0, 25.0, -40.0])
+@pytest.mark.parametrize("start", [0.0, 0.3])
+def test_displacement_settles_into_the_slip_of_a_bicycle(radius: float, start: float) -> None:
+    angles = torch.arange(80, dtype=torch.float64) * 0.5 / radius
+    track = radius * torch.stack([angles.sin(), 1 - angles.cos()], -1)
+    state = torch.tensor([0.0, 0.0, start, 2.5], dtype=torch.float64)
+    for point in track[1:]:
+        target = torch.cat([point, state[2:]])
+        state = displacement_step(state, displacement_inverse(state, target), LENGTH, DT)
+    slip = math.asin(0.3 * LENGTH.item() / radius)
+    assert angles[-1].item() - state[2].item() == pytest.approx(slip, abs=0.01)
+
+
+def test_displacement_neither_slides_nor_spins_at_standstill() -> None:
+    still = displacement_step(torch.tensor([1.0, 2.0, 0.7, 0.0]), torch.zeros(2), LENGTH.float(), DT)
+    torch.testing.assert_close(still, torch.tensor([1.0, 2.0, 0.7, 0.0]), atol=1e-5, rtol=0)
+    jitter = displacement_step(torch.zeros(4), torch.tensor([0.0005, 0.001]), LENGTH.float(), DT)
+    assert abs(jitter[2]) < 1e-3
+
+
+@given(angle=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))
+def test_moving_the_world_moves_the_result(angle: float, x: float, y: float) -> None:
+    state, (acceleration, steering, length) = states(), controls()
+    turn, shift = torch.tensor(angle, dtype=torch.float64), torch.tensor([x, y], dtype=torch.float64)
+
+    def moved(s: torch.Tensor) -> torch.Tensor:
+        return torch.cat([rotate(s[:, :2], turn) + shift, s[:, 2:3] + turn, s[:, 3:]], -1)
+
+    torch.testing.assert_close(
+        bicycle_step(moved(state), acceleration, steering, length, DT),
+        moved(bicycle_step(state, acceleration, steering, length, DT)),
+    )
+    step = torch.stack([1 + acceleration.abs(), steering], -1)
+    torch.testing.assert_close(
+        displacement_step(moved(state), step, length, DT), moved(displacement_step(state, step, length, DT))
+    )
+
+
+def test_gradients() -> None:
+    state, (acceleration, steering, length) = states(4), controls(4)
+    inputs = [t.clone().requires_grad_() for t in (state, acceleration, steering)]
+    assert torch.autograd.gradcheck(lambda s, a, d: bicycle_step(s, a, d, length, DT), inputs)
+    step = torch.tensor([[2.0, 0.1], [0.0, 0.0], [-0.3, 0.02], [0.01, 0.01]], dtype=torch.float64)
+    inputs = [state.clone().requires_grad_(), step.requires_grad_()]
+    # At exactly zero the speed has a kink; a hair above it the slope is finite.
+    inputs[1].data[1] += 1e-3
+    assert torch.autograd.gradcheck(lambda s, d: displacement_step(s, d, LENGTH, DT), inputs)
+
+
+def test_gradient_through_a_long_rollout_is_finite() -> None:
+    action = torch.zeros(50, 2, requires_grad=True)
+    state = torch.zeros(4)
+    for t in range(50):
+        state = displacement_step(state, action[t], LENGTH.float(), DT)
+    state.sum().backward()
+    assert torch.isfinite(action.grad).all()
+
+
+def test_grid_is_the_papers() -> None:
+    grid = Bicycle()
+    acceleration, steering = grid.grid(torch.zeros(()))
+    assert grid.num_actions == 147 == len(acceleration)
+    assert (acceleration[73], steering[73]) == (0, 0)
+    assert acceleration.unique().numel() == 7
+    assert steering.unique().numel() == 21
+
+
+def drive(seed: int, steps: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
+    """States [8, T, 4] of smoothly driven vehicles and their lengths."""
+    rng = torch.Generator().manual_seed(seed)
+    state = torch.cat([torch.zeros(8, 3), 4 + 8 * torch.rand(8, 1, generator=rng)], -1)
+    length, phase = torch.full((8,), 4.6), 6 * torch.rand(8, generator=rng)
+    path = [state]
+    for t in range(steps):
+        swing = torch.sin(phase + 0.1 * t)
+        path.append(bicycle_step(path[-1], 1.7 * swing.cos(), 0.12 * swing, length, DT))
+    return torch.stack(path, 1), length
+
+
+def test_greedy_fit_follows_smooth_driving() -> None:
+    path, length = drive(0)
+    size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
+    actions, fitted = Bicycle().fit(path[..., :2], path[..., 2], path[..., 3], valid, size, DT)
+    assert actions.shape == (8, 50)
+    error = (fitted - path)[..., :2].norm(dim=-1)
+    assert error.max() < 0.25
+    assert error[:, -1].mean() < 0.15
+    replay = path[:, 0]
+    for t in range(50):
+        replay = Bicycle().step(replay, actions[:, t], size, DT)
+        torch.testing.assert_close(replay, fitted[:, t + 1])
+
+
+def test_displacement_fit_is_exact_in_position() -> None:
+    path, length = drive(1)
+    size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
+    _, fitted = Displacement().fit(path[..., :2], path[..., 2], path[..., 3], valid, size, DT)
+    torch.testing.assert_close(fitted[..., :2], path[..., :2], atol=1e-4, rtol=0)
+    assert wrap(fitted[..., 2] - path[..., 2]).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_fit_starts_anew_where_an_agent_reappears(dynamics: Bicycle | Displacement) -> None:
+    path, length = drive(2)
+    size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
+    valid[:, :5] = valid[:, 20:30] = False
+    hidden = torch.where(valid[..., None], path, torch.zeros(()))
+    _, fitted = dynamics.fit(hidden[..., :2], hidden[..., 2], hidden[..., 3], valid, size, DT)
+    torch.testing.assert_close(fitted[:, 30], path[:, 30])
+    assert (fitted - path)[:, 30:, :2].norm(dim=-1).max() < 0.25

@@ -1,0 +1,71 @@
+"""Laws of angles and planar frames."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symphony.geometry import from_frame, rotate, to_frame, wrap
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_wrap_range_and_congruence(dtype):
+    edges = [k * math.pi for k in range(-9, 10)]
+    base = torch.tensor([*edges, 0.0, -1e-12, 1e-12, -1e-30], dtype=dtype)
+    up, down = torch.full_like(base, torch.inf), torch.full_like(base, -torch.inf)
+    angle = torch.cat(
+        [base, base.nextafter(up), base.nextafter(down), torch.linspace(-50, 50, 997, dtype=dtype)]
+    )
+    wrapped = wrap(angle)
+    assert (wrapped >= -math.pi).all()
+    assert (wrapped < math.pi).all()
+    turns = (angle - wrapped) / (2 * math.pi)
+    assert (turns - turns.round()).abs().max() < 1e-5
+    inside = (angle >= -math.pi) & (angle < math.pi)
+    assert torch.equal(wrapped[inside], angle[inside])
+
+
+@given(st.floats(-1e4, 1e4))
+def test_wrap_keeps_the_direction(angle):
+    value = torch.tensor(angle, dtype=torch.float64)
+    wrapped = wrap(value)
+    assert -math.pi <= wrapped < math.pi
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
+    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+def test_wrap_gradient_is_one():
+    angle = torch.tensor([-7.0, -math.pi, 0.0, math.pi, 9.0], requires_grad=True)
+    wrap(angle).sum().backward()
+    assert torch.equal(angle.grad, torch.ones(5))
+
+
+def test_rotate_by_a_quarter_turn_is_counter_clockwise():
+    turned = rotate(torch.tensor([2.0, 1.0]), torch.tensor(math.pi / 2))
+    torch.testing.assert_close(turned, torch.tensor([-1.0, 2.0]))
+
+
+def test_frame_puts_forward_on_x_and_left_on_y():
+    origin, heading = torch.tensor([10.0, 5.0]), torch.tensor(math.pi / 2)
+    ahead, left = torch.tensor([10.0, 8.0]), torch.tensor([7.0, 5.0])
+    torch.testing.assert_close(to_frame(ahead, origin, heading), torch.tensor([3.0, 0.0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(to_frame(left, origin, heading), torch.tensor([0.0, 3.0]), atol=1e-6, rtol=0)
+
+
+def test_frames_are_inverse_and_keep_distances():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(3, 5, 7, 2, generator=generator, dtype=torch.float64) * 100
+    origin = torch.randn(3, 5, 1, 2, generator=generator, dtype=torch.float64) * 100
+    heading = torch.randn(3, 5, 1, generator=generator, dtype=torch.float64) * 9
+    local = to_frame(points, origin, heading)
+    torch.testing.assert_close(from_frame(local, origin, heading), points)
+    torch.testing.assert_close(to_frame(from_frame(points, origin, heading), origin, heading), points)
+    torch.testing.assert_close(local.norm(dim=-1), (points - origin).norm(dim=-1))
+    assert torch.autograd.gradcheck(
+        to_frame,
+        (points[0, 0].requires_grad_(), origin[0, 0].requires_grad_(), heading[0, 0].requires_grad_()),
+    )

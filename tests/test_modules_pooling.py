@@ -1,0 +1,187 @@
+"""Max-pooling through winners equals the dense one, and rows don't depend on their neighbours."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from symphony.modules import in_blocks, mlp, pool_elements
+
+
+def make(n=7, count=60, features=5, hidden=16, share=0.6, dtype=torch.float64, seed=0):
+    torch.manual_seed(seed)
+    network = mlp((features, hidden, hidden)).to(dtype)
+    elements = torch.randn(n, count, features, dtype=dtype)
+    mask = torch.rand(n, count) < share
+    mask[0] = False
+    mask[1] = True
+    return network, elements, mask
+
+
+def results(network, elements, mask, mode, **kwargs):
+    elements = elements.clone().requires_grad_()
+    pooled = pool_elements(network, elements, mask, mode=mode, **kwargs)
+    weights = torch.linspace(-1, 2, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
+    gradients = torch.autograd.grad((pooled * weights).sum(), [elements, *network.parameters()])
+    return [pooled.detach(), *gradients]
+
+
+def reference(network, elements, mask):
+    """One set, one element at a time."""
+    rows = []
+    for row, row_mask in zip(elements, mask, strict=True):
+        encoded = [network(element) for element, ok in zip(row, row_mask, strict=True) if ok]
+        width = network(elements.new_zeros(elements.shape[-1])).shape[-1]
+        rows.append(torch.stack(encoded).amax(0) if encoded else elements.new_zeros(width))
+    return torch.stack(rows)
+
+
+@pytest.mark.parametrize("mode", ["auto", "dense", "winner"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize("rows", [1, 150, 100_000])
+def test_values_and_gradients_equal_an_elementwise_reference(mode, dtype, tolerance, rows):
+    network, elements, mask = make(dtype=dtype)
+    got = results(network, elements, mask, mode, rows=rows)
+    leaf = elements.clone().requires_grad_()
+    pooled = reference(network, leaf, mask)
+    weights = torch.linspace(-1, 2, pooled.numel(), dtype=dtype).view_as(pooled)
+    expected = [pooled, *torch.autograd.grad((pooled * weights).sum(), [leaf, *network.parameters()])]
+    for a, b in zip(got, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
+    with torch.no_grad():
+        again = pool_elements(network, elements, mask, mode=mode, rows=rows)
+    torch.testing.assert_close(again, pooled.detach(), rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("network", [nn.Linear(3, 4), nn.Sequential(nn.Linear(3, 4, bias=False), nn.Tanh())])
+@pytest.mark.parametrize("mode", ["dense", "winner"])
+def test_gradcheck_for_any_row_wise_function(network, mode):
+    torch.manual_seed(1)
+    network = network.double()
+    elements = torch.randn(3, 6, 3, dtype=torch.float64, requires_grad=True)
+    mask = torch.tensor([[1, 1, 0, 1, 1, 1], [0] * 6, [0, 0, 0, 0, 1, 0]], dtype=torch.bool)
+    parameters = list(network.parameters())
+
+    def pooled(x, *_):
+        return pool_elements(network, x, mask, mode=mode)
+
+    assert torch.autograd.gradcheck(pooled, (elements, *parameters))
+    assert torch.autograd.gradgradcheck(pooled, (elements, *parameters))
+
+
+@pytest.mark.parametrize("mode", ["dense", "winner"])
+def test_masked_elements_have_no_influence_whatever_they_hold(mode):
+    network, elements, mask = make()
+    clean = results(network, elements, mask, mode)
+    for garbage in (1e30, torch.nan, torch.inf):
+        dirty = results(network, torch.where(mask[..., None], elements, garbage), mask, mode)
+        for a, b in zip(clean, dirty, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+        assert (dirty[1][~mask] == 0).all()
+
+
+@pytest.mark.parametrize("mode", ["dense", "winner"])
+def test_empty_sets_give_zeros_and_no_gradient(mode):
+    network, elements, mask = make()
+    pooled, gradient, *parameters = results(network, elements, torch.zeros_like(mask), mode)
+    assert not any(t.any() for t in (pooled, gradient, *parameters))
+
+
+@given(seed=st.integers(0, 10_000), extra=st.integers(1, 30))
+@settings(max_examples=25, deadline=None)
+def test_order_and_padding_of_the_elements_change_nothing(seed, extra):
+    network, elements, mask = make(n=3, count=55, seed=seed)
+    base = results(network, elements, mask, "winner")
+    order = torch.randperm(elements.shape[1])
+    shuffled = results(network, elements[:, order], mask[:, order], "winner")
+    shuffled[1] = shuffled[1][:, order.argsort()]
+    padding = torch.full((3, extra, elements.shape[2]), 1e6, dtype=elements.dtype)
+    padded = results(
+        network,
+        torch.cat([padding, elements], 1),
+        torch.cat([torch.zeros(3, extra, dtype=torch.bool), mask], 1),
+        "winner",
+    )
+    padded[1] = padded[1][:, extra:]
+    for other in (shuffled, padded):
+        for a, b in zip(base, other, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["dense", "winner"])
+def test_among_equal_elements_the_first_gets_the_gradient(mode):
+    network, elements, _ = make(n=1)
+    same = elements[:, :1].expand(1, 60, -1).clone()
+    mask = torch.ones(1, 60, dtype=torch.bool)
+    mask[:, :2] = False
+    gradient = results(network, same, mask, mode)[1]
+    assert gradient[0, 2].any()
+    assert not gradient[0, 3:].any()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("count", "features"), [(16, 10), (200, 9), (1000, 8)])
+def test_without_gradients_a_result_does_not_depend_on_its_batch(threads, count, features):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        n = 12
+        network, elements, mask = make(n=n, count=count, features=features, hidden=64, dtype=torch.float32)
+        with torch.no_grad():
+            whole = pool_elements(network, elements, mask)
+            for part in (slice(0, 1), slice(3, 5), slice(5, 12)):
+                assert torch.equal(pool_elements(network, elements[part], mask[part]), whole[part])
+            order = torch.randperm(n)
+            assert torch.equal(pool_elements(network, elements[order], mask[order]), whole[order])
+            many = pool_elements(network, elements.repeat(20, 1, 1), mask.repeat(20, 1))
+            assert torch.equal(many, whole.repeat(20, 1))
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 63, 64, 65, 200])
+def test_blocks_of_rows_do_not_depend_on_the_batch(n):
+    torch.manual_seed(0)
+    network, x = mlp((150, 128, 128, 147)), torch.randn(200, 150)
+    with torch.no_grad():
+        whole = in_blocks(network, x)
+        assert torch.equal(in_blocks(network, x[:n]), whole[:n])
+        assert torch.equal(in_blocks(network, x[-n:]), whole[-n:])
+    torch.testing.assert_close(in_blocks(network, x.view(2, 100, 150)), network(x).view(2, 100, 147))
+    assert in_blocks(network, x[:0]).shape == (0, 147)
+
+
+def test_leading_dimensions_and_empty_inputs():
+    network, elements, mask = make(n=6)
+    pooled = pool_elements(network, elements.view(2, 3, 60, 5), mask.view(2, 3, 60))
+    assert torch.equal(pooled.view(6, -1), pool_elements(network, elements, mask))
+    assert pool_elements(network, elements[:, :0], mask[:, :0]).eq(0).all()
+    assert pool_elements(network, elements[:, :0], mask[:, :0]).shape == (6, 16)
+    assert pool_elements(network, elements[:0], mask[:0]).shape == (0, 16)
+    assert pool_elements(network, elements[0], mask[0]).shape == (16,)
+
+
+def test_bad_arguments_are_refused():
+    network, elements, mask = make()
+    with pytest.raises(ValueError, match="bool mask of shape"):
+        pool_elements(network, elements, mask[:, 1:])
+    with pytest.raises(ValueError, match="bool mask of shape"):
+        pool_elements(network, elements, mask.float())
+    with pytest.raises(ValueError, match="unknown mode"):
+        pool_elements(network, elements, mask, mode="fast")
+    with pytest.raises(ValueError, match="input and an output"):
+        mlp((3,))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("mode", ["auto", "dense", "winner"])
+def test_cuda_agrees_with_the_cpu(mode):
+    network, elements, mask = make()
+    expected = results(network, elements, mask, "dense")
+    got = results(network.cuda(), elements.cuda(), mask.cuda(), mode)
+    for a, b in zip(got, expected, strict=True):
+        torch.testing.assert_close(a.cpu(), b, rtol=1e-9, atol=1e-9)

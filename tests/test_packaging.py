@@ -1,0 +1,227 @@
+"""What a fresh checkout promises: pinned versions, targets that set themselves up, one-way imports."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    found = [line.split("==") for line in lines if line and not line.startswith("#")]
+    assert len(dict(found)) == len(found), "pinned twice"
+    return {canonicalize_name(name): version for name, version in found}
+
+
+def make(*arguments: str, cwd: Path = ROOT, **environment: str) -> subprocess.CompletedProcess[str]:
+    program = shutil.which("make")
+    if program is None:
+        pytest.skip("make is not installed")
+    # Not the make that may be running these tests.
+    inherited = {
+        key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "MFLAGS", "PYTHON"))
+    }
+    return subprocess.run(
+        [program, *arguments],
+        cwd=cwd,
+        env=inherited | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("extra", ["core", *PROJECT["optional-dependencies"]])
+def test_every_dependency_is_pinned_within_its_range(extra: str) -> None:
+    extras = PROJECT["optional-dependencies"]
+    for line in PROJECT["dependencies"] if extra == "core" else extras[extra]:
+        need = Requirement(line)
+        version = pins()[canonicalize_name(need.name)]
+        assert need.specifier.contains(version, prereleases=True), f"{line}: pinned to {version}"
+
+
+def test_pins_are_plain_versions() -> None:
+    # A build tag such as +cpu is found on some package indices only.
+    assert all(re.fullmatch(r"[0-9][0-9a-z.]*", version) for version in pins().values())
+
+
+def test_pins_reach_everything_the_core_needs() -> None:
+    todo, seen = ["symphony"], set()
+    while todo:
+        name = canonicalize_name(todo.pop())
+        if name in seen:
+            continue
+        seen.add(name)
+        for line in importlib.metadata.requires(name) or []:
+            need = Requirement(line)
+            if need.marker is None or need.marker.evaluate({"extra": ""}):
+                todo.append(need.name)
+    assert seen - {"symphony"} - set(pins()) == set()
+
+
+def test_a_python_too_old_is_named(tmp_path: Path) -> None:
+    old = tmp_path / "python"
+    old.write_text("#!/bin/sh\nexit 1\n")
+    old.chmod(0o755)
+    for python in (str(old), str(tmp_path / "missing")):
+        done = make("setup", f"VENV={tmp_path / 'venv'}", f"PYTHON={python}")
+        assert done.returncode != 0
+        assert f"error: {python} is missing or older than Python 3.11" in done.stderr
+        assert not (tmp_path / "venv").exists()
+
+
+def test_without_any_python_the_message_says_what_is_needed(tmp_path: Path) -> None:
+    for tool in ("sh", "make", "test"):
+        found = shutil.which(tool)
+        if found:
+            (tmp_path / tool).symlink_to(found)
+    done = make("setup", f"VENV={tmp_path / 'venv'}", PATH=str(tmp_path))
+    assert done.returncode != 0
+    assert "error: needs Python 3.11 or newer" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("target", "commands"),
+    [
+        ("demo", ["bin/symphony demo --out out/demo"]),
+        ("test", ["bin/python -m pytest"]),
+        ("lint", ["ruff check", "ruff format --check", "mypy", "lint-imports", "scripts/lint_length.py"]),
+    ],
+)
+def test_targets_set_themselves_up_once(target: str, commands: list[str], tmp_path: Path) -> None:
+    first = make("--dry-run", target, f"VENV={tmp_path}").stdout
+    assert [line for line in first.splitlines() if "-c constraints.txt -e" in line]
+    assert ("[dev]" in first) == (target != "demo")
+    (tmp_path / ".core").touch()
+    (tmp_path / ".dev").touch()
+    again = make("--dry-run", target, f"VENV={tmp_path}").stdout
+    assert "pip" not in again
+    for command in commands:
+        assert command in first
+        assert command in again
+
+
+@pytest.mark.parametrize("changed", ["pyproject.toml", "constraints.txt"])
+def test_a_change_of_the_dependencies_installs_again(changed: str, tmp_path: Path) -> None:
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copyfile(ROOT / name, tmp_path / name)
+    venv = tmp_path / ".venv"
+    venv.mkdir()
+    for stamp in (venv / ".core", venv / ".dev"):
+        stamp.touch()
+    assert "pip" not in make("--dry-run", "test", cwd=tmp_path).stdout
+    later = (venv / ".dev").stat().st_mtime + 10
+    os.utime(tmp_path / changed, (later, later))
+    assert make("--dry-run", "test", cwd=tmp_path).stdout.count("pip install") == 2
+
+
+def test_ci_runs_lint_then_tests(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    fake = tmp_path / "make"
+    fake.write_text(f'#!/bin/sh\necho "$PWD $@" >> {log}\n[ "$1" != "$FAIL" ]\n')
+    fake.chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "FAIL": ""}
+    for failing, expected in (("", ["lint", "test"]), ("lint", ["lint"]), ("test", ["lint", "test"])):
+        log.unlink(missing_ok=True)
+        done = subprocess.run(
+            [ROOT / ".ci/run"], cwd=tmp_path, env=environment | {"FAIL": failing}, check=False
+        )
+        assert log.read_text().splitlines() == [f"{ROOT} {target}" for target in expected]
+        assert (done.returncode == 0) == (failing == "")
+
+
+def test_long_files_are_found(tmp_path: Path) -> None:
+    code = "from lint_length import too_long\nimport sys, pathlib\nprint(too_long(pathlib.Path(sys.argv[1])))"
+    source = tmp_path / "src" / "deep"
+    source.mkdir(parents=True)
+    (source / "short.py").write_text("x = 1\n" * 600)
+    (source / "made_pb2.py").write_text("x = 1\n" * 900)
+    for lines, expected in ((600, False), (601, True)):
+        (source / "long.py").write_text("x = 1\n" * lines)
+        done = subprocess.run(
+            [sys.executable, "-c", code, tmp_path],
+            cwd=ROOT / "scripts",
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert ("long.py" in done.stdout) == expected
+        assert "short.py" not in done.stdout
+        assert "made_pb2.py" not in done.stdout
+
+
+def skeleton(root: Path) -> Path:
+    """A package with our packages' names and nothing in them."""
+    package = root / "symphony"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    for path in sorted((ROOT / "src" / "symphony").iterdir()):
+        if path.is_dir() and (path / "__init__.py").exists():
+            (package / path.name).mkdir()
+            (package / path.name / "__init__.py").write_text("")
+        elif path.suffix == ".py":
+            (package / path.name).write_text("")
+    shutil.copyfile(ROOT / ".importlinter", root / ".importlinter")
+    return package
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "allowed"),
+    [
+        ("geometry/frames.py", "import symphony.errors", True),
+        ("geometry/frames.py", "import symphony.roadgraph", False),
+        ("roadgraph/lanes.py", "import symphony.geometry", True),
+        ("roadgraph/lanes.py", "import symphony.data", False),
+        (
+            "roadgraph/lanes.py",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import symphony.data",
+            True,
+        ),
+        ("data/store.py", "import symphony.roadgraph", True),
+        ("data/store.py", "import symphony.envs", False),
+        ("envs/driving.py", "import symphony.keys, symphony.data", True),
+        ("envs/driving.py", "def f():\n    import symphony.metrics", False),
+        ("modules/heads.py", "import symphony.geometry", True),
+        ("modules/heads.py", "import symphony.roadgraph", False),
+        ("modules/heads.py", "import symphony.config", False),
+        ("metrics/realism.py", "import symphony.roadgraph", True),
+        ("metrics/realism.py", "import symphony.envs", False),
+        ("objectives/bc.py", "import symphony.keys", True),
+        ("objectives/bc.py", "import symphony.geometry", False),
+        ("render/plots.py", "import symphony.data", True),
+        ("render/plots.py", "import symphony.metrics", False),
+        (
+            "trainers/loop.py",
+            "import symphony.metrics, symphony.modules, symphony.render, symphony.config",
+            True,
+        ),
+        ("trainers/loop.py", "import symphony.cli", False),
+        ("unplaced.py", "", False),
+    ],
+)
+def test_imports_flow_one_way(file: str, line: str, allowed: bool, tmp_path: Path) -> None:
+    (skeleton(tmp_path) / file).write_text(line + "\n")
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == allowed, done.stdout + done.stderr
+
+
+def test_license_is_the_one_declared() -> None:
+    text = (ROOT / "LICENSE").read_text()
+    assert PROJECT["license"] == "Apache-2.0"
+    assert "Apache License" in text
+    assert "END OF TERMS AND CONDITIONS" in text

@@ -1,0 +1,467 @@
+from __future__ import annotations
+
+import itertools
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgba
+
+from helpers_segments import crossing, hide, straight_road
+from symphony.data.segment import MarkType, Polylines, RunSegment, SignalState
+from symphony.errors import ConfigError
+from symphony.render import plot_grid, plot_rollout, plot_segment
+from symphony.render.agents import CORNERS, NOSE, draw_trails, pieces, place
+from symphony.render.roads import lane_arrows, road_ribbon
+from symphony.render.style import (
+    AGENT_COLORS,
+    PLAYBACK,
+    ROAD,
+    free_corner,
+    new_figure,
+    scale_length,
+    view_around,
+)
+
+
+def blank() -> Axes:
+    return new_figure().add_subplot()
+
+
+def by_gid(axes: Axes, gid: str) -> Any:
+    (found,) = (artist for artist in axes.get_children() if artist.get_gid() == gid)
+    return found
+
+
+def gids(axes: Axes) -> set[str]:
+    return {artist.get_gid() for artist in axes.get_children() if artist.get_gid()}
+
+
+def labels(axes: Axes) -> list[str]:
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def corners(collection: Any) -> np.ndarray:
+    """[A, 4, 2] boxes of a collection, without the closing vertex."""
+    return np.stack([path.vertices[:4] for path in collection.get_paths()])
+
+
+# Geometry
+
+numbers = st.floats(-50, 50, width=32)
+
+
+@given(arrays(np.float64, 2, elements=numbers), st.floats(-7, 7), st.floats(0.5, 12), st.floats(0.3, 3))
+def test_box_agrees_with_shapely(position: np.ndarray, heading: float, length: float, width: float) -> None:
+    box = shapely.Polygon(place(CORNERS, position[None], np.array([heading]), np.array([[length, width]]))[0])
+    expected = shapely.affinity.translate(
+        shapely.affinity.rotate(
+            shapely.box(-length / 2, -width / 2, length / 2, width / 2), heading, (0, 0), use_radians=True
+        ),
+        *position,
+    )
+    assert box.symmetric_difference(expected).area < 1e-6 * expected.area + 1e-9
+
+
+@given(st.floats(-7, 7))
+def test_nose_is_inside_the_box_and_ahead(heading: float) -> None:
+    at = np.array([[3.0, -2.0]]), np.array([heading]), np.array([[4.6, 1.9]])
+    nose = place(NOSE, *at)[0]
+    assert shapely.Polygon(place(CORNERS, *at)[0]).contains(shapely.Polygon(nose))
+    assert (nose.mean(0) - at[0][0]) @ [math.cos(heading), math.sin(heading)] > 1
+
+
+@given(arrays(np.bool_, st.integers(2, 12)))
+def test_pieces_join_valid_steps_only(valid: np.ndarray) -> None:
+    path = np.stack([np.arange(len(valid)), -np.arange(len(valid))], -1).astype(float)
+    found, begin = pieces(path, valid)
+    expected = [k for k in range(len(valid) - 1) if valid[k] and valid[k + 1]]
+    assert begin.tolist() == expected
+    assert found[:, 0, 0].tolist() == expected
+    assert (found[:, 1] - found[:, 0] == [1, -1]).all()
+    hidden = np.where(valid[:, None], path, np.nan)
+    assert pieces(hidden)[1].tolist() == expected
+
+
+def test_trails_fade_away_from_the_step_shown() -> None:
+    axes = blank()
+    path = np.stack([np.arange(21.0), np.zeros(21)], -1)[None]
+    draw_trails(axes, path, None, "#0072B2", step=10, gid="trail")
+    alpha = by_gid(axes, "trail").get_colors()[:, 3]
+    assert (np.diff(alpha[:10]) > 0).all()
+    assert (np.diff(alpha[10:]) < 0).all()
+    np.testing.assert_allclose(alpha, alpha[::-1])
+    assert alpha.min() > 0.1
+
+
+@settings(deadline=None)
+@given(st.integers(2, 9), st.floats(0.3, 40), st.integers(0, 1000))
+def test_arrows_lie_on_the_lane_and_point_along_it(count: int, length: float, seed: int) -> None:
+    turns = np.random.default_rng(seed).uniform(-0.4, 0.4, count)
+    steps = np.stack([np.cos(turns), np.sin(turns)], -1) * length
+    line = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)])
+    found = lane_arrows(line)
+    assert len(found) == (0 if count * length < 7 else max(1, int(count * length / 14)))
+    for arrow in found:
+        tip, back = arrow[1], (arrow[0] + arrow[2]) / 2
+        assert shapely.LineString(line).distance(shapely.Point(tip)) < 1e-6
+        direction = (tip - back) / 0.7
+        # At a bend, either of the two pieces that meet there.
+        near = [shapely.LineString(line[k : k + 2]).distance(shapely.Point(tip)) < 1e-6 for k in range(count)]
+        assert np.abs(direction - steps[near] / length).max(-1).min() < 1e-6
+
+
+@given(st.floats(1e-3, 1e5))
+def test_scale_bar_is_round_and_fits(span: float) -> None:
+    length = scale_length(span)
+    assert span / 12.6 < length <= span / 5 * (1 + 1e-9)
+    assert round(length / 10 ** math.floor(math.log10(length) + 1e-9), 6) in {1, 2, 5}
+
+
+@given(arrays(np.float64, st.tuples(st.integers(1, 9), st.just(2)), elements=st.floats(-500, 500)))
+def test_view_holds_the_points_with_their_margin(points: np.ndarray) -> None:
+    x0, x1, y0, y1 = view_around(points, margin=20, least=70)
+    assert x0 <= points[:, 0].min() - 15 + 1e-6
+    assert x1 >= points[:, 0].max() + 15 - 1e-6
+    assert y0 <= points[:, 1].min() - 15 + 1e-6
+    assert y1 >= points[:, 1].max() + 15 - 1e-6
+    sides = sorted([x1 - x0, y1 - y0])
+    assert sides[1] >= 70 - 1e-9
+    assert sides[0] >= 0.6 * sides[1] - 1e-6
+
+
+@given(arrays(np.float64, st.tuples(st.integers(0, 40), st.just(2)), elements=st.floats(-5, 15)))
+def test_legend_goes_where_it_hides_least(points: np.ndarray) -> None:
+    view = (0.0, 10.0, 0.0, 10.0)
+    boxes = {
+        "upper right": shapely.box(6, 6.5, 10, 10),
+        "upper left": shapely.box(0, 6.5, 4, 10),
+        "lower right": shapely.box(6, 0, 10, 3.5),
+    }
+    hidden = {name: sum(box.covers(shapely.Point(p)) for p in points) for name, box in boxes.items()}
+    on_edge = (np.isin(points[:, 0], [4, 6]) | np.isin(points[:, 1], [3.5, 6.5])).sum()
+    assert hidden[free_corner(points, view)] <= min(hidden.values()) + on_edge
+
+
+def test_view_without_points_is_still_a_view() -> None:
+    assert view_around(np.full((3, 2), np.nan)) == (-35, 35, -35, 35)
+
+
+def test_colors_can_be_told_apart_by_all_eyes() -> None:
+    # Severe deuteranopia and protanopia (Machado et al. 2009), on linear RGB.
+    eyes = (
+        np.eye(3),
+        np.array(
+            [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]]
+        ),
+        np.array(
+            [
+                [0.152286, 1.052583, -0.204868],
+                [0.114503, 0.786281, 0.099216],
+                [-0.003882, -0.048116, 1.051998],
+            ]
+        ),
+    )
+    colors = [*AGENT_COLORS, PLAYBACK, ROAD]
+    linear = np.array([to_rgba(color)[:3] for color in colors]) ** 2.2
+    for eye in eyes:
+        seen = np.clip(linear @ eye.T, 0, 1) ** (1 / 2.2)
+        for a, b in itertools.combinations(range(len(colors)), 2):
+            assert np.linalg.norm(seen[a] - seen[b]) > 0.25, (colors[a], colors[b])
+
+
+# Run segments
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_segment_is_written_as_a_picture(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / "made" / f"crossing.{suffix}"
+    plot_segment(crossing(), path)
+    content = path.read_bytes()
+    assert content.startswith({"png": b"\x89PNG\r\n", "svg": b"<?xml", "pdf": b"%PDF"}[suffix])
+    if suffix == "png":
+        pixels = matplotlib.image.imread(path)
+        colors = {to_hex(color) for color in pixels.reshape(-1, 4)[::7]}
+        assert AGENT_COLORS[0].lower() in colors
+        assert PLAYBACK.lower() in colors
+        assert "#ffffff" in colors
+
+
+def test_equal_pictures_are_equal_files(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        plot_segment(crossing(), tmp_path / f"{name}.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize("step", [0, 25, 50])
+def test_boxes_stand_where_the_log_has_them(step: int) -> None:
+    segment = crossing()
+    axes = plot_segment(segment, blank(), step=step, interactive=[2])
+    for agent, color in ((segment.ego, AGENT_COLORS[0]), (2, AGENT_COLORS[1])):
+        box = by_gid(axes, f"box-{agent}")
+        expected = place(
+            CORNERS,
+            segment.position[[agent], step, :2],
+            segment.heading[[agent], step],
+            segment.size[[agent]],
+        )
+        np.testing.assert_allclose(corners(box), expected, atol=1e-4)
+        assert to_hex(box.get_facecolor()[0]) == color.lower()
+    assert len(corners(by_gid(axes, "playback"))) == segment.num_agents - 2
+
+
+def test_agents_that_are_not_seen_are_not_drawn() -> None:
+    segment = hide(hide(crossing(), 1, slice(20, 30)), 2, slice(20, 30))
+    axes = plot_segment(segment, blank(), step=25, interactive=[1])
+    assert "box-1" not in gids(axes)
+    assert len(corners(by_gid(axes, "playback"))) == segment.num_agents - 3
+    trail = by_gid(axes, "trail-1").get_segments()
+    assert len(trail) == segment.num_steps - 1 - 11
+    np.testing.assert_allclose(trail[0], segment.position[1, :2, :2])
+
+
+def test_map_is_drawn_where_it_lies() -> None:
+    segment = straight_road(3)
+    axes = plot_segment(segment, blank(), view=(0.0, 60.0, -20.0, 20.0))
+    drawn = by_gid(axes, "lanes").get_segments()
+    for k, lane in enumerate(drawn):
+        np.testing.assert_allclose(lane, segment.road.lanes[k][:, :2])
+    assert len(by_gid(axes, "boundary").get_segments()) == len(segment.road.boundary)
+    surface = shapely.Polygon(by_gid(axes, "surface").get_path().vertices)
+    assert surface.contains(shapely.Point(30, 3.5))
+    assert not surface.contains(shapely.Point(30, 13))
+    assert axes.get_xlim() == (0, 60)
+    assert axes.get_ylim() == (-20, 20)
+
+
+def test_map_outside_the_view_is_left_out() -> None:
+    axes = plot_segment(straight_road(3), blank(), view=(0.0, 60.0, 2.0, 40.0))
+    assert len(by_gid(axes, "lanes").get_segments()) == 2
+    axes = plot_segment(straight_road(3), blank(), view=(0.0, 60.0, 200.0, 240.0))
+    assert len(by_gid(axes, "lanes").get_segments()) == 0
+    assert "surface" not in gids(axes)
+
+
+def test_lanes_of_unknown_width_have_a_surface() -> None:
+    road = straight_road(3).road
+    unknown = road.lane_width.copy()
+    unknown[:] = np.nan
+    for width, expected in ((road.lane_width, 3.5), (unknown, 3.6)):
+        ribbon = road_ribbon(type(road)(**{**vars(road), "lane_width": width}), 0)
+        low, high = ribbon.bounds[1], ribbon.bounds[3]
+        assert high - low == pytest.approx(expected + 0.3, abs=1e-4)
+
+
+def test_lights_stand_at_their_stop_points_in_their_state() -> None:
+    segment = crossing()
+    shown = set()
+    for step in range(0, segment.num_steps, 5):
+        axes = plot_segment(segment, blank(), step=step, view=(-200.0, 200.0, -200.0, 200.0))
+        for name, states in (
+            ("stop", {SignalState.STOP, SignalState.ARROW_STOP, SignalState.FLASHING_STOP}),
+            ("caution", {SignalState.CAUTION, SignalState.ARROW_CAUTION, SignalState.FLASHING_CAUTION}),
+            ("go", {SignalState.GO, SignalState.ARROW_GO}),
+        ):
+            expected = segment.signal_point[np.isin(segment.signal_state[:, step], list(states)), :2]
+            assert (
+                (f"signals-{name}" in gids(axes)) == (f"light: {name}" in labels(axes)) == bool(len(expected))
+            )
+            if len(expected):
+                np.testing.assert_allclose(by_gid(axes, f"signals-{name}").get_offsets(), expected, atol=1e-4)
+                shown.add(name)
+    assert {"stop", "go"} <= shown
+
+
+def test_marks_of_every_kind_are_drawn() -> None:
+    segment = straight_road(3)
+    square = np.array([(20, -1), (24, -1), (24, 8), (20, 8)], float)
+    kinds = [
+        MarkType.ROAD_LINE,
+        MarkType.CROSSWALK,
+        MarkType.SPEED_BUMP,
+        MarkType.DRIVEWAY,
+        MarkType.STOP_SIGN,
+    ]
+    lines = [square + np.array([6, 0]) * k for k in range(4)] + [np.array([[50.0, 9.0]])]
+    road = type(segment.road)(
+        **{**vars(segment.road), "marks": Polylines.of(lines), "mark_type": np.array(kinds, np.uint8)}
+    )
+    axes = plot_segment(segment.replace(road=road), blank())
+    np.testing.assert_allclose(by_gid(axes, "marks").get_segments()[0], square)
+    for k, name in enumerate(("crosswalk", "speed_bump", "driveway"), start=1):
+        np.testing.assert_allclose(by_gid(axes, f"mark-{name}").get_path().vertices[:4], lines[k])
+    np.testing.assert_allclose(by_gid(axes, "stop-signs").get_offsets(), [(50, 9)])
+    assert "stop sign" in labels(axes)
+
+
+def test_caption_names_the_segment_and_legend_the_agents() -> None:
+    segment = crossing().replace(segment_id="a_$b^c_7")
+    axes = plot_segment(segment, blank(), interactive=[1])
+    assert axes.get_title(loc="left") == "a_$b^c_7"
+    caption = " ".join(text.get_text() for text in axes.texts)
+    assert f"{segment.source}" in caption
+    assert "10.0 s at 5 Hz" in caption
+    assert f"ego vehicle {segment.agent_id[0]}" in labels(axes)
+    assert f"interactive vehicle {segment.agent_id[1]}" in labels(axes)
+    assert plot_segment(segment, blank(), legend=False).get_legend() is None
+
+
+def test_interest_is_highlighted_by_default_and_the_ego_once() -> None:
+    segment = crossing().replace(interest=np.array([0, 2], np.int32))
+    assert {"box-0", "box-2"} == {
+        gid for gid in gids(plot_segment(segment, blank())) if gid.startswith("box")
+    }
+
+
+@pytest.mark.parametrize("wrong", [{"step": 51}, {"step": -1}, {"interactive": [99]}, {"interactive": [-1]}])
+def test_segment_arguments_are_checked(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"step|agents"):
+        plot_segment(crossing(), blank(), **wrong)
+
+
+def test_unknown_kind_of_picture_is_refused(tmp_path: Path) -> None:
+    for draw in (
+        lambda path: plot_segment(crossing(), path),
+        lambda path: plot_grid([lambda axes: None], path),
+    ):
+        with pytest.raises(ConfigError, match=r"\.png"):
+            draw(tmp_path / "a.docx")
+
+
+# Rollouts
+
+
+def rollouts(segment: RunSegment, agents: list[int], count: int = 3, start: int = 0) -> dict[str, Any]:
+    """The log shifted sideways by 2 m per rollout; padding (negative agents) far away."""
+    steps = segment.num_steps - start
+    position = np.zeros((count, len(agents), steps, 2))
+    heading = np.zeros(position.shape[:-1])
+    for n, agent in enumerate(agents):
+        position[:, n] = segment.position[agent, start:, :2] if agent >= 0 else 1e6
+        heading[:, n] = segment.heading[agent, start:] if agent >= 0 else 0
+    position[..., 1] += 2 * np.arange(count)[:, None, None]
+    return {"position": position, "heading": heading, "agent_index": agents, "start": start}
+
+
+def test_rollouts_are_drawn_over_the_log() -> None:
+    segment = straight_road(4)
+    given = rollouts(segment, [0, 2], start=10)
+    axes = plot_rollout(segment, target=blank(), **given)
+    for n, agent in enumerate([0, 2]):
+        lines = np.stack(by_gid(axes, f"rollouts-{agent}").get_segments()).reshape(3, -1, 2, 2)
+        np.testing.assert_allclose(lines[:, :, 0], given["position"][:, n, :-1], atol=1e-4)
+        ends = corners(by_gid(axes, f"ends-{agent}")).mean(1)
+        np.testing.assert_allclose(ends, given["position"][:, n, -1], atol=1e-4)
+        log = np.stack(by_gid(axes, f"log-{agent}").get_data(), -1)
+        np.testing.assert_allclose(log, segment.position[agent, 10:, :2])
+    playback = corners(by_gid(axes, "playback")).mean(1)
+    np.testing.assert_allclose(playback, segment.position[[1, 3], -1, :2], atol=1e-3)
+
+
+def test_padding_changes_nothing() -> None:
+    segment = straight_road(4)
+    plain, padded = (
+        plot_rollout(segment, target=blank(), **rollouts(segment, agents)) for agents in ([0, 2], [0, -1, 2])
+    )
+    assert gids(plain) == gids(padded)
+    assert plain.get_xlim() == padded.get_xlim()
+    assert labels(plain) == labels(padded)
+    for gid in ("rollouts-2", "ends-2"):
+        first, second = (
+            np.concatenate([path.vertices for path in by_gid(axes, gid).get_paths()])
+            for axes in (plain, padded)
+        )
+        np.testing.assert_array_equal(first, second)
+
+
+def test_rollout_ends_at_its_last_valid_step() -> None:
+    segment = straight_road(3)
+    given = rollouts(segment, [0])
+    valid = np.ones((3, 1, 51), bool)
+    valid[1, 0, 20:] = False
+    axes = plot_rollout(segment, target=blank(), valid=valid, **given)
+    ends = corners(by_gid(axes, "ends-0")).mean(1)
+    np.testing.assert_allclose(ends, given["position"][[0, 1, 2], 0, [50, 19, 50]], atol=1e-4)
+    assert len(by_gid(axes, "rollouts-0").get_segments()) == 50 + 19 + 50
+
+
+def test_events_are_marked_where_they_begin() -> None:
+    segment = straight_road(3)
+    given = rollouts(segment, [0, 1])
+    collision = np.zeros((3, 2, 51), bool)
+    collision[0, 1, 5:9] = collision[0, 1, 30:] = collision[2, 0, 0] = True
+    axes = plot_rollout(
+        segment, target=blank(), collision=collision, offroad=np.zeros_like(collision), **given
+    )
+    marked = {tuple(point) for point in by_gid(axes, "collision").get_offsets().round(3).tolist()}
+    expected = [given["position"][where] for where in ((0, 1, 5), (0, 1, 30), (2, 0, 0))]
+    assert marked == {tuple(point) for point in np.round(expected, 3).tolist()}
+    assert "collision" in labels(axes)
+    assert "offroad" not in gids(axes)
+    assert "off road" not in labels(axes)
+
+
+def test_log_gaps_stay_gaps() -> None:
+    segment = hide(straight_road(3), 1, slice(10, 20))
+    axes = plot_rollout(segment, target=blank(), **rollouts(straight_road(3), [1]))
+    x = by_gid(axes, "log-1").get_xdata()
+    assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 20))
+
+
+def test_ego_keeps_its_color_wherever_it_stands() -> None:
+    segment = straight_road(4)
+    axes = plot_rollout(segment, target=blank(), **rollouts(segment, [2, 0]))
+    for agent, color in ((0, AGENT_COLORS[0]), (2, AGENT_COLORS[1])):
+        assert to_hex(by_gid(axes, f"rollouts-{agent}").get_colors()[0]) == color.lower()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"start": 1},
+        {"start": -1},
+        {"agent_index": [0]},
+        {"agent_index": [0, 9]},
+        {"heading": np.zeros((3, 2, 50))},
+        {"position": np.zeros((3, 2, 51, 3))},
+        {"collision": np.zeros((3, 2, 50), bool)},
+    ],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_rollout_arguments_are_checked(wrong: dict[str, Any]) -> None:
+    segment = straight_road(4)
+    with pytest.raises(ValueError, match=r"steps|agent_index|position|collision"):
+        plot_rollout(segment, target=blank(), **(rollouts(segment, [0, 2]) | wrong))
+
+
+# Several pictures
+
+
+def test_grid_has_a_panel_for_each(tmp_path: Path) -> None:
+    segment, seen = crossing(), []
+    panels = [lambda axes: seen.append(plot_segment(segment, axes, legend=False))] * 4
+    figure = plot_grid(panels, tmp_path / "grid.png", columns=3, size=2)
+    assert len(figure.axes) == len(seen) == 4
+    rows = {axes.get_subplotspec().rowspan.start for axes in figure.axes}
+    assert rows == {0, 1}
+    assert (tmp_path / "grid.png").stat().st_size > 5000
+    with pytest.raises(ValueError, match="no panels"):
+        plot_grid([], tmp_path / "none.png")
+
+
+def test_no_window_and_no_global_state(tmp_path: Path) -> None:
+    code = (
+        "import sys, symphony.render\n"
+        "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules, 'heavy import'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

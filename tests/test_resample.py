@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from helpers_segments import crossing, hide, segments, straight_road
+from symphony.data.resample import resample, smooth
+from symphony.data.segment import RunSegment, content_hash, validate
+from symphony.errors import ConfigError, DataError
+
+PER_STEP = ("position", "heading", "velocity", "valid", "signal_state")
+
+
+def test_10_hz_becomes_5_hz_by_every_second_step() -> None:
+    log = hide(crossing(4, steps=91, dt=0.1, current_step=10), 2, slice(20, 31))
+    new = resample(log, 0.2)
+    assert (new.num_steps, new.current_step, new.dt) == (46, 5, 0.2)
+    for name in PER_STEP:
+        np.testing.assert_array_equal(getattr(new, name), getattr(log, name)[:, ::2])
+
+
+@pytest.mark.parametrize(("step", "expected"), [(0, 0), (1, 0), (2, 1), (3, 1), (90, 45)])
+def test_current_step_becomes_the_latest_kept_one(step: int, expected: int) -> None:
+    assert resample(straight_road(steps=91, dt=0.1, current_step=step), 0.2).current_step == expected
+
+
+@settings(max_examples=40, deadline=None)
+@given(segments(), st.integers(1, 4))
+def test_whole_multiples_pick_and_keep_everything_else(log: RunSegment, every: int) -> None:
+    picked = log.valid[:, ::every]
+    assume(picked.shape[1] >= 2 and picked[log.ego].any())
+    new = resample(log, log.dt * every)
+    same = {name: getattr(log, name) for name in (*PER_STEP, "dt", "current_step")}
+    assert content_hash(new.replace(**same)) == content_hash(log)
+    np.testing.assert_array_equal(new.valid, picked)
+
+
+@settings(max_examples=40, deadline=None)
+@given(segments(), st.floats(0.15, 3))
+def test_any_ratio_gives_a_valid_segment_of_the_same_span(log: RunSegment, ratio: float) -> None:
+    dt = log.dt * ratio
+    before = np.floor(np.arange(int((log.num_steps - 1) / ratio + 1e-6) + 1) * ratio + 1e-6).astype(int)
+    assume(len(before) >= 2 and log.valid[log.ego, 0])
+    new = resample(log, dt)
+    assert new.num_steps == len(before)
+    assert not (new.valid & ~log.valid[:, before]).any()
+    assert (new.num_steps - 1) * dt <= (log.num_steps - 1) * log.dt * (1 + 1e-5)
+    assert new.num_steps * dt > (log.num_steps - 1) * log.dt
+    assert new.current_step * dt <= log.current_step * log.dt + 1e-4
+
+
+def test_interpolation_is_exact_for_uniform_motion() -> None:
+    log = straight_road(4, steps=51, dt=0.1)
+    new = resample(log, 0.15)
+    time = np.arange(new.num_steps) * 0.15
+    expected = log.position[:, :1, :2] + log.velocity[:, :1] * time[:, None]
+    np.testing.assert_allclose(new.position[..., :2], expected, atol=1e-4)
+    np.testing.assert_allclose(
+        new.velocity, np.broadcast_to(log.velocity[:, :1], new.velocity.shape), atol=1e-5
+    )
+
+
+def test_refining_and_picking_again_gives_the_log_back() -> None:
+    log = hide(crossing(4, steps=31, dt=0.2, current_step=7), 1, slice(5, 9))
+    fine = resample(log, 0.05)
+    assert fine.num_steps == 121
+    back = resample(fine, 0.2)
+    np.testing.assert_array_equal(back.valid, log.valid)
+    np.testing.assert_array_equal(back.signal_state, log.signal_state)
+    np.testing.assert_allclose(back.position, log.position, atol=1e-5)
+    np.testing.assert_allclose(back.heading, log.heading, atol=1e-6)
+    assert back.current_step == 7
+
+
+def test_headings_take_the_shorter_arc() -> None:
+    log = straight_road(1, steps=3, dt=0.1)
+    heading = np.array([[np.pi - 0.1, -np.pi + 0.1, np.pi - 0.1]], np.float32)
+    new = resample(log.replace(heading=heading), 0.05)
+    assert np.abs(np.cos(new.heading[0, 1::2]) + 1).max() < 1e-6
+    assert np.abs(np.diff(np.unwrap(new.heading[0].astype(float)))).max() < 0.11
+
+
+def test_between_a_valid_and_an_invalid_step_nothing_is_made_up() -> None:
+    log = hide(straight_road(2, steps=11, dt=0.1), 1, slice(4, 6))
+    new = resample(log, 0.05)
+    np.testing.assert_array_equal(np.flatnonzero(~new.valid[1]), np.arange(7, 12))
+    assert not new.position[1, 7:12].any()
+
+
+def test_lights_keep_the_latest_logged_state() -> None:
+    log = crossing(2, steps=41, dt=0.1)
+    states = np.tile(np.arange(41, dtype=np.uint8) % 9, (12, 1))
+    new = resample(log.replace(signal_state=states), 0.15)
+    expected = (np.floor(np.arange(new.num_steps) * 1.5 + 1e-9) % 9).astype(np.uint8)
+    np.testing.assert_array_equal(new.signal_state[0], expected)
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, float("nan"), float("inf")])
+def test_impossible_steps_are_refused(dt: float) -> None:
+    with pytest.raises(ConfigError, match="dt"):
+        resample(straight_road(1), dt)
+
+
+def test_too_few_steps_are_a_data_error() -> None:
+    with pytest.raises(DataError, match="at least 2 steps"):
+        resample(straight_road(1, steps=5, dt=0.2), 2.0)
+
+
+def noisy(log: RunSegment, sigma: float, seed: int = 0) -> RunSegment:
+    noise = np.random.default_rng(seed).normal(0, sigma, (*log.valid.shape, 2)).astype(np.float32)
+    position = log.position.copy()
+    position[..., :2] += noise * log.valid[..., None]
+    return log.replace(position=position)
+
+
+def test_no_smoothing_is_no_change() -> None:
+    log = crossing(3, steps=21)
+    assert content_hash(smooth(log, 0.0)) == content_hash(log)
+
+
+def test_uniform_motion_with_gaps_stays_as_it_is() -> None:
+    log = hide(hide(straight_road(4, steps=91, dt=0.1), 1, slice(30, 44)), 2, slice(0, 50))
+    new = validate(smooth(log, 0.4))
+    np.testing.assert_array_equal(new.valid, log.valid)
+    for name in ("position", "velocity", "heading"):
+        np.testing.assert_allclose(getattr(new, name), getattr(log, name), atol=2e-4)
+    assert not new.position[~log.valid].any()
+
+
+def test_noise_shrinks_everywhere_also_at_the_ends() -> None:
+    clean = straight_road(30, steps=91, dt=0.1)
+    new = smooth(noisy(clean, 0.2), 0.4)
+    error = np.sqrt(((new.position - clean.position)[..., :2] ** 2).mean(axis=(0, 2)))
+    assert error[5:-5].max() < 0.1
+    assert error.max() < 0.17
+    speed_error = (new.velocity - clean.velocity)[:, 5:-5]
+    assert np.sqrt((speed_error**2).mean()) < 0.3
+
+
+def test_the_velocity_is_the_slope_of_the_smoothed_path() -> None:
+    log = crossing(4, steps=91, dt=0.1)
+    new = smooth(noisy(log, 0.05), 0.4)
+    slope = np.gradient(new.position[..., :2].astype(float), 0.1, axis=1)
+    assert np.abs(slope - new.velocity)[:, 8:-8].max() < 0.1
+
+
+def turned(log: RunSegment, angle: float, shift: float) -> RunSegment:
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = np.array([[c, s], [-s, c]])
+    position = log.position.copy()
+    position[..., :2] = log.position[..., :2] @ matrix + shift
+    return log.replace(
+        position=np.where(log.valid[..., None], position, 0).astype(np.float32),
+        velocity=(log.velocity @ matrix).astype(np.float32),
+        heading=np.where(log.valid, log.heading + angle, 0).astype(np.float32),
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-3, 3), st.floats(-500, 500), st.integers(0, 99))
+def test_smoothing_commutes_with_turning_and_shifting(angle: float, shift: float, seed: int) -> None:
+    log = hide(noisy(crossing(3, steps=31, dt=0.1, seed=seed), 0.1, seed), 1, slice(8, 13))
+    one, other = turned(smooth(log, 0.3), angle, shift), smooth(turned(log, angle, shift), 0.3)
+    np.testing.assert_allclose(one.position, other.position, atol=5e-3)
+    np.testing.assert_allclose(one.velocity, other.velocity, atol=5e-3)
+    np.testing.assert_allclose(np.cos(one.heading - other.heading), 1, atol=1e-4)
+
+
+def along_x(speed: NDArray[Any], heading: float) -> RunSegment:
+    log = straight_road(1, steps=len(speed), dt=0.1)
+    position = np.zeros((1, len(speed), 3), np.float32)
+    position[0, :, 0] = np.cumsum(speed) * 0.1
+    velocity = np.stack([speed, np.zeros_like(speed)], -1)[None].astype(np.float32)
+    return log.replace(position=position, velocity=velocity, heading=np.full_like(log.heading, heading))
+
+
+def test_the_heading_follows_the_motion_only_when_moving() -> None:
+    fast = smooth(along_x(np.full(40, 5.0), 0.2), 0.3)
+    np.testing.assert_allclose(fast.heading, 0.0, atol=1e-5)
+    slow = smooth(along_x(np.full(40, 0.5), 0.2), 0.3)
+    np.testing.assert_allclose(slow.heading, 0.2, atol=1e-5)
+    starting = smooth(along_x(np.linspace(0, 6, 60), 0.2), 0.3)
+    assert np.abs(np.diff(starting.heading)).max() < 0.05
+
+
+def test_a_reversing_car_keeps_facing_the_same_way() -> None:
+    new = smooth(along_x(np.full(40, -5.0), 0.1), 0.3)
+    np.testing.assert_allclose(new.heading, 0.0, atol=1e-5)
+
+
+def test_headings_stay_on_the_logged_branch() -> None:
+    log = along_x(np.full(40, 5.0), 0.0)
+    new = smooth(log.replace(heading=log.heading + np.float32(4 * np.pi)), 0.3)
+    np.testing.assert_allclose(new.heading, 4 * np.pi, atol=1e-5)
+
+
+def test_a_single_sighting_is_left_alone() -> None:
+    log = hide(hide(straight_road(2, steps=21, dt=0.1), 1, slice(0, 10)), 1, slice(11, 21))
+    new = smooth(log, 0.4)
+    np.testing.assert_array_equal(new.position[1], log.position[1])
+    np.testing.assert_array_equal(new.velocity[1], log.velocity[1])
+    np.testing.assert_array_equal(new.heading[1], log.heading[1])
+
+
+@settings(max_examples=30, deadline=None)
+@given(segments(), st.floats(0.01, 5))
+def test_whatever_is_valid_stays_valid(log: RunSegment, sigma: float) -> None:
+    new = validate(smooth(log, sigma))
+    np.testing.assert_array_equal(new.valid, log.valid)
+    assert not new.position[~log.valid].any()
+
+
+@pytest.mark.parametrize("sigma", [-0.1, float("nan"), float("inf")])
+def test_impossible_windows_are_refused(sigma: float) -> None:
+    with pytest.raises(ConfigError, match="sigma"):
+        smooth(straight_road(1), sigma)

@@ -1,0 +1,307 @@
+"""The run segment schema: what it accepts, what it refuses and where it says the fault is."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from helpers_segments import crossing, hide, random_segment, segments, straight_road
+from symphony.data.segment import Polylines, RunSegment, content_hash, recenter, validate
+from symphony.errors import DataError
+
+ARRAYS = [
+    name
+    for name in (f.name for f in dataclasses.fields(RunSegment))
+    if isinstance(getattr(random_segment(), name), np.ndarray)
+]
+ROAD_ARRAYS = [
+    f.name
+    for f in dataclasses.fields(random_segment().road)
+    if isinstance(getattr(random_segment().road, f.name), np.ndarray)
+]
+
+
+def full() -> RunSegment:
+    """No array is empty."""
+    segment = random_segment(agents=4, steps=6, lanes=3, lights=2, marks=2)
+    pairs = np.asarray([[0, 1]], np.int32)
+    road = dataclasses.replace(
+        segment.road,
+        successors=pairs,
+        left_neighbors=pairs,
+        right_neighbors=pairs,
+        boundary=Polylines.of([np.zeros((2, 2)), np.ones((3, 3))]),
+    )
+    some = np.asarray([1, 2], np.int32)
+    return validate(segment.replace(road=road, interest=some, predict=some, file="log.bin"))
+
+
+def put(array: NDArray[Any], value: Any) -> NDArray[Any]:
+    """A copy whose last number is another."""
+    copy = array.copy()
+    copy.reshape(-1)[-1] = value
+    return copy
+
+
+def change_road(segment: RunSegment, **changes: Any) -> RunSegment:
+    return segment.replace(road=dataclasses.replace(segment.road, **changes))
+
+
+def refused(segment: RunSegment) -> DataError:
+    with pytest.raises(DataError) as caught:
+        validate(segment)
+    assert caught.value.segment == segment.segment_id
+    assert caught.value.file == segment.file
+    return caught.value
+
+
+@settings(max_examples=50, deadline=None)
+@given(segments())
+def test_made_segments_fit(segment: RunSegment) -> None:
+    assert validate(segment) is segment
+
+
+@pytest.mark.parametrize("name", [n for n in ARRAYS if n not in {"origin", "agent_id"}])
+def test_every_array_has_one_dtype_and_shape(name: str) -> None:
+    segment = full()
+    array = getattr(segment, name)
+    assert refused(segment.replace(**{name: array.astype(np.float64)})).field == name
+    if name not in {"interest", "predict"}:
+        longer = np.concatenate([array, array[-1:]])
+        found = refused(segment.replace(**{name: longer})).field
+        # A field that others are measured by: the first of them to disagree is named.
+        assert found == (name if name != "signal_lane" else "signal_point")
+    assert refused(segment.replace(**{name: array[None]})).field == name
+
+
+@pytest.mark.parametrize("name", [n for n in ROAD_ARRAYS if n != "lane_id"])
+def test_every_road_array_has_one_dtype_and_shape(name: str) -> None:
+    segment = full()
+    array = getattr(segment.road, name)
+    assert refused(change_road(segment, **{name: array.astype(np.float64)})).field == f"road.{name}"
+    assert refused(change_road(segment, **{name: array[None]})).field == f"road.{name}"
+
+
+@pytest.mark.parametrize("name", ["size", "position", "heading", "velocity", "signal_point", "origin"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_are_finite(name: str, value: float) -> None:
+    segment = full()
+    assert refused(segment.replace(**{name: put(getattr(segment, name), value)})).field == name
+
+
+@pytest.mark.parametrize("name", ["lanes", "boundary", "marks"])
+def test_polylines_are_checked(name: str) -> None:
+    segment = full()
+    lines = getattr(segment.road, name)
+
+    def fault(points: NDArray[Any], offsets: NDArray[Any]) -> None:
+        assert refused(change_road(segment, **{name: Polylines(points, offsets)})).field == f"road.{name}"
+
+    fault(put(lines.points, np.nan), lines.offsets)
+    fault(lines.points, lines.offsets + 1)
+    fault(lines.points, put(lines.offsets, lines.offsets[-1] - 1))
+    fault(lines.points, put(lines.offsets, lines.offsets[-1] + 1))
+    fault(lines.points[:, :2], lines.offsets)
+    fault(lines.points.astype(np.float64), lines.offsets)
+    fault(lines.points, np.sort(lines.offsets)[[0, 0, *range(1, len(lines.offsets))]])  # a line of no points
+
+
+@pytest.mark.parametrize("value", [-1, 99])
+@pytest.mark.parametrize("name", ["signal_lane", "interest", "predict", "agent_type", "signal_state"])
+def test_indices_and_codes_stay_inside(name: str, value: int) -> None:
+    segment = full()
+    array = getattr(segment, name)
+    if array.dtype == np.uint8:
+        value = 99
+    assert refused(segment.replace(**{name: put(array, value)})).field == name
+
+
+@pytest.mark.parametrize(
+    "name", ["successors", "left_neighbors", "right_neighbors", "lane_type", "mark_type"]
+)
+def test_road_indices_and_codes_stay_inside(name: str) -> None:
+    segment = full()
+    changed = put(getattr(segment.road, name), 99)
+    assert refused(change_road(segment, **{name: changed})).field == f"road.{name}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"segment_id": "a/b"}, "segment_id"),
+        ({"segment_id": ""}, "segment_id"),
+        ({"dt": 0.0}, "dt"),
+        ({"dt": float("nan")}, "dt"),
+        ({"dt": -0.1}, "dt"),
+        ({"ego": -1}, "ego"),
+        ({"ego": 4}, "ego"),
+        ({"current_step": 6}, "current_step"),
+        ({"current_step": -1}, "current_step"),
+        ({"agent_id": np.zeros(4, np.int64)}, "agent_id"),
+        ({"size": np.zeros((4, 3), np.float32)}, "size"),
+        ({"size": np.full((4, 3), 100, np.float32)}, "size"),
+        ({"position": np.full((4, 6, 3), 20_001, np.float32)}, "position"),
+        ({"valid": np.zeros((4, 6), bool)}, "ego"),
+        ({"valid": np.ones(6, bool)}, "valid"),
+        ({"origin": np.zeros(2)}, "origin"),
+    ],
+)
+def test_faults_are_named(changes: dict[str, Any], field: str) -> None:
+    assert refused(full().replace(**changes)).field == field
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("speed_limit", 0), ("speed_limit", -3), ("lane_width", -1), ("lane_id", None)],
+)
+def test_road_faults_are_named(name: str, value: float | None) -> None:
+    segment = full()
+    array = getattr(segment.road, name)
+    changed = put(array, array[0] if value is None else value)
+    assert refused(change_road(segment, **{name: changed})).field == f"road.{name}"
+
+
+def test_a_map_and_two_steps_are_needed() -> None:
+    none = np.zeros((0, 2), np.int32)
+    bare = change_road(
+        full(),
+        lanes=Polylines.of([]),
+        lane_id=np.zeros(0, np.int64),
+        lane_type=np.zeros(0, np.uint8),
+        speed_limit=np.zeros(0, np.float32),
+        lane_width=np.zeros(0, np.float32),
+        successors=none,
+        left_neighbors=none,
+        right_neighbors=none,
+    )
+    assert refused(bare).field == "road.lanes"
+    one = full()
+    cut = {n: getattr(one, n)[:, :1] for n in ("position", "heading", "velocity", "valid", "signal_state")}
+    assert refused(one.replace(**cut, current_step=0)).field == "valid"
+
+
+# --- polylines ---------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.integers(0, 4), max_size=5), st.sampled_from([2, 3]))
+def test_polylines_hold_their_lines(counts: list[int], columns: int) -> None:
+    rng = np.random.default_rng(0)
+    given_lines = [rng.normal(size=(n, columns)).astype(np.float32) for n in counts if n]
+    lines = Polylines.of(given_lines)
+    assert len(lines) == len(given_lines)
+    assert lines.points.dtype == np.float32
+    assert lines.points.shape[1] == 3
+    assert lines.offsets.dtype == np.int64
+    for k, line in enumerate(given_lines):
+        assert np.array_equal(lines[k][:, :columns], line)
+        assert np.array_equal(lines.points[lines.line_index == k], lines[k])
+        assert not lines[k][:, columns:].any()
+    for past in (len(lines), -1):
+        with pytest.raises(IndexError):
+            lines[past]
+
+
+# --- content hash ------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(segments())
+def test_equal_content_gives_equal_hashes(segment: RunSegment) -> None:
+    copy = segment.replace(
+        position=np.asfortranarray(segment.position.copy()), heading=segment.heading.copy()
+    )
+    assert content_hash(copy) == content_hash(segment)
+    assert len(content_hash(segment)) == hashlib.sha256().digest_size * 2
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_any_number_changes_the_hash(name: str) -> None:
+    segment = full()
+    array = getattr(segment, name)
+    changed = ~array if array.dtype == bool else array + 1
+    assert content_hash(segment.replace(**{name: changed})) != content_hash(segment)
+    if array.dtype != bool:
+        assert content_hash(segment.replace(**{name: array.astype(">f8")})) != content_hash(segment)
+    assert content_hash(segment.replace(**{name: array.reshape(-1, 1)})) != content_hash(segment)
+
+
+@pytest.mark.parametrize("name", ["segment_id", "source", "file", "dt", "ego", "current_step"])
+def test_any_scalar_changes_the_hash(name: str) -> None:
+    segment = full()
+    value = getattr(segment, name)
+    changed = value + "x" if isinstance(value, str) else value + 1
+    assert content_hash(segment.replace(**{name: changed})) != content_hash(segment)
+
+
+@pytest.mark.parametrize("name", ROAD_ARRAYS)
+def test_any_map_number_changes_the_hash(name: str) -> None:
+    segment = full()
+    changed = change_road(segment, **{name: getattr(segment.road, name) + 1})
+    assert content_hash(changed) != content_hash(segment)
+
+
+# --- re-centring -------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(segments())
+def test_recentring_moves_everything_alike_and_is_done_once(segment: RunSegment) -> None:
+    moved = validate(recenter(segment))
+    shift = moved.origin - segment.origin
+    np.testing.assert_allclose(shift, np.round(shift), atol=1e-6)
+    for name in ("lanes", "boundary", "marks"):
+        before, after = getattr(segment.road, name), getattr(moved.road, name)
+        np.testing.assert_allclose(after.points + shift, before.points, atol=1e-3)
+        assert np.array_equal(before.offsets, after.offsets)
+    valid = segment.valid
+    np.testing.assert_allclose((moved.position + shift)[valid], segment.position[valid], atol=1e-3)
+    assert not moved.position[~valid].any()
+    np.testing.assert_allclose(moved.signal_point + shift, segment.signal_point, atol=1e-3)
+    first = segment.valid[segment.ego].argmax()
+    assert np.abs(moved.position[segment.ego, first]).max() <= 0.5
+    assert content_hash(recenter(moved)) == content_hash(moved)
+
+
+# --- the scenes other tests use ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [straight_road, crossing])
+@pytest.mark.parametrize("seed", range(4))
+def test_made_scenes_drive_as_they_say(make: Any, seed: int) -> None:
+    segment = make(num_agents=5, seed=seed)
+    moved = np.diff(segment.position[..., :2], axis=1) / segment.dt
+    middle = (segment.velocity[:, 1:] + segment.velocity[:, :-1]) / 2
+    assert np.abs(moved - middle).max() < 0.3
+    ahead = np.stack([np.cos(segment.heading), np.sin(segment.heading)], -1)
+    speed = np.linalg.norm(segment.velocity, axis=-1)
+    np.testing.assert_allclose((ahead * segment.velocity).sum(-1), speed, rtol=1e-5)
+    for lane, after in segment.road.successors:
+        np.testing.assert_allclose(segment.road.lanes[lane][-1], segment.road.lanes[after][0], atol=1e-4)
+    gaps = np.linalg.norm(segment.position[:, None] - segment.position[None], axis=-1)
+    gaps[np.arange(5), np.arange(5)] = np.inf
+    assert gaps.min() > 3
+
+
+def test_made_crossing_is_closed_by_its_boundary() -> None:
+    shapely = pytest.importorskip("shapely")
+    road = crossing().road
+    outline = shapely.Polygon(np.concatenate([road.boundary[k][:, :2] for k in range(4)]))
+    assert outline.is_valid
+    assert outline.exterior.is_ccw  # the drivable side is on the left
+    inside = outline.buffer(-1.7)
+    for k in range(len(road.lanes)):
+        assert inside.covers(shapely.LineString(road.lanes[k][2:-2, :2]))
+
+
+def test_hidden_agents_are_zero() -> None:
+    segment = validate(hide(straight_road(), 1, slice(3, 9)))
+    assert not segment.valid[1, 3:9].any()
+    assert not segment.position[1, 3:9].any()
+    assert segment.valid.sum() == 3 * 51 - 6

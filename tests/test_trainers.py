@@ -1,0 +1,208 @@
+"""Training and evaluation, end to end on tiny stores."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from helpers_segments import crossing, straight_road
+
+from symphony import keys
+from symphony.cli import main
+from symphony.config import AgentConfig, BCConfig, EvaluateConfig, from_dict, to_json
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import Bicycle, Displacement, ObservationConfig
+from symphony.errors import ConfigError, DataError
+from symphony.trainers import evaluate, load_agent, train
+from symphony.trainers.checkpoint import checkpoints
+from symphony.trainers.dataset import SceneDataset, experts
+from symphony.trainers.tracking import read_metrics
+
+TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        for seed in range(3):
+            writer.append(straight_road(4, seed=seed, steps=26 + 5 * seed))
+            writer.append(crossing(4, seed=seed, steps=31))
+    return path
+
+
+def config(store: Path, out: Path, **changes: object) -> BCConfig:
+    base = BCConfig(
+        data=store,
+        out=out,
+        steps=6,
+        agent=TINY,
+        segments=3,
+        states=32,
+        checkpoint_every=2,
+        log_every=1,
+        wandb="disabled",
+    )
+    return replace(base, **changes)
+
+
+def weights(run: Path) -> list[torch.Tensor]:
+    policy = load_agent(str(run)).policy
+    assert policy is not None
+    return [p.detach().clone() for p in policy.parameters()]
+
+
+def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+@pytest.fixture(scope="module")
+def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(config(store, tmp_path_factory.mktemp("runs") / "bc"))
+
+
+def test_a_run_leaves_its_config_metrics_and_last_checkpoints(run: Path, store: Path) -> None:
+    saved = from_dict(BCConfig, json.loads((run / "config.json").read_text()))
+    assert saved == config(store, run)
+    assert [r["step"] for r in read_metrics(run)] == [1, 2, 3, 4, 5, 6]
+    assert [int(p.name[-12:]) for p in checkpoints(run / "checkpoints")] == [2, 4, 6]
+
+
+def test_the_same_seed_gives_the_same_weights(run: Path, store: Path, tmp_path: Path) -> None:
+    again = train(config(store, tmp_path / "again"))
+    other = train(config(store, tmp_path / "other", seed=1))
+    assert same(weights(run), weights(again))
+    assert not same(weights(run), weights(other))
+
+
+@pytest.mark.parametrize("stop", [2, 4])
+def test_a_resumed_run_ends_with_the_same_weights(run: Path, store: Path, tmp_path: Path, stop: int) -> None:
+    out, whole = tmp_path / "part", config(store, tmp_path / "part")
+    train(whole)
+    for done in checkpoints(out / "checkpoints"):
+        if int(done.name[-12:]) > stop:
+            for file in done.iterdir():
+                file.unlink()
+            done.rmdir()
+    train(replace(whole, resume=True))
+    assert same(weights(run), weights(out))
+    assert [r["step"] for r in read_metrics(out)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path) -> None:
+    with pytest.raises(ConfigError, match="holds a run already"):
+        train(config(store, run))
+    with pytest.raises(ConfigError, match="another seed"):
+        train(config(store, run, resume=True, seed=5))
+
+
+def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
+    out = train(config(store, tmp_path / "long", steps=60, states=128, learning_rate=3e-3, checkpoint_every=60))
+    losses = [r["loss_bc"] for r in read_metrics(out)]
+    assert losses[0] == pytest.approx(math.log(147), rel=0.1)
+    assert sum(losses[-5:]) < 0.85 * sum(losses[:5])
+
+
+def test_playback_scores_nothing_against_itself(store: Path) -> None:
+    numbers = evaluate("playback", store).numbers()
+    assert numbers["segments"] == 6
+    assert numbers["rollouts"] == 1
+    for name in ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd"):
+        assert numbers[name] == pytest.approx(0, abs=1e-6)
+
+
+def test_constant_velocity_is_right_on_the_straight_and_wrong_in_turns(store: Path) -> None:
+    rows = {r["segment"]: r for r in evaluate("constant_velocity", store).metrics.rows()}
+    assert all(rows[f"straight-{k}"]["ade"] < 0.05 for k in range(3))
+    turning = [crossing(4, seed=k, steps=31) for k in range(3)]
+    bend = [abs(s.heading[:2, -1] - s.heading[:2, 0]).max() for s in turning]
+    assert max(bend) > 1  # else the segments have changed and this test tells nothing
+    assert rows[f"crossing-{bend.index(max(bend))}"]["ade"] > 0.5
+
+
+def test_evaluation_does_not_depend_on_the_batch(run: Path, store: Path) -> None:
+    one, three = (
+        evaluate(str(run), store, EvaluateConfig(rollouts=3, batch=b)).metrics.rows() for b in (1, 4)
+    )
+    assert one == three
+
+
+def test_evaluation_follows_its_seed(run: Path, store: Path) -> None:
+    a, b, c = (
+        evaluate(str(run), store, EvaluateConfig(rollouts=2, seed=s)).metrics.rows() for s in (0, 0, 1)
+    )
+    assert a == b != c
+
+
+def test_more_rollouts_keep_the_first_ones(run: Path, store: Path) -> None:
+    few, many = (evaluate(str(run), store, EvaluateConfig(rollouts=k)).metrics.segments for k in (2, 5))
+    for name, result in few.items():
+        assert result.error.tolist() == many[name].error[:2].tolist()
+
+
+def test_experts_are_the_moving_vehicles_and_the_ego() -> None:
+    segment = straight_road(4)
+    parked = segment.position.copy()
+    parked[1:3] = parked[1:3, :1]
+    found = experts(segment.replace(position=parked), Bicycle())
+    assert found.agent.tolist() == [0, 3]
+    assert found.error.max() < 0.15
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_expert_batches_show_what_the_environment_shows(store: Path, dynamics: Bicycle | Displacement) -> None:
+    dataset = SceneDataset(SegmentStore(store), 2, dynamics)
+    rng = torch.Generator().manual_seed(0)
+    batch = dataset.sample_states(2, 50, ObservationConfig(num_objects=4, num_points=20), rng)
+    assert batch.shape == (50,)
+    assert batch[keys.POINTS].shape == (50, 1, 20, 22)
+    assert batch[keys.VALID].all()
+    assert batch[keys.OWN][..., 0].mean() > 0.3  # everybody drives at 6 to 15 m/s
+    seen = batch[keys.OBJECTS][..., :2][batch[keys.OBJECTS_MASK]]
+    assert seen.norm(dim=-1).min() * 20 > 1  # nobody sees itself
+
+
+def test_command_line_trains_and_evaluates(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, file, picture = tmp_path / "run", tmp_path / "numbers.json", tmp_path / "rollouts.png"
+    small = ["--agent.hidden", "8", "--agent.head", "8", "--agent.num-points", "20", "--wandb", "disabled"]
+    command = ["train", "bc", "--data", store, "--out", out, "--steps", "3", "--seed", "4", *small]
+    assert main([str(c) for c in command]) == 0
+    command = ["evaluate", out, "--data", store, "--json", file, "--figure", picture, "--rollouts", "2"]
+    assert main([str(c) for c in command]) == 0
+    numbers = json.loads(file.read_text())
+    wanted = {"collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd", "segments", "rollouts", "seed"}
+    assert wanted <= numbers.keys()
+    assert numbers["playback"]["ade"] == 0
+    assert len(numbers["per_segment"]) == numbers["segments"] == 6
+    printed = capsys.readouterr().out
+    assert f"{numbers['ade']:.2f}" in printed
+    assert f"{numbers['min_sade']:.2f}" in printed
+    assert picture.stat().st_size > 10_000
+
+
+def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is no agent"):
+        load_agent(str(tmp_path / "nowhere"))
+    with pytest.raises(DataError, match="nowhere"):
+        evaluate("playback", tmp_path / "nowhere")
+    with pytest.raises(DataError, match="9 interactive agents"):
+        evaluate("constant_velocity", store, EvaluateConfig(interactive=9))
+    with pytest.raises(ConfigError, match="unknown device"):
+        train(config(store, tmp_path / "x", device="tpu-like"))
+    assert not (tmp_path / "x").exists()
+
+
+def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> None:
+    saved = json.loads(to_json(config(store, tmp_path)))
+    with pytest.raises(ConfigError, match="did you mean 'learning_rate'"):
+        from_dict(BCConfig, {**saved, "learning_rat": 1})
+    with pytest.raises(ConfigError, match="unknown format"):
+        from_dict(BCConfig, {**saved, "format": 99})
+    with pytest.raises(ConfigError, match="missing"):
+        from_dict(BCConfig, {"out": "x"})
+    with pytest.raises(ConfigError, match="steps must be positive"):
+        replace(config(store, tmp_path), steps=0)

@@ -1,0 +1,489 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers_sources import FAR, read_error, read_one, womd_scenario
+from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, content_hash
+from symphony.data.sources import get_reader, readers, womd_pb2
+from symphony.data.sources.tfrecord import read_records, write_records
+from symphony.errors import ConfigError, DataError
+
+MPS = 0.44704
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "made.tfrecord-00000-of-00001"
+
+
+def convert(path: Path, scenario: womd_pb2.Scenario) -> RunSegment:
+    write_records(path, [scenario.SerializeToString()])
+    return read_one("womd", path)
+
+
+def refuse(path: Path, scenario: womd_pb2.Scenario) -> DataError:
+    write_records(path, [scenario.SerializeToString()])
+    return read_error("womd", path)
+
+
+def test_readers_are_found_by_name() -> None:
+    assert readers() == ("commonroad", "womd")
+    for name in readers():
+        assert get_reader(name).name == name
+    with pytest.raises(ConfigError, match="did you mean 'womd'"):
+        get_reader("wmod")
+    with pytest.raises(ConfigError, match="known: commonroad, womd"):
+        get_reader("?")
+    with pytest.raises(ConfigError, match="egos"):
+        get_reader("womd", egos="all")
+
+
+def test_tracks(path: Path) -> None:
+    segment = convert(path, womd_scenario(tracks=3, steps=5))
+    assert (segment.segment_id, segment.source, segment.file) == ("0123456789abcdef", "womd", path.name)
+    assert (segment.dt, segment.num_steps, segment.current_step, segment.ego) == (0.1, 5, 1, 2)
+    np.testing.assert_array_equal(segment.agent_id, [100, 101, 102])
+    np.testing.assert_array_equal(segment.agent_type, [AgentType.VEHICLE] * 3)
+    np.testing.assert_array_equal(segment.origin, np.round(FAR + [10, 0, 0]))
+    for k in range(3):
+        x = FAR[0] - segment.origin[0] + 5 * k + (10 + k) * 0.1 * np.arange(5)
+        np.testing.assert_allclose(segment.position[k, :, 0], x, atol=1e-5)
+        np.testing.assert_allclose(segment.position[k, :, 1], 4 * (k % 2), atol=1e-5)
+        np.testing.assert_allclose(segment.velocity[k], [[10 + k, 0.5]] * 5)
+        np.testing.assert_allclose(segment.heading[k], 0.01 * k)
+    np.testing.assert_allclose(segment.size, [[4.5, 2, 1.5], [5.5, 2, 1.5], [6.5, 2, 1.5]])
+    np.testing.assert_array_equal(segment.predict, [0])
+    np.testing.assert_array_equal(segment.interest, [0, 1])
+
+
+def test_invalid_states_are_zero_whatever_they_hold(path: Path) -> None:
+    scenario = womd_scenario()
+    hidden = scenario.tracks[0].states[3]
+    hidden.valid, hidden.center_x, hidden.heading, hidden.velocity_x = False, np.nan, np.inf, 1e30
+    segment = convert(path, scenario)
+    np.testing.assert_array_equal(segment.valid[0], [True, True, True, False, True])
+    assert not segment.position[0, 3].any()
+    assert segment.heading[0, 3] == 0
+    assert not segment.velocity[0, 3].any()
+
+
+def test_sizes_come_from_the_current_step_or_else_the_median(path: Path) -> None:
+    scenario = womd_scenario(tracks=3, steps=5)
+    for step, length in enumerate([4.0, 9.0, 5.0, 6.0, 90.0]):
+        for track in scenario.tracks[:2]:
+            track.states[step].length = length
+    scenario.tracks[1].states[1].valid = False
+    segment = convert(path, scenario)
+    assert segment.size[0, 0] == 9.0
+    assert segment.size[1, 0] == 5.5
+
+
+def test_tracks_never_seen_are_left_out_and_indices_follow(path: Path) -> None:
+    scenario = womd_scenario(tracks=4)
+    for state in scenario.tracks[1].states:
+        state.valid = False
+    scenario.tracks_to_predict.add(track_index=1)
+    scenario.tracks_to_predict.add(track_index=2)
+    segment = convert(path, scenario)
+    np.testing.assert_array_equal(segment.agent_id, [100, 102, 103])
+    assert segment.ego == 2
+    np.testing.assert_array_equal(segment.predict, [0, 1])
+    np.testing.assert_array_equal(segment.interest, [0])
+
+
+def test_road(path: Path) -> None:
+    segment = convert(path, womd_scenario())
+    road, shift = segment.road, FAR[:2] - segment.origin[:2]
+    np.testing.assert_array_equal(road.lane_id, [10, 11, 20, 21])
+    np.testing.assert_array_equal(road.successors, [[0, 1], [2, 3]])
+    np.testing.assert_array_equal(road.left_neighbors, [[0, 2], [1, 3]])
+    np.testing.assert_array_equal(road.right_neighbors, [[2, 0], [3, 1]])
+    np.testing.assert_allclose(road.speed_limit, 25 * MPS)
+    assert np.isnan(road.lane_width).all()
+    np.testing.assert_array_equal(road.lane_type, [LaneType.SURFACE_STREET] * 4)
+    np.testing.assert_allclose(road.lanes[1][:, :2] - shift, [[50, 0], [75, 0], [100, 0]], atol=1e-4)
+    np.testing.assert_allclose(road.boundary[0][:, :2] - shift, [[0, -2], [100, -2]], atol=1e-4)
+    np.testing.assert_array_equal(
+        road.mark_type, [MarkType.ROAD_LINE, MarkType.CROSSWALK, MarkType.STOP_SIGN]
+    )
+    np.testing.assert_array_equal(np.diff(road.marks.offsets), [3, 5, 1])
+    np.testing.assert_array_equal(road.marks[1][0], road.marks[1][-1])
+
+
+def test_lights(path: Path) -> None:
+    scenario = womd_scenario(steps=5)
+    extra = scenario.dynamic_map_states[2].lane_states
+    extra.add(lane=999, state=4)
+    extra.add(lane=21, state=5)
+    segment = convert(path, scenario)
+    np.testing.assert_array_equal(segment.signal_lane, [1, 3])
+    np.testing.assert_array_equal(segment.signal_state, [[4, 4, 4, 6, 6], [0, 0, 5, 0, 0]])
+    np.testing.assert_allclose(
+        segment.signal_point[0] + segment.origin, [FAR[0] + 49, FAR[1], FAR[2]], atol=1e-3
+    )
+    np.testing.assert_array_equal(segment.signal_point[1], segment.road.lanes[3][0])
+
+
+def test_the_id_of_a_feature_may_follow_its_lane(path: Path) -> None:
+    scenario = womd_scenario()
+    expected = convert(path, scenario)
+    swapped = womd_pb2.Scenario()
+    swapped.CopyFrom(scenario)
+    del swapped.map_features[:]
+    data = swapped.SerializeToString()
+    for feature in scenario.map_features:
+        number = womd_pb2.MapFeature(id=feature.id).SerializeToString()
+        rest = feature.SerializeToString().removeprefix(number)
+        assert len(rest) + len(number) == feature.ByteSize()
+        body = rest + number
+        data += bytes([8 << 3 | 2]) + varint(len(body)) + body
+    write_records(path, [data])
+    assert content_hash(read_one("womd", path)) == content_hash(expected)
+
+
+def varint(value: int) -> bytes:
+    head = b""
+    while value > 127:
+        head += bytes([value & 127 | 128])
+        value >>= 7
+    return head + bytes([value])
+
+
+def test_unknown_fields_are_skipped(path: Path) -> None:
+    scenario = womd_scenario()
+    expected = convert(path, scenario)
+    lidar = b"\x62\x03abc" + b"\x6a\x02hi" + b"\x80\x7d\x07"
+    write_records(path, [lidar + scenario.SerializeToString() + lidar])
+    assert content_hash(read_one("womd", path)) == content_hash(expected)
+
+
+def test_lanes_and_edges_of_one_point_go_with_all_that_refers_to_them(path: Path) -> None:
+    scenario = womd_scenario()
+    lane = next(feature for feature in scenario.map_features if feature.id == 11)
+    del lane.lane.polyline[1:]
+    edge = next(feature for feature in scenario.map_features if feature.id == 30)
+    del edge.road_edge.polyline[1:]
+    segment = convert(path, scenario)
+    np.testing.assert_array_equal(segment.road.lane_id, [10, 20, 21])
+    np.testing.assert_array_equal(segment.road.successors, [[1, 2]])
+    np.testing.assert_array_equal(segment.road.left_neighbors, [[0, 1]])
+    np.testing.assert_array_equal(segment.road.right_neighbors, [[1, 0]])
+    assert len(segment.road.boundary) == 0
+    assert len(segment.signal_lane) == 0
+
+
+def test_repeated_links_count_once_and_unknown_ones_not_at_all(path: Path) -> None:
+    scenario = womd_scenario()
+    lane = scenario.map_features[0].lane
+    lane.exit_lanes.extend([11, 999, 21])
+    lane.left_neighbors.add(feature_id=20)
+    lane.left_neighbors.add(feature_id=998)
+    segment = convert(path, scenario)
+    np.testing.assert_array_equal(segment.road.successors, [[0, 1], [0, 3], [2, 3]])
+    np.testing.assert_array_equal(segment.road.left_neighbors, [[0, 2], [1, 3]])
+
+
+def test_an_unknown_speed_limit_is_nan(path: Path) -> None:
+    scenario = womd_scenario()
+    scenario.map_features[0].lane.ClearField("speed_limit_mph")
+    assert np.isnan(convert(path, scenario).road.speed_limit).tolist() == [True, False, False, False]
+
+
+def test_precision_far_from_the_origin(path: Path) -> None:
+    near = convert(path, womd_scenario())
+    scenario = womd_scenario()
+    for track in scenario.tracks:
+        for state in track.states:
+            state.center_x += 4e6
+    for feature in scenario.map_features:
+        for line in (feature.lane.polyline, feature.road_edge.polyline, feature.road_line.polyline):
+            for point in line:
+                point.x += 4e6
+    far = convert(path, scenario)
+    np.testing.assert_allclose(far.position, near.position, atol=1e-5)
+    np.testing.assert_allclose(far.road.lanes.points, near.road.lanes.points, atol=1e-5)
+
+
+def test_files_of_many_records_keep_their_order(path: Path) -> None:
+    names = [f"{k:016x}" for k in range(7)]
+    write_records(
+        path, [womd_scenario(name, tracks=1 + k % 3).SerializeToString() for k, name in enumerate(names)]
+    )
+    found = list(get_reader("womd").read(str(path)))
+    assert [item.segment_id for item in found if isinstance(item, RunSegment)] == names
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "message"),
+    [
+        (lambda s: s.ClearField("scenario_id"), "scenario_id", "missing"),
+        (lambda s: s.ClearField("timestamps_seconds"), "timestamps_seconds", "at least 2"),
+        (lambda s: s.timestamps_seconds.__setitem__(2, 0.9), "timestamps_seconds", "uneven"),
+        (lambda s: s.timestamps_seconds.__setitem__(2, np.nan), "timestamps_seconds", "not finite"),
+        (lambda s: s.ClearField("tracks"), "tracks", "no agents"),
+        (lambda s: s.tracks[0].states.pop(), "tracks.states", "track 100 has 4 states for 5 steps"),
+        (lambda s: setattr(s.tracks[1], "object_type", 9), "tracks.object_type", "unknown value 9"),
+        (lambda s: setattr(s, "sdc_track_index", 3), "sdc_track_index", "outside the 3"),
+        (lambda s: setattr(s, "sdc_track_index", -1), "sdc_track_index", "outside the 3"),
+        (lambda s: [setattr(x, "valid", False) for x in s.tracks[2].states], "sdc_track_index", "no step"),
+        (lambda s: setattr(s, "current_time_index", 5), "current_time_index", "outside the 5"),
+        (lambda s: s.tracks_to_predict.add(track_index=7), "tracks_to_predict", "outside the 3"),
+        (lambda s: s.dynamic_map_states.pop(), "dynamic_map_states", "4 entries for 5 steps"),
+        (
+            lambda s: setattr(s.dynamic_map_states[0].lane_states[0], "state", 260),
+            "dynamic_map_states.state",
+            "unknown value 260",
+        ),
+        (lambda s: setattr(s.map_features[0].lane, "type", 4), "map_features.lane.type", "unknown value 4"),
+    ],
+)
+def test_what_the_format_forbids_is_named(path: Path, change: Any, field: str, message: str) -> None:
+    scenario = womd_scenario()
+    name = scenario.scenario_id
+    change(scenario)
+    error = refuse(path, scenario)
+    assert error.file == path
+    assert error.segment == (None if field == "scenario_id" else name)
+    assert error.field == f"record 0, {field}"
+    assert message in error.message
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda s: setattr(s.tracks[0].states[2], "center_x", np.nan), "position"),
+        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e300), "position"),
+        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e6), "position"),
+        (lambda s: setattr(s.tracks[2].states[0], "center_x", np.nan), "position"),
+        (lambda s: setattr(s.tracks[0].states[2], "heading", np.inf), "heading"),
+        (lambda s: setattr(s.tracks[0].states[2], "velocity_y", np.nan), "velocity"),
+        (lambda s: setattr(s.tracks[0].states[1], "length", 0), "size"),
+        (lambda s: setattr(s.tracks[0].states[1], "width", np.nan), "size"),
+        (lambda s: setattr(s.tracks[1], "id", 100), "agent_id"),
+        (lambda s: setattr(s, "scenario_id", "a/b"), "segment_id"),
+        (lambda s: s.ClearField("map_features"), "road.lanes"),
+        (lambda s: setattr(s.map_features[0].lane.polyline[1], "z", np.nan), "road.lanes"),
+        (lambda s: setattr(s.map_features[4].road_edge.polyline[0], "x", np.inf), "road.boundary"),
+        (lambda s: setattr(s.map_features[1], "id", 10), "road.lane_id"),
+        (lambda s: setattr(s.map_features[0].lane, "speed_limit_mph", -5), "road.speed_limit"),
+    ],
+)
+def test_what_the_schema_forbids_is_named(path: Path, change: Any, field: str) -> None:
+    scenario = womd_scenario()
+    change(scenario)
+    error = refuse(path, scenario)
+    assert (error.file, error.segment, error.field) == (path, scenario.scenario_id, field)
+
+
+# The real record, compared with an independent summary of the same file.
+
+
+@pytest.fixture(scope="module")
+def sample(samples: Path) -> Path:
+    return samples / "womd" / "motion_data_one_scenario.tfrecord"
+
+
+@pytest.fixture(scope="module")
+def summary(samples: Path) -> dict[str, Any]:
+    path = samples.parent / "wosac" / "scenario_637f20cafde22ff8.json"
+    if not path.is_file():
+        pytest.skip(f"no summary at {path}")
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def record(sample: Path) -> womd_pb2.Scenario:
+    (payload,) = read_records(sample)
+    assert isinstance(payload, bytes)
+    return womd_pb2.Scenario.FromString(payload)
+
+
+@pytest.fixture(scope="module")
+def real(sample: Path) -> RunSegment:
+    return read_one("womd", sample)
+
+
+STATE = ("center_x", "center_y", "center_z", "heading", "velocity_x", "velocity_y")
+
+
+@pytest.mark.samples
+def test_record_header(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
+    for name in ("scenario_id", "current_time_index", "sdc_track_index"):
+        assert getattr(record, name) == summary[name]
+    np.testing.assert_allclose(record.timestamps_seconds, summary["timestamps_seconds"], atol=1e-9)
+    predict = [(p.track_index, p.difficulty) for p in record.tracks_to_predict]
+    assert predict == [(p["track_index"], p["difficulty"]) for p in summary["tracks_to_predict"]]
+    assert list(record.objects_of_interest) == summary["objects_of_interest"]
+
+
+@pytest.mark.samples
+def test_record_tracks(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
+    assert len(record.tracks) == len(summary["tracks"]) == 83
+    for track, expected in zip(record.tracks, summary["tracks"], strict=True):
+        assert (track.id, track.object_type) == (expected["id"], expected["object_type"])
+        assert len(track.states) == expected["n_states"]
+        valid = [step for step, state in enumerate(track.states) if state.valid]
+        assert len(valid) == expected["n_valid"]
+        assert (valid[0], valid[-1]) == (expected["first_valid"], expected["last_valid"])
+        for name in STATE:
+            total = sum(getattr(track.states[step], name) for step in valid)
+            assert total == pytest.approx(expected["sum_valid"][name], rel=1e-9, abs=1e-6)
+        current = track.states[record.current_time_index]
+        for name, value in expected["state_at_current"].items():
+            assert getattr(current, name) == pytest.approx(value, abs=1e-9)
+
+
+@pytest.mark.samples
+def test_record_map(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
+    assert len(record.map_features) == len(summary["map_features"])
+    for feature, expected in zip(record.map_features, summary["map_features"], strict=True):
+        kind = feature.WhichOneof("feature_data")
+        assert (feature.id, kind) == (expected["id"], expected["kind"])
+        body = getattr(feature, kind)
+        if kind == "stop_sign":
+            assert list(body.lane) == expected["lane_ids"]
+            assert [body.position.x, body.position.y, body.position.z] == expected["position"]
+            continue
+        line = body.polyline if kind in {"lane", "road_line", "road_edge"} else body.polygon
+        points = np.array([(p.x, p.y, p.z) for p in line])
+        assert len(points) == expected["n_points"]
+        np.testing.assert_allclose(points[0], expected["first"], rtol=1e-12)
+        np.testing.assert_allclose(points[-1], expected["last"], rtol=1e-12)
+        np.testing.assert_allclose(points.sum(axis=0), expected["sum_xyz"], rtol=1e-12)
+        for name in ("edge", "line", "lane"):
+            if f"{name}_type_value" in expected:
+                assert body.type == expected[f"{name}_type_value"]
+        if kind == "lane":
+            check_lane(body, expected)
+
+
+def check_lane(lane: womd_pb2.LaneCenter, expected: dict[str, Any]) -> None:
+    for name in ("speed_limit_mph", "interpolating"):
+        assert getattr(lane, name) == pytest.approx(expected[name])
+    for name in ("entry_lanes", "exit_lanes"):
+        assert list(getattr(lane, name)) == expected[name]
+    numbers = (
+        "feature_id",
+        "self_start_index",
+        "self_end_index",
+        "neighbor_start_index",
+        "neighbor_end_index",
+    )
+    for side in ("left", "right"):
+        near = getattr(lane, f"{side}_neighbors")
+        for found, other in zip(near, expected[f"{side}_neighbors"], strict=True):
+            assert [getattr(found, name) for name in numbers] == [other[name] for name in numbers]
+            check_boundaries(found.boundaries, other["boundaries"])
+        check_boundaries(getattr(lane, f"{side}_boundaries"), expected[f"{side}_boundaries"])
+
+
+def check_boundaries(found: Any, expected: list[dict[str, Any]]) -> None:
+    names = ("lane_start_index", "lane_end_index", "boundary_feature_id")
+    assert [[getattr(b, n) for n in names] for b in found] == [[b[n] for n in names] for b in expected]
+    assert [b.boundary_type for b in found] == [b["boundary_type_value"] for b in expected]
+
+
+@pytest.mark.samples
+def test_record_lights(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
+    assert sum(len(now.lane_states) for now in record.dynamic_map_states) == summary["n_lane_states_total"]
+    for now, expected in zip(record.dynamic_map_states, summary["dynamic_map_states"], strict=True):
+        found = [
+            {
+                "lane": s.lane,
+                "state": s.state,
+                "stop_point": [s.stop_point.x, s.stop_point.y, s.stop_point.z],
+            }
+            for s in now.lane_states
+        ]
+        assert found == expected
+
+
+@pytest.mark.samples
+def test_segment_tracks(real: RunSegment, summary: dict[str, Any]) -> None:
+    tracks = summary["tracks"]
+    assert real.position.shape == (83, 91, 3)
+    assert (real.segment_id, real.dt, real.current_step, real.ego) == ("637f20cafde22ff8", 0.1, 10, 82)
+    np.testing.assert_array_equal(real.agent_id, [track["id"] for track in tracks])
+    assert np.bincount(real.agent_type).tolist() == [0, 70, 10, 3]
+    np.testing.assert_array_equal(real.valid.sum(axis=1), [track["n_valid"] for track in tracks])
+    np.testing.assert_array_equal(real.predict, [72, 43, 42])
+    assert len(real.interest) == 0
+    logged = np.where(real.valid[..., None], real.position + real.origin, 0).sum(axis=1)
+    for k, track in enumerate(tracks):
+        sums, now = track["sum_valid"], track["state_at_current"]
+        np.testing.assert_allclose(logged[k], [sums[f"center_{axis}"] for axis in "xyz"], atol=91 * 2e-5)
+        assert real.heading[k].sum(dtype=float) == pytest.approx(sums["heading"], abs=1e-3)
+        velocity = real.velocity[k].sum(axis=0, dtype=float)
+        np.testing.assert_allclose(velocity, [sums["velocity_x"], sums["velocity_y"]], atol=1e-3)
+        if now["valid"]:
+            np.testing.assert_allclose(real.size[k], [now["length"], now["width"], now["height"]], rtol=1e-6)
+
+
+@pytest.mark.samples
+def test_segment_map(real: RunSegment, summary: dict[str, Any]) -> None:
+    road = real.road
+    features = {kind: [] for kind in summary["n_map_features_by_type"]}
+    for feature in summary["map_features"]:
+        features[feature["kind"]].append(feature)
+    lanes = [lane for lane in features["lane"] if lane["n_points"] > 1]
+    assert (len(features["lane"]), len(lanes)) == (199, 198)
+    np.testing.assert_array_equal(road.lane_id, [lane["id"] for lane in lanes])
+    np.testing.assert_array_equal(road.lane_type, [lane["lane_type_value"] for lane in lanes])
+    np.testing.assert_allclose(road.speed_limit, [lane["speed_limit_mph"] * MPS for lane in lanes], rtol=1e-6)
+    index = {lane["id"]: k for k, lane in enumerate(lanes)}
+
+    def links(pick: Any) -> set[tuple[int, int]]:
+        return {(k, index[i]) for k, lane in enumerate(lanes) for i in pick(lane) if i in index}
+
+    assert set(map(tuple, road.successors.tolist())) == links(lambda lane: lane["exit_lanes"])
+    entries = links(lambda lane: lane["entry_lanes"])
+    assert {(b, a) for a, b in road.successors.tolist()} == entries
+    assert (np.bincount(road.successors[:, 0]) > 1).sum() == 20
+    for side, found in (("left", road.left_neighbors), ("right", road.right_neighbors)):
+        near = links(lambda lane, side=side: [n["feature_id"] for n in lane[f"{side}_neighbors"]])
+        assert set(map(tuple, found.tolist())) == near
+    for lines, expected in ((road.lanes, lanes), (road.boundary, features["road_edge"])):
+        np.testing.assert_array_equal(np.diff(lines.offsets), [line["n_points"] for line in expected])
+        for k, line in enumerate(expected):
+            np.testing.assert_allclose(lines[k][0] + real.origin, line["first"], atol=2e-5)
+            length = np.hypot(*np.diff(lines[k][:, :2].astype(float), axis=0).T).sum()
+            assert length == pytest.approx(line["length_xy"], abs=2e-3)
+    kinds = [MarkType.ROAD_LINE, MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.STOP_SIGN]
+    assert [int((road.mark_type == kind).sum()) for kind in kinds] == [59, 4, 3, 8]
+
+
+@pytest.mark.samples
+def test_segment_lights(real: RunSegment, summary: dict[str, Any]) -> None:
+    rows = {lane: k for k, lane in enumerate(real.road.lane_id[real.signal_lane].tolist())}
+    assert len(rows) == 12
+    expected = np.zeros((12, 91), np.uint8)
+    for step, now in enumerate(summary["dynamic_map_states"]):
+        for light in now:
+            expected[rows[light["lane"]], step] = light["state"]
+            stop = real.signal_point[rows[light["lane"]]] + real.origin
+            np.testing.assert_allclose(stop, light["stop_point"], atol=1e-4)
+    np.testing.assert_array_equal(real.signal_state, expected)
+
+
+@pytest.mark.samples
+def test_traffic_drives_on_the_left_of_the_boundary(real: RunSegment) -> None:
+    import shapely
+
+    edges = [shapely.LineString(real.road.boundary[k][:, :2]) for k in range(len(real.road.boundary))]
+    speed = np.hypot(*np.moveaxis(real.velocity, -1, 0))
+    fast = real.valid & (speed > 3) & (real.agent_type == AgentType.VEHICLE)[:, None]
+    sides = []
+    for x, y in real.position[fast][::20, :2].astype(float):
+        spot = shapely.Point(x, y)
+        edge = min(edges, key=spot.distance)
+        if spot.distance(edge) < 8:
+            along = edge.project(spot)
+            a, b = edge.interpolate(max(along - 0.5, 0)), edge.interpolate(along + 0.5)
+            sides.append((b.x - a.x) * (y - a.y) - (b.y - a.y) * (x - a.x) > 0)
+    assert len(sides) > 50
+    assert np.mean(sides) > 0.97
