@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from symphony.data.segment import RunSegment
 from symphony.data.sources import get_reader
@@ -155,3 +157,15 @@ def commonroad(*parts: str, version: str = "2020a", name: str = "ZAM_Made-1_1_T-
     """A whole file."""
     head = f'commonRoadVersion="{version}" benchmarkID="{name}" timeStepSize="0.1" tags="{tags}"'
     return f'<?xml version="1.0" encoding="UTF-8"?>\n<commonRoad {head}>{"".join(parts)}</commonRoad>\n'
+
+
+def signed_area(ring: NDArray[Any]) -> float:
+    """Of a closed ring; positive counter-clockwise."""
+    x, y = ring[:-1, 0], ring[:-1, 1]
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
+
+
+def convert_xml(path: Path, *parts: str, **options: str) -> RunSegment:
+    """Write a CommonRoad file of these parts and read it."""
+    path.write_text(commonroad(*parts, **options), encoding="utf-8")
+    return read_one("commonroad", path)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from symphony.data.resample import resample, smooth
 
 from helpers_segments import crossing, hide, straight_road
 from symphony.data.convert import Report, convert, expand, info
+from symphony.data.resample import resample, smooth
 from symphony.data.segment import RunSegment, content_hash
 from symphony.data.selection import usable
 from symphony.data.sources.base import Item, Reader

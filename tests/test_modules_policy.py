@@ -105,11 +105,11 @@ def test_logits_and_actions_do_not_depend_on_the_batch(threads):
 
 @pytest.mark.parametrize("points", [40, 60])
 def test_padding_and_order_change_nothing_for_valid_agents(points):
-    actor, td = policy(), scene(4, points=points)
+    actor, td = policy(), scene(8, points=points)
     logits = actor(td.clone())[LOGITS]
     order = torch.tensor([2, 0, 1])
     agents = td["agents"].clone().auto_batch_size_(2)[:, order]
-    permuted = actor(TensorDict({"agents": agents}, [4]))[LOGITS]
+    permuted = actor(TensorDict({"agents": agents}, [8]))[LOGITS]
     torch.testing.assert_close(permuted, logits[:, order], rtol=1e-5, atol=1e-6)
     dirty = td.clone()
     for key, mask in ((POINTS, POINTS_MASK), (OBJECTS, OBJECTS_MASK)):

@@ -113,8 +113,8 @@ def test_order_and_padding_of_the_elements_change_nothing(seed, extra):
 
 @pytest.mark.parametrize("mode", ["dense", "winner"])
 def test_among_equal_elements_the_first_gets_the_gradient(mode):
-    network, elements, _ = make(n=1)
-    same = elements[:, :1].expand(1, 60, -1).clone()
+    network, elements, _ = make(n=2, dtype=torch.float32)
+    same = elements[:1, :1].expand(1, 60, -1).clone()
     mask = torch.ones(1, 60, dtype=torch.bool)
     mask[:, :2] = False
     gradient = results(network, same, mask, mode)[1]

@@ -101,7 +101,9 @@ def test_streams_are_independent_of_each_other():
 
 
 def test_derived_streams_do_not_collide():
-    streams = fold_in(fold_in(torch.tensor(stream_of("scene")), torch.arange(1000)[:, None]), torch.arange(1000))
+    streams = fold_in(
+        fold_in(torch.tensor(stream_of("scene")), torch.arange(1000)[:, None]), torch.arange(1000)
+    )
     assert streams.flatten().unique().numel() == 1_000_000
 
 
@@ -120,8 +122,9 @@ def test_bad_arguments_are_refused():
 
 
 def test_draws_follow_the_distribution():
+    torch.manual_seed(0)
     logits = torch.randn(147) * 2
-    n = 400_000
+    n = 100_000
     drawn = inverse_cdf(logits.expand(n, -1), uniform(0, torch.arange(n), 0))
     expected = logits.double().softmax(-1) * n
     common = expected > 10
@@ -156,4 +159,6 @@ def test_impossible_categories_are_never_drawn(noise):
 def test_cuda_gives_the_same_bits():
     streams = torch.randint(-(2**62), 2**62, (1000,))
     for dtype in (torch.float32, torch.float64):
-        assert torch.equal(uniform(7, streams.cuda(), 3, dtype=dtype).cpu(), uniform(7, streams, 3, dtype=dtype))
+        assert torch.equal(
+            uniform(7, streams.cuda(), 3, dtype=dtype).cpu(), uniform(7, streams, 3, dtype=dtype)
+        )

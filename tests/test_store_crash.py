@@ -61,6 +61,9 @@ def test_any_unfinished_tail_is_cut_off(grown: tuple[Path, Path], data: st.DataO
                     tail = data.draw(st.binary(max_size=40))
             file.write_bytes(old + tail)
         assert hashes(SegmentStore(path)) == hashes(unlike(3))
+        fill(path, [], append=True)
+        for file in files(path):
+            assert file.read_bytes() == (three / file.relative_to(path)).read_bytes()
         fill(path, unlike(2, start=3), append=True)
         assert hashes(SegmentStore(path)) == hashes(unlike(5))
         SegmentStore(path).verify()
@@ -133,7 +136,7 @@ def test_kill_9_loses_nothing_and_repeats_nothing(folder: Path) -> None:
     count = 0
     for pause in (0.0, 0.013, 0.041):
         command = [sys.executable, "-c", WRITE, str(folder), str(Path(__file__).parent)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             first = process.stdout.readline()
             time.sleep(pause)

@@ -83,13 +83,14 @@ def displacement_step(
 
     The rear axle, half a wheelbase r behind the centre, is dragged along (a tractrix, dheading = sin(phi) / r
     per metre at an angle phi between motion and heading), here by the implicit midpoint rule: a turn of
-    atan2(y, r + x / 2). So heading errors die out instead of swinging, and a step too small to have a direction
+    atan(y / (r + x / 2)). So heading errors die out instead of swinging, and a step too small to have a direction
     hardly turns the agent. Reversing turns it as the step sideways alone would.
     """
     forward, left = displacement.unbind(-1)
     distance = (forward.square() + left.square() + 1e-12).sqrt()
     arm = 0.5 * WHEELBASE * length
-    turn = torch.atan2(left, arm + 0.5 * forward.clamp_min(0.0))
+    # Not atan2, whose last bit on the CPU depends on an element's place in the batch.
+    turn = torch.atan(left / (arm + 0.5 * forward.clamp_min(0.0)))
     moved = state[..., :2] + rotate(displacement, state[..., 2])
     return torch.cat([moved, (state[..., 2] + turn)[..., None], (distance / dt)[..., None]], dim=-1)
 
@@ -123,12 +124,20 @@ class Dynamics(Protocol):
         ...
 
 
+def _quadratic(count: int) -> Float[Tensor, " K"]:
+    """An odd number of values from -1 to 1, dense about the middle one, which is exactly 0."""
+    half = count // 2
+    unit = (torch.arange(count) - half) / half
+    return unit * unit.abs()
+
+
 @dataclass(frozen=True)
 class Bicycle:
     """Kinematic bicycle with a grid of discrete actions (paper, section V-A: 7 accelerations x 21 steering angles).
 
-    The joint index of an action is ``acceleration_index * num_steering + steering_index``. Steering angles are
-    spaced quadratically, so that they are dense near straight ahead.
+    The joint index of an action is ``acceleration_index * num_steering + steering_index``. Both grids are spaced
+    quadratically, dense near coasting straight ahead: on real logs the greedy fit then swings least between
+    neighbouring actions, for the same error.
 
     Attributes:
         max_acceleration: m/s^2, the grid is symmetric.
@@ -139,12 +148,12 @@ class Bicycle:
         speed_weight: metres that one m/s of speed error counts for in the greedy fit.
     """
 
-    max_acceleration: float = 4.0
+    max_acceleration: float = 5.0
     num_acceleration: int = 7
     max_steering: float = 0.5
     num_steering: int = 21
     heading_weight: float = 1.0
-    speed_weight: float = 0.1
+    speed_weight: float = 0.3
     discrete: Literal[True] = True
 
     @property
@@ -154,11 +163,8 @@ class Bicycle:
 
     def grid(self, like: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
-        half, wide = self.num_acceleration // 2, self.num_steering // 2
-        # Counted from the middle, so that the middle is exactly zero.
-        acceleration = (torch.arange(self.num_acceleration) - half) * (self.max_acceleration / half)
-        unit = (torch.arange(self.num_steering) - wide) / wide
-        steering = self.max_steering * unit * unit.abs()
+        acceleration = self.max_acceleration * _quadratic(self.num_acceleration)
+        steering = self.max_steering * _quadratic(self.num_steering)
         return (
             acceleration.repeat_interleave(self.num_steering).to(like),
             steering.repeat(self.num_acceleration).to(like),

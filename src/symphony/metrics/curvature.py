@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -21,18 +20,23 @@ def curvature_histogram(curvature: NDArray[Any]) -> NDArray[np.int64]:
     return np.bincount(np.rint(flat.clip(-1, 1) * half).astype(np.int64) + half, minlength=BINS)
 
 
-def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> float:
-    """Jensen-Shannon divergence of two histograms, in nats (0 to ln 2); NaN if either is empty.
+def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
+    """Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN where either is empty.
 
     The divergence itself, not its square root.
     """
-    if first.sum() == 0 or second.sum() == 0:
-        return math.nan
-    p, q = first / first.sum(), second / second.sum()
+    p, q = (_normalised(np.asarray(counts, dtype=np.float64)) for counts in (first, second))
     middle = (p + q) / 2
+    divergence = (_relative(p, middle) + _relative(q, middle)) / 2
+    return np.maximum(divergence, 0.0)
 
-    def relative(a: NDArray[Any]) -> float:
-        some = a > 0
-        return float((a[some] * np.log(a[some] / middle[some])).sum())
 
-    return max(0.0, (relative(p) + relative(q)) / 2)
+def _normalised(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    total = counts.sum(-1, keepdims=True)
+    return np.where(total > 0, counts / np.where(total > 0, total, 1.0), np.nan)
+
+
+def _relative(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum of p ln(p / q) over the bins where p is not 0; NaN stays NaN."""
+    none = p == 0
+    return (p * np.log(np.where(none, 1.0, p) / np.where(none, 1.0, q))).sum(-1)

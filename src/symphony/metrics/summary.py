@@ -78,15 +78,24 @@ class RolloutMetrics:
             curvature_log: per segment, likewise by the log.
 
         Raises:
-            ValueError: for a segment that was added before.
+            ValueError: for a segment that was added before, shapes that do not fit together, or a displacement or
+                curvature that is not finite.
         """
+        _check_shapes(len(segment_ids), simulated, collided, offroad, displacement, logged)
         compared = simulated & logged[:, None]
-        error = displacement.double().masked_fill(~compared, 0.0).sum((2, 3)).numpy()
+        # One contiguous row per rollout, so that its sum does not depend on the batch it came in.
+        away = (
+            displacement.detach().double().masked_fill(~compared, 0.0).flatten(2).contiguous().cpu().numpy()
+        )
+        error = away.sum(-1)
+        if not np.isfinite(error).all():
+            bad = segment_ids[int(np.argwhere(~np.isfinite(error))[0, 0])]
+            raise ValueError(f"segment {bad}: displacement is not finite")
         hits = (collided & simulated).flatten(2).any(-1).sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
         # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
         count = compared.sum((2, 3)).amax(1)
-        for b, name in enumerate(segment_ids):
+        for b, (name, seen, seen_log) in enumerate(zip(segment_ids, curvature, curvature_log, strict=True)):
             if name in self.segments:
                 raise ValueError(f"segment {name} was added twice")
             self.segments[name] = SegmentResult(
@@ -96,8 +105,8 @@ class RolloutMetrics:
                 steps=int(steps[b]),
                 error=error[b],
                 logged=int(count[b]),
-                histogram=curvature_histogram(curvature[b]),
-                histogram_log=curvature_histogram(curvature_log[b]),
+                histogram=curvature_histogram(seen),
+                histogram_log=curvature_histogram(seen_log),
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -134,8 +143,9 @@ class RolloutMetrics:
         Returns:
             ``collision_rate`` (percent of rollouts with at least one collision of an interactive agent),
             ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
-            all segments), each with its standard error over segments under ``*_se``; ``curvature_jsd`` (nats, NaN
-            if rollouts or logs visit no branching region), ``segments`` and ``rollouts`` (per segment).
+            all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
+            standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
+            ``segments`` and ``rollouts`` (per segment).
 
         Raises:
             ValueError: if nothing was added.
@@ -160,8 +170,8 @@ class RolloutMetrics:
         out: dict[str, Any] = {}
         for name, (total, weight) in parts.items():
             out[name], out[f"{name}_se"] = _ratio(total, weight)
-        out["curvature_jsd"] = jensen_shannon(
-            np.sum([s.histogram for s in found], axis=0), np.sum([s.histogram_log for s in found], axis=0)
+        out["curvature_jsd"], out["curvature_jsd_se"] = _divergence(
+            np.stack([s.histogram for s in found]), np.stack([s.histogram_log for s in found])
         )
         out["segments"] = len(found)
         out["rollouts"] = max(s.rollouts for s in found)
@@ -178,3 +188,27 @@ def _ratio(total: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[flo
         return float(ratio), math.nan
     residual = (total - ratio * weight) / weight.mean()
     return float(ratio), float(np.sqrt((residual**2).sum() / (count - 1) / count))
+
+
+def _divergence(counts: NDArray[np.int64], counts_log: NDArray[np.int64]) -> tuple[float, float]:
+    """Divergence of the summed histograms [segments, 201] and its jackknife standard error over segments."""
+    total, total_log = counts.sum(0), counts_log.sum(0)
+    value, number = float(jensen_shannon(total, total_log)), len(counts)
+    if number < 2:
+        return value, math.nan
+    without = jensen_shannon(total - counts, total_log - counts_log)
+    error = np.sqrt((number - 1) / number * ((without - without.mean()) ** 2).sum())
+    return value, float(error)
+
+
+def _check_shapes(
+    batch: int, simulated: Tensor, collided: Tensor, offroad: Tensor, displacement: Tensor, logged: Tensor
+) -> None:
+    shape = tuple(simulated.shape)
+    if len(shape) != 4 or shape[0] != batch or shape[1] < 1:
+        raise ValueError(f"simulated is {list(shape)}, expected [B = {batch}, K >= 1, N, T]")
+    for name, value in (("collided", collided), ("offroad", offroad), ("displacement", displacement)):
+        if tuple(value.shape) != shape:
+            raise ValueError(f"{name} is {list(value.shape)}, expected {list(shape)}")
+    if tuple(logged.shape) != (batch, *shape[2:]):
+        raise ValueError(f"logged is {list(logged.shape)}, expected {[batch, *shape[2:]]}")

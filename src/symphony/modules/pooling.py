@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -41,8 +42,8 @@ def pool_elements(
             gradient of small sets, where that is faster) and `"dense"` elsewhere.
 
     Returns:
-        `[..., H]`. With `"winner"` and without gradients, the result for one set does not depend on the
-        sets beside it, to the last bit.
+        `[..., H]`. With `"winner"`, on the CPU in float32 and without gradients, the result for one set does
+        not depend on the sets beside it, to the last bit (see :func:`symphony.modules.in_blocks`).
     """
     if mask.shape != elements.shape[:-1] or mask.dtype != torch.bool:
         raise ValueError(
@@ -51,8 +52,9 @@ def pool_elements(
     if mode not in ("auto", "dense", "winner"):
         raise ValueError(f"unknown mode {mode!r}, expected 'auto', 'dense' or 'winner'")
     batch, (count, features) = elements.shape[:-2], elements.shape[-2:]
-    sets, valid = elements.reshape(-1, count, features), mask.reshape(-1, count)
-    if count == 0 or sets.shape[0] == 0:
+    n = math.prod(batch)
+    sets, valid = elements.reshape(n, count, features), mask.reshape(n, count)
+    if count == 0 or n == 0:
         width = function(elements.new_zeros(1, features)).shape[-1]
         return elements.new_zeros(*batch, width)
     gradient = _wants_gradient(function, elements)

@@ -25,10 +25,12 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
 def in_blocks(function: Callable[[Tensor], Tensor], x: Tensor, rows: int = BLOCK) -> Tensor:
     """Apply a row-wise function `[n, F] -> [n, H]` to `x` `[..., F]` in blocks of exactly `rows` rows.
 
-    Matrix products pick their kernel, and with it their rounding, by the number of rows, so a row computed
+    Matrix products pick their kernel, and with it their rounding, by the number of rows, so that a row computed
     alone and the same row computed among others may differ in the last bit. Blocks of one fixed size (the
-    last one padded) take that away: without gradients and on the CPU, the result of a row does not depend on
-    the batch it is in. With gradients enabled, or on another device, the function is called once on all rows.
+    last one padded) take that away: on the CPU, in float32 and without gradients, the result of a row does not
+    depend on the batch it is in. That rests on the kernels treating the rows of one product alike, which MKL's
+    do in float32, but not in float64. With gradients enabled, or on another device, the function is called
+    once on all rows.
     """
     flat = x.reshape(-1, x.shape[-1])
     if torch.is_grad_enabled() or x.device.type != "cpu" or flat.shape[0] == 0:

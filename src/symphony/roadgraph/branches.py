@@ -27,11 +27,11 @@ def visited_regions(
 ) -> Bools:
     """Which branching regions each trajectory took.
 
-    A trajectory comes to a choice where the path between two consecutive valid states passes the first point of one of
-    its regions, or where the first valid state is on one of them already. From there until it comes to the same
-    choice again (in a roundabout), the last state that is clearly on one region decides. A state is on a region if
-    it lies within 2 m of the centre line with a compatible heading, and clearly so if every alternative is at
-    least half a metre farther away. So of the alternatives of one choice each pass takes at most one.
+    A trajectory comes to a choice where the path between two consecutive valid states passes the first point of
+    one of its regions, or where the first valid state is on one of them already. From there until it comes to the
+    same choice again (in a roundabout), the last state that is clearly on one region decides. A state is on a
+    region if it lies within 2 m of the centre line with a compatible heading, and clearly so if every alternative
+    is at least half a metre farther away. So of the alternatives of one choice each pass takes at most one.
 
     Args:
         graph: the lane graph.
@@ -60,13 +60,11 @@ def visited_regions(
     key = parent * len(row) + begin
     chosen = graph.regions.parent[region]
     found = np.searchsorted(key, chosen * len(row) + clear, side="right") - 1
-    within = (
-        (found >= 0) & (parent[found] == chosen) & (row[begin[found]] == row[clear])
-        if len(key)
-        else found >= 0
-    )
+    after = np.flatnonzero(found >= 0)
+    at = found[after]
+    same = (parent[at] == chosen[after]) & (row[begin[at]] == row[clear[after]])
     last = np.full(len(key), -1, dtype=np.int64)
-    last[found[within]] = np.flatnonzero(within)  # states ascend, so the last one stays
+    np.maximum.at(last, at[same], after[same])  # states ascend
     last = last[last >= 0]
     result = np.zeros(shape, dtype=bool)
     result[row[clear[last]], region[last]] = True

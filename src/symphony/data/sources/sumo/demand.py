@@ -85,7 +85,7 @@ def write_demand(
     if through:
         # Sources are edges nothing leads into; each lane carries 600-1 300 vehicles per hour.
         entered = {edge for edges in following for edge in edges}
-        sources = [edge for edge in range(len(length)) if edge not in entered]
+        sources = [edge for edge in range(len(length)) if lanes[edge] > 0 and edge not in entered]
         departs, starts = [], []
         for edge in sources:
             flow = lanes[edge] * rng.uniform(600, 1300) / 3600

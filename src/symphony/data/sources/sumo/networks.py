@@ -237,7 +237,7 @@ def _add_nodes(
         big = [link.arterial for link in links if k in (link.a, link.b)]
         angles = np.sort([np.arctan2(*(p - nodes[k])[::-1]) for p in arms])
         gaps = np.diff([*angles, angles[0] + 2 * np.pi])
-        if len(rings) < wanted and len(arms) >= 3 and gaps.min() > 1.0:
+        if len(rings) < wanted and len(arms) >= 3 and gaps.min() > 1.2 and not any(wide[i] for i in range(len(big))):
             rings[int(k)] = _Ring(nodes[k], float(rng.uniform(14, 20)))
             continue
         if len(arms) == 2:
@@ -346,7 +346,8 @@ def _carriageway(
 
     ramp_speed, edge = rng.uniform(15.5, 20), lanes * width
     on, off = 1, len(extra) - 1
-    reach = np.linspace(1, 0, 14)
+    # Ramps are longer than a crop's radius, so that their ends are never on a map.
+    reach = np.linspace(1.7, 0, 20)
     gap = 3 * reach + 30 * reach**2
     start = along(marks[on] - 150 * reach, edge + gap)
     end = along(marks[off] + 150 * reach[::-1], edge + gap[::-1])

@@ -1,0 +1,271 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from helpers_sources import (
+    RECTANGLE,
+    ROAD,
+    commonroad,
+    driver,
+    lanelet,
+    obstacle,
+    read_error,
+    read_one,
+    signed_area,
+    state,
+)
+from helpers_sources import convert_xml as convert
+from symphony.data.segment import AgentType, RunSegment, SignalState, content_hash
+from symphony.data.sources import get_reader
+from symphony.errors import ConfigError
+
+VERSIONS = ["2018b", "2020a"]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "made.xml"
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_tracks(path: Path, version: str) -> None:
+    late = driver(8, version, 10.0, -0.5, 8.0, range(2, 4))
+    segment = convert(path, ROAD, driver(7, version, 3.3, 0.4), late, version=version)
+    assert (segment.segment_id, segment.source, segment.file) == (
+        "ZAM_Made-1_1_T-1",
+        "commonroad",
+        "made.xml",
+    )
+    assert (segment.dt, segment.num_steps, segment.ego, segment.current_step) == (0.1, 5, 0, 0)
+    np.testing.assert_array_equal(segment.agent_id, [7, 8])
+    np.testing.assert_array_equal(segment.valid, [[1] * 5, [0, 0, 1, 1, 0]])
+    np.testing.assert_array_equal(segment.origin, [3, 0, 0])
+    np.testing.assert_allclose(segment.position[0, :, 0], 0.3 + np.arange(5), atol=1e-5)
+    np.testing.assert_allclose(segment.position[0, :, 1], 0.4, atol=1e-6)
+    np.testing.assert_allclose(segment.position[1, 2:4, :2], [[8.6, -0.5], [9.4, -0.5]], atol=1e-5)
+    np.testing.assert_allclose(segment.velocity[0], [[10, 0]] * 5)
+    np.testing.assert_array_equal(segment.size, np.float32([[4.5, 2, 0]] * 2))
+    assert not segment.position[1, [0, 1, 4]].any()
+
+
+def test_the_two_versions_say_the_same(path: Path) -> None:
+    found = []
+    for version in VERSIONS:
+        parked = obstacle(9, [state(0, 20, -1)], version, "parkedVehicle", role="static")
+        found.append(convert(path, ROAD, driver(7, version), driver(8, version, 9), parked, version=version))
+    assert content_hash(found[0]) == content_hash(found[1])
+
+
+def test_steps_need_not_begin_at_zero(path: Path) -> None:
+    segment = convert(
+        path,
+        ROAD,
+        driver(7, steps=range(40, 45)),
+        driver(8, steps=range(43, 47)),
+        driver(9, steps=range(40, 47)),
+    )
+    assert (segment.num_steps, segment.agent_id[segment.ego]) == (7, 9)
+    np.testing.assert_array_equal(segment.valid[1], [0, 0, 0, 1, 1, 1, 1])
+
+
+def test_static_obstacles_rest_at_every_step(path: Path) -> None:
+    parked = obstacle(9, [state(0, 20, -1, 0.3, 7.0)], kind="parkedVehicle", role="static")
+    segment = convert(path, ROAD, parked, driver(7))
+    assert segment.agent_id.tolist() == [7, 9]
+    assert segment.valid[1].all()
+    assert not segment.velocity[1].any()
+    np.testing.assert_allclose(segment.heading[1], 0.3)
+    np.testing.assert_allclose(segment.position[1], [[20, -1, 0]] * 5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("car", AgentType.VEHICLE),
+        ("bus", AgentType.VEHICLE),
+        ("motorcycle", AgentType.VEHICLE),
+        ("pedestrian", AgentType.PEDESTRIAN),
+        ("bicycle", AgentType.CYCLIST),
+        ("unknown", AgentType.OTHER),
+        ("spaceship", AgentType.OTHER),
+    ],
+)
+def test_types(path: Path, kind: str, expected: AgentType) -> None:
+    other = obstacle(8, [state(k, 20.0, 0) for k in range(5)], kind=kind)
+    assert convert(path, ROAD, driver(7), other).agent_type.tolist() == [AgentType.VEHICLE, expected]
+
+
+def test_scenery_is_left_out(path: Path) -> None:
+    house = obstacle(8, [state(0, 20.0, 30.0)], kind="building", role="static")
+    assert convert(path, ROAD, driver(7), house).agent_id.tolist() == [7]
+
+
+def test_the_velocity_points_along_the_orientation(path: Path) -> None:
+    turned = obstacle(8, [state(k, 20, k, 2.0, 5.0) for k in range(5)])
+    segment = convert(path, ROAD, driver(7), turned)
+    np.testing.assert_allclose(segment.velocity[1], [[5 * np.cos(2), 5 * np.sin(2)]] * 5, rtol=1e-5)
+
+
+def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:
+    x = [0.5 * k**2 for k in range(5)]
+    accelerating = obstacle(8, [state(k, x[k], 0.2 * k, 0.1, None) for k in range(5)])
+    segment = convert(path, ROAD, driver(7), accelerating)
+    np.testing.assert_allclose(segment.velocity[1, :, 0], np.gradient(x, 0.1), rtol=1e-4)
+    np.testing.assert_allclose(segment.velocity[1, :, 1], 2.0, rtol=1e-4)
+    single = obstacle(8, [state(2, 5, 5, 0, None)])
+    assert not convert(path, ROAD, driver(7), single).velocity[1].any()
+
+
+def test_intervals_and_regions_become_their_middle(path: Path) -> None:
+    def between(tag: str, low: float, high: float) -> str:
+        return f"<{tag}><intervalStart>{low}</intervalStart><intervalEnd>{high}</intervalEnd></{tag}>"
+
+    box = "<rectangle><length>2</length><width>1</width><center><x>30</x><y>1</y></center></rectangle>"
+    vague = (
+        f"<state><position>{box}</position>{between('orientation', 0.2, 0.4)}{between('time', 1, 3)}"
+        f"{between('velocity', 4, 6)}</state>"
+    )
+    segment = convert(path, ROAD, driver(7), obstacle(8, [vague]))
+    assert np.flatnonzero(segment.valid[1]).tolist() == [2]
+    np.testing.assert_allclose(segment.position[1, 2], [30, 1, 0], atol=1e-5)
+    np.testing.assert_allclose(segment.heading[1, 2], 0.3, rtol=1e-6)
+    np.testing.assert_allclose(np.hypot(*segment.velocity[1, 2]), 5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "place", "turn"),
+    [
+        (RECTANGLE, (4.5, 2), (0, 0), 0),
+        ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
+        (
+            "<polygon>"
+            + "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in [(0, 0), (3, 0), (3, 1), (0, 1)])
+            + "</polygon>",
+            (3, 1),
+            (1.5, 0.5),
+            0,
+        ),
+        (
+            "<rectangle><length>4</length><width>2</width><orientation>0.5</orientation>"
+            "<center><x>1</x><y>0.2</y></center></rectangle>",
+            (4, 2),
+            (1, 0.2),
+            0.5,
+        ),
+        (RECTANGLE + "<circle><radius>1.5</radius></circle>", (4.5, 3), (0, 0), 0),
+    ],
+)
+def test_boxes_bound_their_shape(
+    path: Path, shape: str, size: tuple[float, float], place: tuple[float, float], turn: float
+) -> None:
+    heading = 0.7
+    other = obstacle(8, [state(k, 20, 3, heading, 2.0) for k in range(5)], shape=shape)
+    segment = convert(path, ROAD, driver(7), other)
+    np.testing.assert_allclose(segment.size[1, :2], size, rtol=1e-6)
+    c, s = np.cos(heading), np.sin(heading)
+    expected = [20 + c * place[0] - s * place[1], 3 + s * place[0] + c * place[1]]
+    np.testing.assert_allclose(segment.position[1, 0, :2], expected, atol=1e-5)
+    np.testing.assert_allclose(segment.heading[1], heading + turn, rtol=1e-6)
+    np.testing.assert_allclose(segment.velocity[1, 0], [2 * c, 2 * s], rtol=1e-5)
+
+
+def test_the_ego_has_the_most_moving_neighbours(path: Path) -> None:
+    cars = [
+        driver(5, x=500),
+        driver(9, x=30),
+        driver(8, x=0),
+        driver(6, x=75),
+        driver(3, x=20, steps=range(4)),
+        obstacle(2, [state(k, 20, 3, 0, 0) for k in range(5)]),
+        obstacle(4, [state(k, 10.0 + k, 3, 0, 10) for k in range(5)], kind="bicycle"),
+    ]
+    # Within 50 m, 8 has 9, 3 and 4 moving; 9 has 8, 3 and 4, and 6 besides. Without 6 they tie.
+    assert convert(path, ROAD, *cars).ego == 1
+    assert convert(path, ROAD, *cars[:3], *cars[4:]).ego == 2
+    for order in (cars, cars[::-1]):
+        path.write_text(commonroad(ROAD, *order))
+        items = list(get_reader("commonroad", egos="all").read(path))
+        names = [item.segment_id for item in items if isinstance(item, RunSegment)]
+        assert names == [f"ZAM_Made-1_1_T-1_ego{ego}" for ego in (5, 6, 8, 9)]
+
+
+def test_all_egos_differ_only_by_ego_and_frame(path: Path) -> None:
+    path.write_text(commonroad(ROAD, driver(7), driver(8, x=30)))
+    first, second = get_reader("commonroad", egos="all").read(path)
+    assert isinstance(first, RunSegment)
+    assert isinstance(second, RunSegment)
+    assert (first.agent_id[first.ego], second.agent_id[second.ego]) == (7, 8)
+    np.testing.assert_allclose(first.position + first.origin, second.position + second.origin)
+    np.testing.assert_allclose(
+        first.road.boundary.points + first.origin, second.road.boundary.points + second.origin
+    )
+
+
+def test_an_unknown_choice_of_egos_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'one' or 'all'"):
+        get_reader("commonroad", egos="some")
+
+
+def test_precision_far_from_the_origin(path: Path) -> None:
+    def shifted(by: float) -> RunSegment:
+        road = lanelet(10, [(by, 2), (by + 50, 2)], [(by, -2), (by + 50, -2)])
+        return convert(path, road, driver(7, x=by), driver(8, x=by + 17.125))
+
+    near, far = shifted(0), shifted(5_000_000)
+    np.testing.assert_allclose(near.position, far.position, atol=1e-6)
+    np.testing.assert_allclose(near.road.lanes.points, far.road.lanes.points, atol=1e-6)
+
+
+# Real files.
+
+
+@pytest.mark.samples
+def test_every_sample_reads(samples: Path) -> None:
+    files = sorted((samples / "commonroad").rglob("*.xml"))
+    assert len(files) == 26
+    for file in files:
+        if "Starnberg" in file.name:
+            error = read_error("commonroad", file)
+            assert (error.message, error.segment) == ("has no dynamic obstacles", "DEU_Starnberg-1_1_T-1")
+            continue
+        segment = read_one("commonroad", file)
+        assert segment.segment_id == file.stem
+        assert segment.valid[segment.ego].all()
+        assert_drives_on_its_lanes(segment)
+
+
+def assert_drives_on_its_lanes(segment: RunSegment) -> None:
+    """Moving vehicles are on the drivable side of every ring and head along a lane near them."""
+    rings = [segment.road.boundary[k][:, :2].astype(float) for k in range(len(segment.road.boundary))]
+    area = shapely.union_all([shapely.Polygon(ring) for ring in rings if signed_area(ring) > 0])
+    area = area.difference(shapely.union_all([shapely.Polygon(r) for r in rings if signed_area(r) < 0]))
+    moving = segment.valid & (np.hypot(*np.moveaxis(segment.velocity, -1, 0)) > 3)
+    spots = segment.position[moving][:, :2].astype(float)
+    assert shapely.contains_xy(area.buffer(0.3), *spots.T).mean() > 0.97, segment.segment_id
+    lanes = [segment.road.lanes[k][:, :2] for k in range(len(segment.road.lanes))]
+    starts = np.concatenate([(line[:-1] + line[1:]) / 2 for line in lanes])
+    steps = np.concatenate([np.diff(line, axis=0) for line in lanes])
+    some = np.arange(0, len(spots), 37)
+    offset = np.hypot(*np.moveaxis(spots[some, None] - starts, -1, 0))
+    angle = np.arctan2(steps[:, 1], steps[:, 0]) - segment.heading[moving][some, None]
+    aligned = ((offset < 20) & (np.cos(angle) > 0.9)).any(axis=1)
+    assert aligned.mean() > 0.9, segment.segment_id
+
+
+@pytest.mark.samples
+def test_sample_agrees_with_a_direct_look(samples: Path) -> None:
+    segment = read_one("commonroad", samples / "commonroad" / "USA_Lanker-1_1_T-1.xml")
+    k = segment.agent_id.tolist().index(1213)
+    assert segment.num_agents == 24
+    np.testing.assert_allclose(segment.size[k], [3.1699, 2.0726, 0], rtol=1e-6)
+    np.testing.assert_allclose(segment.position[k, 1, :2] + segment.origin[:2], [7.1255, 15.1052], atol=1e-4)
+    np.testing.assert_allclose(np.hypot(*segment.velocity[k, 2]), 9.7566, rtol=1e-5)
+    assert segment.heading[k, 1] == np.float32(1.0983)
+    assert len(segment.road.lane_id) == 91
+    light = read_one("commonroad", samples / "commonroad" / "USA_Peach-4_8_T-1.xml")
+    assert len(light.signal_lane) == 16
+    assert set(np.unique(light.signal_state)) <= {SignalState.STOP, SignalState.CAUTION, SignalState.GO}

@@ -1,0 +1,220 @@
+"""Lanelet networks and traffic lights of CommonRoad files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers_sources import ROAD, bound, driver, lanelet, signed_area
+from helpers_sources import convert_xml as convert
+from symphony.data.segment import LaneType, MarkType, SignalState
+from symphony.data.sources.commonroad_map import SLIT, drivable_rings
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "made.xml"
+
+
+def test_lanes(path: Path) -> None:
+    near = lanelet(12, [(0, 6), (50, 6)], [(0, 2), (50, 2)], '<adjacentRight ref="10" drivingDir="same"/>')
+    against = lanelet(
+        13, [(50, -2), (0, -2)], [(50, -6), (0, -6)], '<adjacentLeft ref="10" drivingDir="opposite"/>'
+    )
+    main = lanelet(
+        10,
+        [(0, 2), (50, 2)],
+        [(0, -2), (20, -2), (50, -2)],
+        '<successor ref="11"/><successor ref="99"/><adjacentLeft ref="12" drivingDir="same"/>'
+        '<adjacentRight ref="13" drivingDir="opposite"/>',
+    )
+    after = lanelet(11, [(50, 2), (100, 2)], [(50, -2), (100, -1)], '<predecessor ref="10"/>')
+    segment = convert(path, driver(7), main, after, near, against)
+    road = segment.road
+    assert road.lane_id.tolist() == [10, 11, 12, 13]
+    assert road.successors.tolist() == [[0, 1]]
+    assert road.left_neighbors.tolist() == [[0, 2]]
+    assert road.right_neighbors.tolist() == [[2, 0]]
+    np.testing.assert_allclose(road.lane_width, [4, 3.5, 4, 4], rtol=1e-6)
+    np.testing.assert_allclose(road.lanes[0][:, :2], [[0, 0], [25, 0], [50, 0]], atol=1e-6)
+    np.testing.assert_allclose(road.lanes[3][:, :2], [[50, -4], [0, -4]], atol=1e-6)
+
+
+def test_speed_limits_of_either_version(path: Path) -> None:
+    ends = [(50, 2), (100, 2)], [(50, -2), (100, -2)]
+    sign = (
+        '<trafficSign id="5"><trafficSignElement><trafficSignID>{}</trafficSignID>'
+        "<additionalValue>13.5</additionalValue></trafficSignElement></trafficSign>"
+    )
+    old = convert(
+        path, driver(7, "2018b"), lanelet(11, *ends, "<speedLimit>12.5</speedLimit>"), version="2018b"
+    )
+    assert old.road.speed_limit.tolist() == [12.5]
+    lane = lanelet(11, *ends, '<trafficSignRef ref="5"/><trafficSignRef ref="77"/>')
+    for kind, expected in (("274", 13.5), ("R2-1", 13.5), ("206", None)):
+        (found,) = convert(path, driver(7), lane, sign.format(kind)).road.speed_limit.tolist()
+        assert found == expected or (expected is None and np.isnan(found))
+
+
+@pytest.mark.parametrize(
+    ("inner", "tags", "expected"),
+    [
+        ("<laneletType>highway</laneletType>", "", LaneType.FREEWAY),
+        ("<laneletType>urban</laneletType>", "highway", LaneType.SURFACE_STREET),
+        ("<laneletType>urban</laneletType><laneletType>bicycleLane</laneletType>", "", LaneType.BIKE_LANE),
+        ("<laneletType>shoulder</laneletType>", "", LaneType.UNDEFINED),
+        ("", "multi_lane highway comfort", LaneType.FREEWAY),
+        ("", "urban", LaneType.SURFACE_STREET),
+        ("", "", LaneType.UNDEFINED),
+    ],
+)
+def test_lane_types(path: Path, inner: str, tags: str, expected: LaneType) -> None:
+    lane = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], inner)
+    assert convert(path, lane, driver(7), tags=tags).road.lane_type.tolist() == [expected]
+
+
+def test_walkways_are_no_lanes(path: Path) -> None:
+    walk = lanelet(20, [(0, 4), (50, 4)], [(0, 2), (50, 2)], "<laneletType>sidewalk</laneletType>")
+    cross = lanelet(21, [(20, 2), (20, -2)], [(18, 2), (18, -2)], "<laneletType>crosswalk</laneletType>")
+    segment = convert(path, ROAD, walk, cross, driver(7))
+    assert segment.road.lane_id.tolist() == [10, 11]
+    assert segment.road.mark_type.tolist() == [MarkType.CROSSWALK]
+    assert segment.road.boundary.points[:, 1].max() == 2
+
+
+def test_painted_lines_are_marks_and_shared_ones_count_once(path: Path) -> None:
+    middle = [(0, 2), (50, 2)]
+    left, right = bound("left", middle, "dashed"), bound("right", [(0, -2), (50, -2)], "no_marking")
+    low = f'<lanelet id="10">{left}{right}</lanelet>'
+    left, right = bound("left", [(0, 6), (50, 6)], "solid"), bound("right", middle, "dashed")
+    high = f'<lanelet id="12">{left}{right}</lanelet>'
+    road = convert(path, low, high, driver(7)).road
+    assert road.mark_type.tolist() == [MarkType.ROAD_LINE] * 2
+    assert sorted(road.marks.points[:, 1].tolist()) == [2, 2, 6, 6]
+
+
+def test_lanelets_of_one_point_go_with_all_that_refers_to_them(path: Path) -> None:
+    dot = lanelet(12, [(100, 2)], [(100, -2)], '<predecessor ref="11"/>')
+    assert convert(path, ROAD, dot, driver(7)).road.successors.tolist() == [[0, 1]]
+
+
+def test_boundary_rings_have_the_drivable_side_on_their_left(path: Path) -> None:
+    corners = [(-20, -20), (20, -20), (20, 20), (-20, 20), (-20, -20)]
+    inner = [(0.8 * x, 0.8 * y) for x, y in corners]
+    square = [
+        lanelet(k, inner[k : k + 2], corners[k : k + 2], f'<successor ref="{(k + 1) % 4}"/>')
+        for k in range(4)
+    ]
+    road = convert(path, *square, driver(7, y=-18)).road
+    areas = sorted(signed_area(road.boundary[k].astype(float)) for k in range(len(road.boundary)))
+    np.testing.assert_allclose(areas, [-(32.0**2), 40.0**2], rtol=1e-4)
+    for k in range(len(road.boundary)):
+        np.testing.assert_array_equal(road.boundary[k][0], road.boundary[k][-1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(-50, 50),
+            st.floats(-50, 50),
+            st.floats(0.1, 20),
+            st.floats(1, 20),
+            st.floats(0, 6.3),
+        ),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:
+    outlines = []
+    for x, y, length, width, angle in boxes:
+        corners = np.array([[0, 0], [length, 0], [length, width], [0, width], [0, 0]])
+        c, s = np.cos(angle), np.sin(angle)
+        outlines.append(corners @ np.array([[c, s], [-s, c]]) + [x, y])
+    rings = drivable_rings(outlines)
+    area = sum(signed_area(ring) for ring in rings)
+    union = shapely.union_all([shapely.Polygon(outline) for outline in outlines])
+    assert area >= union.area - 0.5
+    assert area <= union.buffer(2 * SLIT).area + 0.5
+    shells = [shapely.Polygon(ring) for ring in rings if signed_area(ring) > 0]
+    holes = [shapely.Polygon(ring) for ring in rings if signed_area(ring) < 0]
+    rebuilt = shapely.union_all(shells).difference(shapely.union_all(holes))
+    assert union.difference(rebuilt.buffer(0.05)).area < 0.05
+
+
+def test_slits_between_lanelets_are_no_boundary() -> None:
+    low = np.array([[0, 0], [50, 0], [50, 4], [0, 4], [0, 0.0]])
+    near, far = (low + np.array([0, 4 + gap * SLIT]) for gap in (1.5, 3))
+    assert len(drivable_rings([low, near])) == 1
+    assert len(drivable_rings([low, far])) == 2
+
+
+LIGHT = (
+    '<trafficLight id="30"><cycle>'
+    "<cycleElement><duration>3</duration><color>green</color></cycleElement>"
+    "<cycleElement><duration>1</duration><color>yellow</color></cycleElement>"
+    "<cycleElement><duration>4</duration><color>{color}</color></cycleElement>"
+    "<timeOffset>{offset}</timeOffset></cycle><direction>{direction}</direction><active>{active}</active></trafficLight>"
+)
+
+
+def light(color: str = "red", offset: int = 0, direction: str = "all", active: str = "true") -> str:
+    return LIGHT.format(color=color, offset=offset, direction=direction, active=active)
+
+
+def branch(target: int, dy: float) -> str:
+    return lanelet(target, [(50, 2), (100, 2 + dy)], [(50, -2), (100, -2 + dy)])
+
+
+APPROACH = lanelet(
+    10,
+    [(0, 2), (50, 2)],
+    [(0, -2), (50, -2)],
+    '<successor ref="11"/><successor ref="12"/><trafficLightRef ref="30"/>',
+)
+FORK = APPROACH + branch(11, 0) + branch(12, 30)
+TURNS = (
+    '<intersection id="40"><incoming id="41"><incomingLanelet ref="10"/>'
+    '<successorsStraight ref="11"/><successorsLeft ref="12"/></incoming></intersection>'
+)
+
+
+@pytest.mark.parametrize("offset", [0, 2, 5, -3, 800])
+def test_a_light_repeats_its_cycle_from_the_offset(path: Path, offset: int) -> None:
+    segment = convert(path, FORK, light(offset=offset), driver(7, steps=range(100, 140)))
+    cycle = [SignalState.GO] * 3 + [SignalState.CAUTION] + [SignalState.STOP] * 4
+    expected = [cycle[(step - offset) % 8] for step in range(100, 140)]
+    assert segment.signal_lane.tolist() == [1, 2]
+    np.testing.assert_array_equal(segment.signal_state, [expected, expected])
+    stop = segment.signal_point + segment.origin
+    np.testing.assert_allclose(stop, [[50, 0, 0]] * 2, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("direction", "lanes"), [("straight", [1]), ("left", [2]), ("leftStraight", [1, 2]), ("right", [])]
+)
+def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: list[int]) -> None:
+    assert convert(path, FORK, TURNS, light(direction=direction), driver(7)).signal_lane.tolist() == lanes
+
+
+def test_a_light_at_the_end_of_the_map_holds_for_its_own_lanelet(path: Path) -> None:
+    segment = convert(path, APPROACH, light(), driver(7))
+    assert segment.signal_lane.tolist() == [0]
+
+
+def test_stop_lines_that_are_drawn_count(path: Path) -> None:
+    line = "<stopLine><point><x>47</x><y>2</y></point><point><x>47</x><y>-2</y></point></stopLine>"
+    marked = APPROACH.replace("<trafficLightRef", line + "<trafficLightRef", 1)
+    segment = convert(path, marked, light(), driver(7))
+    np.testing.assert_allclose(segment.signal_point + segment.origin, [[47, 0, 0]], atol=1e-5)
+
+
+def test_switched_off_and_dangling_lights(path: Path) -> None:
+    assert not convert(path, FORK, light(active="false"), driver(7)).signal_state.any()
+    assert len(convert(path, FORK, driver(7)).signal_lane) == 0

@@ -1,0 +1,144 @@
+"""Collisions, off-road driving and displacement against shapely and by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symphony.geometry import box_corners, segments_of
+from symphony.metrics import collisions, displacement, offroad
+
+
+def scene(seed, lead=(2,), agents=7, steps=5, spread=14.0):
+    rng = np.random.default_rng(seed)
+    position = torch.tensor(rng.uniform(0, spread, (*lead, agents, steps, 2)))
+    heading = torch.tensor(rng.uniform(-7, 7, (*lead, agents, steps)))
+    size = torch.tensor(rng.uniform(0.4, 5, (*lead, agents, 2)))
+    valid = torch.tensor(rng.random((*lead, agents, steps)) < 0.7)
+    subject = torch.tensor(np.stack([rng.permutation(agents)[:3] for _ in range(math.prod(lead))]))
+    return position, heading, size, valid, subject.reshape(*lead, 3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_collisions_agree_with_shapely(seed):
+    position, heading, size, valid, subject = scene(seed)
+    boxes = shapely.polygons(box_corners(position, heading, size[..., None, :]).numpy())
+    found = collisions(position, heading, size, valid, subject)
+    assert found.shape == (2, 3, 5)
+    for b, n, t in np.ndindex(2, 3, 5):
+        me = int(subject[b, n])
+        others = [k for k in range(7) if k != me and valid[b, k, t]]
+        area = [shapely.area(shapely.intersection(boxes[b, me, t], boxes[b, k, t])) for k in others]
+        expected = bool(valid[b, me, t]) and max(area, default=0) > 0
+        if not 0 < max(area, default=0) < 1e-9:
+            assert found[b, n, t] == expected
+
+
+def test_collisions_by_hand():
+    """Three cars in a row: the first two overlap by 12.5 cm at step 1, the last one only touches."""
+    position = torch.zeros(3, 2, 2)
+    position[1, :, 0] = torch.tensor([6.0, 4.375])
+    position[2, :, 0] = torch.tensor([10.5, 8.875])
+    heading, size = torch.zeros(3, 2), torch.tensor([[4.5, 2.0]]).expand(3, 2)
+    valid, subject = torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 1, 2])
+    found = collisions(position, heading, size, valid, subject)
+    assert found.tolist() == [[False, True], [False, True], [False, False]]
+    valid[1, 1] = False
+    assert not collisions(position, heading, size, valid, subject).any()
+
+
+def test_padding_and_order_of_agents_change_nothing():
+    position, heading, size, valid, subject = scene(3)
+    found = collisions(position, heading, size, valid, subject)
+    assert found.any()
+    order = torch.tensor([4, 2, 6, 0, 1, 5, 3])
+    place = torch.argsort(order)
+    pad = [torch.cat([x[:, order], x[:, :2]], 1) for x in (position, heading, size, valid)]
+    pad[3][:, -2:] = False
+    pad[0][:, -2:] = torch.nan
+    shuffled = torch.cat([place[subject], torch.full((2, 1), -1)], 1)
+    again = collisions(pad[0], pad[1], pad[2], pad[3], shuffled)
+    assert torch.equal(again[:, :3], found)
+    assert not again[:, 3].any()
+
+
+def test_leading_dimensions_broadcast():
+    position, heading, size, valid, subject = scene(4, lead=(2, 3))
+    whole = collisions(position, heading, size[:, :1], valid, subject[:, :1])
+    assert whole.shape == (2, 3, 3, 5)
+    for b, k in np.ndindex(2, 3):
+        one = collisions(position[b, k], heading[b, k], size[b, 0], valid[b, k], subject[b, 0])
+        assert torch.equal(whole[b, k], one)
+
+
+def boundary(polygons):
+    """start, end, valid, previous, following of one scene per polygon, padded."""
+    parts = []
+    for polygon in shapely.orient_polygons(polygons):
+        lines = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
+        parts.append(segments_of(np.concatenate(lines), np.cumsum([0, *(len(x) for x in lines)])))
+    width = max(len(p[0]) for p in parts)
+
+    def stack(k, fill):
+        pads = [np.concatenate((p[k], np.full((width - len(p[k]), *p[k].shape[1:]), fill))) for p in parts]
+        return torch.tensor(np.stack(pads))
+
+    valid = torch.tensor(np.stack([np.arange(width) < len(p[0]) for p in parts]))
+    return stack(0, 0.0), stack(1, 0.0), valid, stack(2, -1), stack(3, -1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_offroad_agrees_with_shapely(seed):
+    rng = np.random.default_rng(seed)
+    roads = []
+    for _ in range(2):
+        line = shapely.LineString(np.cumsum(rng.uniform(-15, 15, (5, 2)), axis=0))
+        area = line.buffer(rng.uniform(3, 6))
+        roads.append(max(shapely.get_parts(area), key=shapely.area))
+    edge = boundary(roads)
+    position = torch.tensor(rng.uniform(-40, 40, (2, 3, 4, 5, 2)))
+    heading = torch.tensor(rng.uniform(-4, 4, (2, 3, 4, 5)))
+    size = torch.tensor(rng.uniform(1, 5, (2, 1, 4, 1, 2)))
+    center = offroad(position, *edge)
+    corner = offroad(position, *edge, heading=heading, size=size)
+    assert center.shape == corner.shape == (2, 3, 4, 5)
+    corners = box_corners(position, heading, size).numpy()
+    for i in np.ndindex(2, 3, 4, 5):
+        assert center[i] == (not roads[i[0]].contains(shapely.Point(position[i].numpy())))
+        inside = shapely.contains(roads[i[0]], shapely.points(corners[i]))
+        assert corner[i] == (not inside.all())
+
+
+def test_offroad_of_a_car_at_the_kerb():
+    edge = boundary([shapely.box(0, 0, 100, 10)])
+    position, heading = (
+        torch.tensor([[[50.0, 1.0], [50.0, 0.5], [50.0, -0.1]]]).double(),
+        torch.zeros(1, 3).double(),
+    )
+    size = torch.tensor([[[4.0, 1.8]] * 3]).double()
+    assert offroad(position, *edge).tolist() == [[False, False, True]]
+    assert offroad(position, *edge, heading=heading, size=size).tolist() == [[False, True, True]]
+    with pytest.raises(ValueError, match="heading and size"):
+        offroad(position, *edge, size=size)
+
+
+def test_nothing_is_offroad_without_a_boundary():
+    none = torch.zeros(2, 0, 2)
+    assert not offroad(torch.rand(2, 3, 4, 2), none, none, torch.zeros(2, 0, dtype=torch.bool)).any()
+
+
+def test_displacement():
+    log = torch.tensor([[[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]])
+    position = (log + torch.tensor([3.0, 4.0])).expand(2, 1, 3, 2).clone()
+    position[0] += torch.tensor([3.0, 4.0])
+    valid = torch.tensor([[True, False, True]])
+    log[0, 1] = torch.nan
+    assert displacement(position, log, valid).tolist() == [[[10, 0, 10]], [[5, 0, 5]]]
