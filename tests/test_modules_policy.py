@@ -15,8 +15,8 @@ from symphony.modules import (
     discrete_policy,
     inverse_cdf,
     scene_module,
-    uniform,
 )
+from symphony.streams import uniform
 
 GROUPS = (ElementGroup(OBJECTS, OBJECTS_MASK, 10), ElementGroup(POINTS, POINTS_MASK, 9))
 

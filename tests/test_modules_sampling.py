@@ -11,7 +11,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from symphony.modules import fold_in, inverse_cdf, stream_of, uniform
+from symphony.modules import inverse_cdf
+from symphony.streams import fold_in, stream_of, uniform
 
 MASK = 2**64 - 1
 int64 = st.integers(-(2**63), 2**63 - 1)
@@ -108,7 +109,7 @@ def test_derived_streams_do_not_collide():
 
 
 def test_a_name_has_the_same_stream_in_another_process():
-    code = "from symphony.modules import stream_of; print(stream_of('a segment'))"
+    code = "from symphony.streams import stream_of; print(stream_of('a segment'))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert int(out) == stream_of("a segment") != stream_of("a segment ")
     assert -(2**63) <= int(out) < 2**63

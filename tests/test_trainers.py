@@ -9,15 +9,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers_segments import crossing, straight_road
 
+from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.cli import main
 from symphony.config import AgentConfig, BCConfig, EvaluateConfig, from_dict, to_json
 from symphony.data.store import SegmentStore, StoreWriter
-from symphony.envs import Bicycle, Displacement, ObservationConfig
+from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
-from symphony.trainers import evaluate, load_agent, train
+from symphony.metrics import collisions, offroad
+from symphony.trainers import evaluate, load_agent, simulate, train
 from symphony.trainers.checkpoint import checkpoints
 from symphony.trainers.dataset import SceneDataset, experts
 from symphony.trainers.tracking import read_metrics
@@ -101,7 +102,9 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path)
 
 
 def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
-    out = train(config(store, tmp_path / "long", steps=60, states=128, learning_rate=3e-3, checkpoint_every=60))
+    out = train(
+        config(store, tmp_path / "long", steps=60, states=128, learning_rate=3e-3, checkpoint_every=60)
+    )
     losses = [r["loss_bc"] for r in read_metrics(out)]
     assert losses[0] == pytest.approx(math.log(147), rel=0.1)
     assert sum(losses[-5:]) < 0.85 * sum(losses[:5])
@@ -113,6 +116,35 @@ def test_playback_scores_nothing_against_itself(store: Path) -> None:
     assert numbers["rollouts"] == 1
     for name in ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd"):
         assert numbers[name] == pytest.approx(0, abs=1e-6)
+
+
+def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
+    """One definition in two forms: step by step in simulation, whole trajectories for logs."""
+    dataset = SceneDataset(SegmentStore(store), 2)
+    scenes = dataset.scenes(range(len(dataset)))
+    env = DrivingEnv(scenes, Bicycle(), ObservationConfig(num_points=1))
+    start = env.start(torch.arange(len(dataset))[:, None].expand(-1, 20), torch.arange(20))
+    done = simulate(env, env.rand_action, start, steps=25)
+    where = scenes.log_state[:, None, :26].transpose(2, 3).repeat(1, 20, 1, 1, 1)
+    valid = scenes.log_valid[:, None, :26].transpose(2, 3).repeat(1, 20, 1, 1)
+    rows = torch.arange(len(dataset))[:, None, None], torch.arange(20)[:, None], scenes.interactive[:, None]
+    where[rows] = torch.cat([done.state, done.state[..., :1]], -1).transpose(2, 3)
+    valid[rows] = True
+    hit = collisions(
+        where[..., :2], where[..., 2], scenes.box_size[:, None], valid, scenes.interactive[:, None]
+    )[..., 1:]
+    assert torch.equal(hit.transpose(2, 3), done.collision)
+    assert 0 < hit.float().mean() < 1
+    edges = (
+        scenes.edge_start,
+        scenes.edge_end,
+        scenes.edge_valid,
+        scenes.edge_previous,
+        scenes.edge_following,
+    )
+    off = offroad(done.state[:, :, 1:, :, :2], *edges)
+    assert torch.equal(off, done.offroad)
+    assert 0 < off.float().mean() < 1
 
 
 def test_constant_velocity_is_right_on_the_straight_and_wrong_in_turns(store: Path) -> None:
@@ -154,7 +186,9 @@ def test_experts_are_the_moving_vehicles_and_the_ego() -> None:
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_expert_batches_show_what_the_environment_shows(store: Path, dynamics: Bicycle | Displacement) -> None:
+def test_expert_batches_show_what_the_environment_shows(
+    store: Path, dynamics: Bicycle | Displacement
+) -> None:
     dataset = SceneDataset(SegmentStore(store), 2, dynamics)
     rng = torch.Generator().manual_seed(0)
     batch = dataset.sample_states(2, 50, ObservationConfig(num_objects=4, num_points=20), rng)
@@ -166,7 +200,9 @@ def test_expert_batches_show_what_the_environment_shows(store: Path, dynamics: B
     assert seen.norm(dim=-1).min() * 20 > 1  # nobody sees itself
 
 
-def test_command_line_trains_and_evaluates(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_trains_and_evaluates(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, file, picture = tmp_path / "run", tmp_path / "numbers.json", tmp_path / "rollouts.png"
     small = ["--agent.hidden", "8", "--agent.head", "8", "--agent.num-points", "20", "--wandb", "disabled"]
     command = ["train", "bc", "--data", store, "--out", out, "--steps", "3", "--seed", "4", *small]
@@ -174,7 +210,16 @@ def test_command_line_trains_and_evaluates(store: Path, tmp_path: Path, capsys: 
     command = ["evaluate", out, "--data", store, "--json", file, "--figure", picture, "--rollouts", "2"]
     assert main([str(c) for c in command]) == 0
     numbers = json.loads(file.read_text())
-    wanted = {"collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd", "segments", "rollouts", "seed"}
+    wanted = {
+        "collision_rate",
+        "offroad_time",
+        "ade",
+        "min_sade",
+        "curvature_jsd",
+        "segments",
+        "rollouts",
+        "seed",
+    }
     assert wanted <= numbers.keys()
     assert numbers["playback"]["ade"] == 0
     assert len(numbers["per_segment"]) == numbers["segments"] == 6

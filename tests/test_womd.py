@@ -277,3 +277,12 @@ def test_what_the_schema_forbids_is_named(path: Path, change: Any, field: str) -
     change(scenario)
     error = refuse(path, scenario)
     assert (error.file, error.segment, error.field) == (path, scenario.scenario_id, field)
+
+
+def test_a_name_that_is_no_text_is_refused(path: Path) -> None:
+    payload = womd_scenario("abcdefgh").SerializeToString().replace(b"abcdefgh", b"abc\xb3efgh")
+    write_records(path, [payload])
+    error = read_error("womd", path)
+    assert error.segment is None
+    assert error.field is not None
+    assert error.field.startswith("record 0")

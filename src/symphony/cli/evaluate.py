@@ -67,4 +67,6 @@ def evaluate_with_bar(agent: str, data: Path, config: EvaluateConfig, interactiv
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("segments"))
     with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(f"evaluating {agent}", total=None)
-        return evaluate(agent, data, config, lambda done, total: bar.update(task, completed=done, total=total))
+        return evaluate(
+            agent, data, config, lambda done, total: bar.update(task, completed=done, total=total)
+        )

@@ -43,7 +43,8 @@ def draw_rollouts(
         runs: Rollouts = playback(scene) if agent.policy is None else simulated(agent, scene, SHOWN, seed)
         state = runs.state[0].transpose(1, 2)
         flags = {
-            name: getattr(runs, name)[0].transpose(1, 2).numpy() for name in ("collision", "offroad", "counted")
+            name: getattr(runs, name)[0].transpose(1, 2).numpy()
+            for name in ("collision", "offroad", "counted")
         }
 
         def draw(axes: Any) -> Any:

@@ -26,4 +26,6 @@ class BC:
         from symphony.trainers import train
 
         folder = train(self.config)
-        Console().print(f"Trained agent in {folder}; judge it: symphony evaluate {folder} --data DIR", soft_wrap=True)
+        Console().print(
+            f"Trained agent in {folder}; judge it: symphony evaluate {folder} --data DIR", soft_wrap=True
+        )

@@ -138,7 +138,7 @@ def _local_line(
     mean = (values * there[..., None]).sum(axis=1, keepdims=True) / total
     masked = (values - mean) * there[..., None]
     s0, s1, s2 = (there @ (weight * lag**k).T for k in range(3))
-    y0, y1 = (np.einsum("ts,asd->atd", weight * lag**k, masked) for k in range(2))
+    y0, y1 = ((weight * lag**k) @ masked for k in range(2))
     spread = s0 * s2 - s1**2
     fitted = valid & (spread > 1e-9 * s0**2 * sigma**2)
     safe = np.where(fitted, spread, 1.0)[..., None]

@@ -326,7 +326,11 @@ def _array(
     yield name, array.shape == shape, f"shape {array.shape}, expected {shape}"
     if below is None:
         bad = np.argwhere(~np.isfinite(array))
-        yield name, len(bad) == 0, f"{len(bad)} numbers that are not finite, first at index {bad[:1].tolist()}"
+        yield (
+            name,
+            len(bad) == 0,
+            f"{len(bad)} numbers that are not finite, first at index {bad[:1].tolist()}",
+        )
     else:
         inside = ((array >= 0) & (array < below)).all()
         yield name, bool(inside), f"values outside 0 … {below - 1}"

@@ -22,6 +22,7 @@ from symphony.envs.observation import (
     observe,
 )
 from symphony.envs.scene import SceneBatch
+from symphony.streams import fold_in
 
 
 class DrivingEnv(EnvBase):
@@ -124,7 +125,7 @@ class DrivingEnv(EnvBase):
                 its own whatever batch it runs in.
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
-        stream = self.scenes.stream[scene] + rollout * _STRIDE
+        stream = fold_in(self.scenes.stream[scene], rollout)
         return self._from_state(
             scene, torch.zeros_like(scene), stream, self._logged_state(scene), self._valid(scene)
         )
@@ -232,10 +233,6 @@ class DrivingEnv(EnvBase):
         position = _rows_of(objects.state, index)[..., :2]
         collision = collision_flags(objects, index) & valid
         return collision, offroad_flags(self.scenes, scene, position) & valid
-
-
-_STRIDE = 0xD1B54A32D192ED03 - (1 << 64)
-"""Odd 64-bit constant that sets the streams of one scene's rollouts apart; int64 wraps around."""
 
 
 def _rows_of(values: Tensor, index: Tensor) -> Tensor:

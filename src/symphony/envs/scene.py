@@ -6,7 +6,6 @@ segments. World frame of the segment, SI units.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
@@ -22,6 +21,7 @@ from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.errors import DataError
 from symphony.geometry.polylines import segments_of
+from symphony.streams import stream_of
 
 SPACING = 2.0
 """Metres between the points that stand for a polyline in the observation."""
@@ -167,11 +167,6 @@ def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
 _INDEX_FIELDS = {"point_light", "edge_previous", "edge_following"}
 
 
-def stream_of(segment_id: str) -> int:
-    """A 63-bit number derived from a segment id alone."""
-    return int.from_bytes(hashlib.sha256(segment_id.encode()).digest()[:8], "little") >> 1
-
-
 def _edges(boundary: Polylines) -> tuple[NDArray[Any], ...]:
     lines = [
         np.asarray(LineString(boundary[k][:, :2].astype(np.float64)).simplify(BOUNDARY_TOLERANCE).coords)
@@ -199,7 +194,9 @@ def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
         kind.append(types[line])
         speed.append(limits[line])
     lights = len(segment.signal_lane)
-    ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32).reshape(-1, 2)
+    ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32).reshape(
+        -1, 2
+    )
     point.append(segment.signal_point[:, :2])
     direction.append(_unit(ends - segment.signal_point[:, :2]))
     kind.append(np.full(lights, PointType.LIGHT))

@@ -6,7 +6,7 @@ from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, s
 from symphony.modules.policy import NoiseSampler, discrete_policy
 from symphony.modules.pooling import pool_elements
 from symphony.modules.rows import in_blocks, mlp
-from symphony.modules.sampling import fold_in, inverse_cdf, stream_of, uniform
+from symphony.modules.sampling import inverse_cdf
 
 __all__ = [
     "ElementGroup",
@@ -14,12 +14,9 @@ __all__ = [
     "SceneEncoder",
     "SceneNetwork",
     "discrete_policy",
-    "fold_in",
     "in_blocks",
     "inverse_cdf",
     "mlp",
     "pool_elements",
     "scene_module",
-    "stream_of",
-    "uniform",
 ]

@@ -1,74 +1,9 @@
-"""Random numbers as a function of (seed, stream, step), and drawing a category with one of them.
-
-A generator's state ties a rollout's numbers to how many others were drawn before, hence to its batch. Here
-nothing is kept: the number is a hash of what it is for, so that a rollout is the same in any batch, branch
-layout, process or device.
-"""
+"""Drawing a category with a given random number."""
 
 from __future__ import annotations
 
-import hashlib
-
 import torch
 from torch import Tensor
-
-# SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.
-_GAMMA = 0x9E3779B97F4A7C15
-_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
-
-
-def _signed(value: int) -> int:
-    """The int64 with the low 64 bits of `value`."""
-    value &= (1 << 64) - 1
-    return value - (1 << 64) if value >> 63 else value
-
-
-def _shift_xor(x: Tensor, bits: int) -> Tensor:
-    # int64 shifts copy the sign; the mask makes the shift logical.
-    return x ^ ((x >> bits) & ((1 << (64 - bits)) - 1))
-
-
-def _mix(x: Tensor) -> Tensor:
-    """SplitMix64's finaliser, a bijection of int64 in which each input bit sways each output bit."""
-    x = _shift_xor(x, 30) * _signed(_MULTIPLIERS[0])
-    x = _shift_xor(x, 27) * _signed(_MULTIPLIERS[1])
-    return _shift_xor(x, 31)
-
-
-def fold_in(stream: Tensor, index: Tensor | int) -> Tensor:
-    """Derive int64 streams from streams: `stream` and `index` broadcast; distinct pairs give unrelated streams."""
-    if isinstance(index, int):
-        return _mix(stream + _signed((index + 1) * _GAMMA))
-    return _mix(stream + (index.to(torch.int64) + 1) * _signed(_GAMMA))
-
-
-def stream_of(text: str) -> int:
-    """The int64 stream of a name such as a segment's id, the same in every process."""
-    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big", signed=True)
-
-
-def uniform(seed: int, stream: Tensor, step: Tensor | int, *, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Uniform numbers in the open interval (0, 1), a pure function of the three arguments.
-
-    Args:
-        seed: of the whole run.
-        stream: int64, one per independent sequence, e.g. made by :func:`fold_in` from segment, branch, agent.
-        step: int64 or int, counter within a sequence; broadcast against `stream`.
-        dtype: float32 (23 random bits) or float64 (52).
-
-    Returns:
-        Float tensor of the broadcast shape, with the same bits on every device.
-    """
-    if stream.dtype != torch.int64:
-        raise ValueError(f"streams are int64, got {stream.dtype}")
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype must be float32 or float64, got {dtype}")
-    bits = 23 if dtype == torch.float32 else 52
-    start = torch.full((), _signed(seed), dtype=torch.int64, device=stream.device)
-    hashed = fold_in(fold_in(_mix(start), stream), step)
-    top = (hashed >> (64 - bits)) & ((1 << bits) - 1)
-    # The middle of one of 2^bits equal cells: exact in this dtype, and never 0 or 1.
-    return (2 * top + 1).to(dtype) * 2.0 ** -(bits + 1)
 
 
 def inverse_cdf(logits: Tensor, noise: Tensor) -> Tensor:

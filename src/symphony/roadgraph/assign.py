@@ -60,7 +60,7 @@ def starting_lanes(
     position: NDArray[Any],
     heading: float,
     *,
-    margin: float = 1.0,
+    margin: float = 1.5,
     tolerance: float = LATERAL,
     max_turn: float = TURN,
 ) -> list[tuple[int, float]]:

@@ -18,6 +18,7 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
 from symphony.envs.scene import SceneBatch, collate, scene
 
+
 @dataclass(frozen=True)
 class Experts:
     """Logged vehicles of one segment as demonstrations, after the fit to the action space.

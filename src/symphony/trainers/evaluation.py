@@ -17,13 +17,11 @@ from symphony import keys
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv
-from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.observation import objects_at
 from symphony.envs.scene import SceneBatch
 from symphony.errors import DataError
-from symphony.metrics import RolloutMetrics
-from symphony.modules import fold_in, uniform
+from symphony.metrics import RolloutMetrics, collisions, offroad
 from symphony.roadgraph import LaneGraph, visited_regions
+from symphony.streams import fold_in, uniform
 from symphony.trainers.agents import Agent, load_agent
 from symphony.trainers.dataset import SceneDataset
 from symphony.trainers.simulate import Rollouts, simulate
@@ -117,15 +115,11 @@ def _evaluate_batch(
 ) -> None:
     scenes = dataset.scenes(items).to(torch.device(config.device))
     log, log_valid = logged(scenes)
-    if agent.policy is None:
-        rollouts = playback(scenes)
-    else:
-        rollouts = simulated(agent, scenes, config.rollouts, config.seed)
+    playing = agent.policy is None
+    rollouts = playback(scenes) if playing else simulated(agent, scenes, config.rollouts, config.seed)
     segments = [dataset.segment(i) for i in items]
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
-    driven, judged, log, log_valid = (
-        t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid)
-    )
+    driven, judged, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
     regions, regions_log = [], []
     for b, segment in enumerate(segments):
         graph = LaneGraph(segment.road)
@@ -157,16 +151,19 @@ def simulated(agent: Agent, scenes: SceneBatch, rollouts: int, seed: int) -> Rol
 
 def playback(scenes: SceneBatch) -> Rollouts:
     """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
-    batch, steps = scenes.log_valid.shape[:2]
     log, valid = logged(scenes)
-    row = torch.arange(batch, device=log.device).repeat_interleave(steps)
-    step = torch.arange(steps, device=log.device).repeat(batch)
-    index = scenes.interactive[row]
-    objects = objects_at(scenes, row, step)
-    collision = collision_flags(objects, index).unflatten(0, (batch, steps)) & valid
-    position = log[..., :2].flatten(0, 1)
-    offroad = offroad_flags(scenes, row, position).unflatten(0, (batch, steps)) & valid
-    return Rollouts(log[:, None], collision[:, None, 1:], offroad[:, None, 1:], valid[:, None, 1:])
+    position, heading = scenes.log_state[..., :2].transpose(1, 2), scenes.log_state[..., 2].transpose(1, 2)
+    everyone = scenes.log_valid.transpose(1, 2)
+    hit = collisions(position, heading, scenes.box_size, everyone, scenes.interactive).transpose(1, 2) & valid
+    edges = (
+        scenes.edge_start,
+        scenes.edge_end,
+        scenes.edge_valid,
+        scenes.edge_previous,
+        scenes.edge_following,
+    )
+    off = offroad(log[..., :2], *edges) & valid
+    return Rollouts(log[:, None], hit[:, None, 1:], off[:, None, 1:], valid[:, None, 1:])
 
 
 def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
@@ -32,7 +32,10 @@ class Rollouts(NamedTuple):
 
 @torch.no_grad()
 def simulate(
-    env: DrivingEnv, policy: TensorDictModuleBase, start: TensorDictBase, steps: int | None = None
+    env: DrivingEnv,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    start: TensorDictBase,
+    steps: int | None = None,
 ) -> Rollouts:
     """Roll a policy out from a start state.
 

@@ -32,9 +32,9 @@ class Tracker:
         for record in kept:
             self._write(record)
         self._run = None
-        mode = os.environ.get("WANDB_MODE", wandb)
+        mode: Any = os.environ.get("WANDB_MODE", wandb)
         if mode != "disabled":
-            import wandb as tracking
+            import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
             self._run = tracking.init(
                 project="symphony",

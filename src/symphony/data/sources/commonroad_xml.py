@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -118,8 +117,3 @@ def rotate(vectors: Doubles, angle: Doubles | float) -> Doubles:
 def is_true(text: str | None, default: bool) -> bool:
     """An XML boolean."""
     return default if text is None else text.strip() in {"true", "1"}
-
-
-def shortest(angle: float) -> float:
-    """The same angle in -π … π."""
-    return math.remainder(angle, math.tau)

@@ -74,7 +74,7 @@ class WomdReader(Reader):
         name = None
         try:
             scenario = pb.Scenario.FromString(payload)
-            name = scenario.scenario_id or None
+            name = _name(scenario)
             # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
             with np.errstate(over="ignore", invalid="ignore"):
                 return scenario_to_segment(scenario, file=path.name)
@@ -91,8 +91,7 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
     Raises:
         DataError: naming the field of the format.
     """
-    if not scenario.scenario_id:
-        raise DataError("missing; is this a WOMD Scenario record?", field="scenario_id")
+    name = _name(scenario)
     dt, steps = _time_step(scenario)
     states, kept, renumber = _tracks(scenario, steps)
     ego = _index(scenario.sdc_track_index, renumber, "sdc_track_index")
@@ -110,7 +109,7 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
     interest = [where[track] for track in scenario.objects_of_interest if track in where]
     masked = np.where(valid[..., None], states, 0.0)
     return RunSegment(
-        segment_id=scenario.scenario_id,
+        segment_id=name,
         source=WomdReader.name,
         dt=dt,
         ego=ego,
@@ -131,6 +130,16 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
         predict=np.array([p for p in predict if p >= 0], np.int32),
         file=file,
     )
+
+
+def _name(scenario: pb.Scenario) -> str:
+    name: str | bytes = scenario.scenario_id
+    if not name:
+        raise DataError("missing; is this a WOMD Scenario record?", field="scenario_id")
+    # Where a string is not UTF-8, protobuf's runtimes either refuse the record or hand over its bytes.
+    if isinstance(name, bytes):
+        raise DataError(f"{name!r} is not UTF-8", field="scenario_id")
+    return name
 
 
 def _time_step(scenario: pb.Scenario) -> tuple[float, int]:

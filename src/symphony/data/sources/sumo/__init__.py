@@ -86,5 +86,7 @@ def generate_run(kind: str, seed: int, duration: float = 150.0, *, rule: CropRul
         end = WARM_UP + duration
         demand = write_demand(network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane)
         traffic = simulate(file, network, demand, drive_rng, end, WARM_UP, sublane=sublane)
-    segments, reasons = cut_segments(f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule or RULES[kind])
+    segments, reasons = cut_segments(
+        f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule or RULES[kind]
+    )
     return Generated(segments, reasons)

@@ -31,7 +31,9 @@ class Demand:
     size: NDArray[np.float32]
 
 
-def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], NDArray[np.float32], NDArray[np.float64]]:
+def _types(
+    rng: np.random.Generator, sublane: bool
+) -> tuple[list[str], NDArray[np.float32], NDArray[np.float64]]:
     """XML, boxes [TYPES, 3] and shares [TYPES] of the vehicle types."""
     # At least one type per body, so that a run's mix has all of them.
     bodies = np.concatenate([np.arange(len(_BODIES)), rng.choice([0, 0, 0, 0, 1, 2], TYPES - len(_BODIES))])
@@ -55,7 +57,11 @@ def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], NDArray[
 
 
 def _walk(
-    rng: np.random.Generator, start: int, following: list[list[int]], length: NDArray[np.float64], reach: float
+    rng: np.random.Generator,
+    start: int,
+    following: list[list[int]],
+    length: NDArray[np.float64],
+    reach: float,
 ) -> list[int]:
     """Edges of a random walk (uniform among the edges that follow) until it is ``reach`` metres long or ends."""
     route, total = [start], float(length[start])

@@ -236,7 +236,11 @@ def _overlap(
     half = size[:, :2].astype(np.float64) / 2
     reach = np.linalg.norm(half, axis=-1)
     gap = np.linalg.norm(position[first] - position[second], axis=-1)
-    close = valid[first] & valid[second] & (np.nan_to_num(gap, nan=np.inf) < (reach[first] + reach[second])[:, None])
+    close = (
+        valid[first]
+        & valid[second]
+        & (np.nan_to_num(gap, nan=np.inf) < (reach[first] + reach[second])[:, None])
+    )
     pair, step = np.nonzero(close)
     a, b = first[pair], second[pair]
     between = position[b, step] - position[a, step]

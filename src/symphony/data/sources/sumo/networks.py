@@ -108,6 +108,8 @@ class _Link:
     b: int
     line: Point
     arterial: bool
+    lanes: int
+    speed: float
 
 
 def _town_links(rng: np.random.Generator, columns: int, rows: int) -> list[tuple[int, int]]:
@@ -162,30 +164,31 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
         same_row, same_column = a // columns == b // columns, a % columns == b % columns
         return (same_row and a // columns in main_rows) or (same_column and a % columns in main_columns)
 
+    width = rng.uniform(3.2, 3.7)
+    arterial = (int(rng.choice([2, 2, 3])), float(rng.choice([13.89, 15.65, 16.67])))
+    collector = (int(rng.choice([1, 1, 2])), float(rng.choice([8.94, 11.18, 13.41])))
     links = []
     for a, b in _town_links(rng, columns, rows):
         sideways = rng.normal(0, 9, 2).clip(-16, 16) * (rng.random() < 0.6)
-        links.append(_Link(a, b, _bezier(nodes[a], nodes[b], sideways), is_main(a, b)))
+        main = is_main(a, b)
+        links.append(
+            _Link(a, b, _bezier(nodes[a], nodes[b], sideways), main, *(arterial if main else collector))
+        )
 
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
-    width = rng.uniform(3.2, 3.7)
-    arterial_speed, collector_speed = rng.choice([13.89, 15.65, 16.67]), rng.choice([8.94, 11.18, 13.41])
-    arterial_lanes, collector_lanes = int(rng.choice([2, 2, 3])), int(rng.choice([1, 1, 2]))
     for link in links:
-        lanes = arterial_lanes if link.arterial else collector_lanes
-        speed = arterial_speed if link.arterial else collector_speed
         line, start, end = link.line, f"n{link.a}", f"n{link.b}"
         if link.a in rings:
             start, line = rings[link.a].enter(start, line)
         if link.b in rings:
             end, line = rings[link.b].enter(end, line[::-1])
             line = line[::-1]
-        priority = 5 if link.arterial else 3
-        net.edge(start, end, lanes=lanes, speed=speed, width=width, priority=priority, shape=line)
-        net.edge(end, start, lanes=lanes, speed=speed, width=width, priority=priority, shape=line[::-1])
-    for name, ring in rings.items():
-        ring.write(net, f"n{name}", width + 0.8)
+        for ends, shape in (((start, end), line), ((end, start), line[::-1])):
+            priority = 5 if link.arterial else 3
+            net.edge(*ends, lanes=link.lanes, speed=link.speed, width=width, priority=priority, shape=shape)
+    for ring in rings.values():
+        ring.write(net, width + 0.8)
     options = ["--tls.layout", _signal_layout(rng), "--default.junctions.radius", f"{rng.uniform(5, 10):.2f}"]
     return net.compile(folder, options)
 
@@ -211,7 +214,7 @@ class _Ring:
     def _at(self, angle: float | NDArray[np.float64]) -> Point:
         return self.center + self.radius * np.stack([np.cos(angle), np.sin(angle)], -1)
 
-    def write(self, net: PlainNetwork, name: str, width: float) -> None:
+    def write(self, net: PlainNetwork, width: float) -> None:
         """Add the ring's junctions and its one-way edges, counter-clockwise."""
         arms = sorted(self.arms)
         names = []
@@ -231,14 +234,17 @@ def _add_nodes(
 ) -> dict[int, _Ring]:
     """Add a junction per node, except where a roundabout takes its place; returns the roundabouts."""
     rings: dict[int, _Ring] = {}
-    wanted = int(rng.integers(0, 3))
+    wanted = int(rng.integers(0, 4))
     for k in rng.permutation(len(nodes)):
-        arms = [link.line[4] if link.a == k else link.line[-5] for link in links if k in (link.a, link.b)]
-        big = [link.arterial for link in links if k in (link.a, link.b)]
+        meeting = [link for link in links if k in (link.a, link.b)]
+        arms = [link.line[4] if link.a == k else link.line[-5] for link in meeting]
+        big = [link.arterial for link in meeting]
         angles = np.sort([np.arctan2(*(p - nodes[k])[::-1]) for p in arms])
         gaps = np.diff([*angles, angles[0] + 2 * np.pi])
-        if len(rings) < wanted and len(arms) >= 3 and gaps.min() > 1.2 and not any(wide[i] for i in range(len(big))):
-            rings[int(k)] = _Ring(nodes[k], float(rng.uniform(14, 20)))
+        # Wide streets close together would pave over the island.
+        roomy = gaps.min() > 1.2 and max(link.lanes for link in meeting) <= 2
+        if len(rings) < wanted and len(arms) >= 3 and roomy:
+            rings[int(k)] = _Ring(nodes[k], float(rng.uniform(15, 21)))
             continue
         if len(arms) == 2:
             control = "priority"
@@ -260,8 +266,19 @@ def grid(rng: np.random.Generator, folder: Path) -> Path:
     """A perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
     control = str(rng.choice(["traffic_light", "priority", "allway_stop", "right_before_left"]))
     length, spread = rng.uniform(100, 140), rng.uniform(4, 12)
-    arguments = ["--grid", "--grid.x-number", str(rng.integers(3, 5)), "--grid.y-number", str(rng.integers(3, 5))]
-    arguments += ["--grid.x-length", f"{length:.2f}", "--grid.y-length", f"{length * rng.uniform(0.85, 1.2):.2f}"]
+    arguments = [
+        "--grid",
+        "--grid.x-number",
+        str(rng.integers(3, 5)),
+        "--grid.y-number",
+        str(rng.integers(3, 5)),
+    ]
+    arguments += [
+        "--grid.x-length",
+        f"{length:.2f}",
+        "--grid.y-length",
+        f"{length * rng.uniform(0.85, 1.2):.2f}",
+    ]
     arguments += ["--turn-lanes", "1", "--turn-lanes.length", f"{rng.uniform(30, 45):.1f}"]
     arguments += ["--perturb-x", f"norm(0,{spread:.2f})", "--perturb-y", f"norm(0,{spread:.2f})"]
     arguments += ["--default-junction-type", control, "--default.lanenumber", str(rng.integers(1, 3))]
@@ -285,7 +302,9 @@ def ramp(rng: np.random.Generator, folder: Path) -> Path:
     curvature = rng.uniform(-1, 1) / 1500
     for side in range(2):
         lanes = int(rng.integers(2, 4))
-        _carriageway(net, rng, side, (lanes, speed, width), direction + side * np.pi, curvature * (1 - 2 * side))
+        _carriageway(
+            net, rng, side, (lanes, speed, width), direction + side * np.pi, curvature * (1 - 2 * side)
+        )
     return net.compile(folder, ["--default.junctions.radius", "4", "--junctions.scurve-stretch", "1.5"])
 
 
@@ -312,15 +331,19 @@ def _carriageway(
         x, y = u, curvature * u**2 / 2
         normal = np.stack([curvature * u, -np.ones_like(u)], -1)
         out = np.stack([x, y], -1) + normal * (median + np.asarray(right))[..., None]
-        spin = np.array(
-            [[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]]
-        )
+        spin = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
         return out @ spin.T
 
     def stretch(a: float, b: float, right: float = 0.0) -> Point:
         return along(np.linspace(a, b, 12), right)
 
-    marks = [stations[0], stations[1], stations[2], *([] if weaving else [stations[3], stations[4]]), stations[5]]
+    marks = [
+        stations[0],
+        stations[1],
+        stations[2],
+        *([] if weaving else [stations[3], stations[4]]),
+        stations[5],
+    ]
     extra = [0, 1, 0] if weaving else [0, 1, 0, 1, 0]
     names = [f"c{side}m{k}" for k in range(len(marks))]
     for name, mark in zip(names, marks, strict=True):

@@ -87,7 +87,14 @@ def simulate(
     (folder / "lights.add.xml").write_text("\n".join(["<additional>", *events, "</additional>"]))
     arguments = ["--net-file", network_file.name, "--route-files", demand.file.name]
     arguments += ["--additional-files", "lights.add.xml", "--end", f"{duration:.1f}"]
-    arguments += ["--step-length", str(STEP), "--step-method.ballistic", "true", "--seed", str(rng.integers(2**30))]
+    arguments += [
+        "--step-length",
+        str(STEP),
+        "--step-method.ballistic",
+        "true",
+        "--seed",
+        str(rng.integers(2**30)),
+    ]
     arguments += ["--extrapolate-departpos", "true", "--time-to-teleport", "-1", "--precision", "4"]
     arguments += ["--collision.action", "warn", "--collision.check-junctions", "true"]
     arguments += ["--collision.mingap-factor", "0", "--no-step-log", "true", "--no-warnings", "true"]
@@ -164,7 +171,7 @@ def _smooth(
         axles.append(_gaussian(front - back[..., None] * along + sideways[..., None] * left))
     ahead = axles[0] - axles[1]
     ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
-    center = (axles[0] + (at_front - size / 2)[..., None] * ahead)
+    center = axles[0] + (at_front - size / 2)[..., None] * ahead
     angle = np.arctan2(ahead[..., 1], ahead[..., 0])
     turn = np.nan_to_num((np.diff(angle, axis=1) + np.pi) % (2 * np.pi) - np.pi)
     first = np.argmax(np.isfinite(angle), axis=1)
