@@ -98,8 +98,13 @@ def test_bad_maps_name_the_field():
     road, _ = fork()
     with pytest.raises(DataError, match=r"road\.successors"):
         LaneGraph(dataclasses.replace(road, successors=np.array([[0, 3]], np.int32)))
-    with pytest.raises(DataError, match=r"road\.lanes"):
-        LaneGraph(make_road({"a": [[1, 1], [1, 1]]})[0])
+
+
+def test_lanes_of_a_single_point_match_nothing():
+    graph = LaneGraph(make_road({"a": [[1, 1], [1, 1]]})[0])
+    assert not graph.usable.any()
+    assert (graph.length, graph.curvature) == (0, 0)
+    assert lane_of(graph, [1, 1], 0.0) == -1
 
 
 def test_repeated_points_and_connections_change_nothing():

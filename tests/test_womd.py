@@ -161,10 +161,20 @@ def test_unknown_fields_are_skipped(path: Path) -> None:
     assert content_hash(read_one("womd", path)) == content_hash(expected)
 
 
-def test_lanes_and_edges_of_one_point_go_with_all_that_refers_to_them(path: Path) -> None:
-    scenario = womd_scenario()
+def test_lanes_of_one_point_stay(path: Path) -> None:
+    scenario, whole = womd_scenario(), convert(path, womd_scenario())
     lane = next(feature for feature in scenario.map_features if feature.id == 11)
     del lane.lane.polyline[1:]
+    road = convert(path, scenario).road
+    np.testing.assert_array_equal(road.lane_id, whole.road.lane_id)
+    np.testing.assert_array_equal(road.successors, whole.road.successors)
+    assert np.diff(road.lanes.offsets).min() == 1
+
+
+def test_lanes_without_points_and_edges_of_one_go_with_all_that_refers_to_them(path: Path) -> None:
+    scenario = womd_scenario()
+    lane = next(feature for feature in scenario.map_features if feature.id == 11)
+    del lane.lane.polyline[:]
     edge = next(feature for feature in scenario.map_features if feature.id == 30)
     del edge.road_edge.polyline[1:]
     segment = convert(path, scenario)

@@ -111,7 +111,7 @@ class RoadMap:
     """Lane graph, road boundary and markings.
 
     Attributes:
-        lanes: centre lines in the direction of travel.
+        lanes: centre lines in the direction of travel (a single point where the source has no more).
         lane_id: [L] int64, the source's own ids (unique).
         lane_type: [L] uint8, :class:`LaneType`.
         speed_limit: [L] float32 m/s, NaN where unknown.
@@ -296,7 +296,7 @@ def _checks_road(road: RoadMap) -> Any:
     lanes = len(road.lanes)
     yield "road.lanes", lanes >= 1, "has no lanes"
     for name in ("lanes", "boundary", "marks"):
-        yield from _polylines(f"road.{name}", getattr(road, name), 1 if name == "marks" else 2)
+        yield from _polylines(f"road.{name}", getattr(road, name), 2 if name == "boundary" else 1)
     yield "road.lane_id", road.lane_id.shape == (lanes,), "must be [L]"
     yield "road.lane_id", len(np.unique(road.lane_id)) == lanes, "ids are not unique"
     yield from _array("road.lane_type", road.lane_type, (lanes,), np.uint8, len(LaneType))

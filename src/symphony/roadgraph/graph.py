@@ -88,22 +88,23 @@ class Regions:
 class LaneGraph:
     """Lanes, how they connect, and their shapes; built once per map.
 
-    Lanes of an excluded type keep their index but are not connected to anything and match no position.
+    Lanes of an excluded type, and those that are a single point (WOMD has some, as stubs), keep their index but
+    are not connected to anything and match no position.
 
     Args:
         road: the map.
         exclude: lane types to leave out.
 
     Raises:
-        DataError: a lane without two distinct points, or a connection to a lane that does not exist.
+        DataError: a connection to a lane that does not exist.
 
     Attributes:
         lines: centre lines [P_k, 2], float64, repeated points dropped.
         arc: per lane, the metres [P_k] from its start to each of its points.
-        usable: [L] whether the lane's type is not excluded.
+        usable: [L] whether the lane is none of those.
         length: [L] metres.
         curvature: [L] average signed curvature, total change of heading / length, 1/m, positive to the left.
-        start_heading: [L] direction of the first piece of each lane.
+        start_heading: [L] direction of the first piece of each lane (of a single point: 0, as its curvature).
         successors: per lane, the lanes its traffic flows into, ascending.
         predecessors: per lane, the lanes that flow into it, ascending.
         left: per lane, the lanes a change to the left reaches.
@@ -113,18 +114,18 @@ class LaneGraph:
 
     def __init__(self, road: Road, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
         points = np.asarray(road.lanes.points, dtype=np.float64)[:, :2]
-        self.lines = [_distinct(points[a:b], k) for k, (a, b) in enumerate(pairwise(road.lanes.offsets))]
+        self.lines = [_distinct(points[a:b]) for a, b in pairwise(road.lanes.offsets)]
         self.arc = [_arc(line) for line in self.lines]
         self.length: Reals = np.array([arc[-1] for arc in self.arc], dtype=np.float64)
-        self.usable: Bools = ~np.isin(np.asarray(road.lane_type), list(exclude))
+        self.usable: Bools = ~np.isin(np.asarray(road.lane_type), list(exclude)) & (self.length > 0)
         self.successors = self._adjacency(road.successors, "road.successors")
         self.predecessors = self._adjacency(np.asarray(road.successors)[:, ::-1], "road.successors")
         self.left = self._adjacency(road.left_neighbors, "road.left_neighbors")
         self.right = self._adjacency(road.right_neighbors, "road.right_neighbors")
         headings = [np.arctan2(*np.diff(line, axis=0).T[::-1]) for line in self.lines]
-        self.start_heading = np.array([heading[0] for heading in headings], dtype=np.float64)
+        self.start_heading = np.array([heading[0] if len(heading) else 0 for heading in headings], np.float64)
         turns = [((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi).sum() for heading in headings]
-        self.curvature: Reals = np.array(turns, dtype=np.float64) / self.length
+        self.curvature: Reals = np.array(turns, dtype=np.float64) / np.where(self.length > 0, self.length, 1)
         self.regions = self._branching()
 
     def __len__(self) -> int:
@@ -170,12 +171,9 @@ class LaneGraph:
         return Regions(lane, parent, self.curvature[lane], entry, self.start_heading[lane])
 
 
-def _distinct(line: Reals, lane: int) -> Reals:
+def _distinct(line: Reals) -> Reals:
     keep = np.concatenate(([True], (line[1:] != line[:-1]).any(1)))[: len(line)]
-    line = line[keep]
-    if len(line) < 2:
-        raise DataError(f"lane {lane} has fewer than two distinct points", field="road.lanes")
-    return line
+    return line[keep]
 
 
 def _arc(line: Reals) -> Reals:

@@ -10,8 +10,8 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 - Lanes are centre lines without width. Road edges of either kind are the boundary; they come oriented with
   the drivable side on the left. Polygons (crosswalks, speed bumps, driveways) become closed rings among the
   marks.
-- Lanes and road edges of fewer than two points are left out, as are references (exits, neighbours, lights,
-  objects of interest) to anything that is not in the record.
+- Lanes without points and road edges of fewer than two are left out, as are references (exits, neighbours,
+  lights, objects of interest) to anything that is not in the record. Lanes of one point are kept.
 - A light is one row per lane that has a state at any step; its stop point is the first one logged.
 """
 
@@ -207,7 +207,7 @@ def _road(features: Sequence[pb.MapFeature], origin: Doubles) -> tuple[RoadMap, 
     kinds: list[int] = []
     for feature in features:
         kind = feature.WhichOneof("feature_data")
-        if kind == "lane" and len(feature.lane.polyline) >= 2:
+        if kind == "lane" and len(feature.lane.polyline) >= 1:
             lanes.append((feature.id, feature.lane))
             lines.append(_points(feature.lane.polyline))
         elif kind == "road_edge" and len(feature.road_edge.polyline) >= 2:

@@ -124,7 +124,7 @@ def _at_steps(traffic: Traffic) -> _Tracks:
         acceleration = (velocity[:, EVERY:] - velocity[:, :-EVERY]) / DT
         yaw_rate = (heading[:, EVERY:] - heading[:, :-EVERY]) / DT
         sideways = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)
-        wild = np.abs(sideways) > MAX_LATERAL_SPEED
+        wild = np.atleast_2d(np.abs(sideways) > MAX_LATERAL_SPEED)
         wild[:, EVERY:] |= np.linalg.norm(acceleration, axis=-1) > MAX_ACCELERATION
         wild[:, EVERY:] |= np.abs(yaw_rate) > MAX_YAW_RATE
     pick = slice(None, None, EVERY)
@@ -212,13 +212,13 @@ def _interest(
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     distance = np.where(valid[:, None] & valid[None], distance, np.inf)
     distance[np.arange(len(position)), np.arange(len(position))] = np.inf
-    partner = valid.all(1) & (travel > MOVING)
-    has_partner = (distance[:, partner, 0] < rule.partner_distance).any(1)
-    whole = valid.all(1)
+    whole: NDArray[np.bool_] = np.all(valid, axis=1)
+    partner = np.flatnonzero(whole & (travel > MOVING))
+    has_partner = np.any(distance[:, partner, 0] < rule.partner_distance, axis=1)
     speed = np.where(whole[:, None], np.linalg.norm(velocity, axis=-1), 0)
     turns = np.where(whole, np.abs(heading[:, -1] - heading[:, 0]), 0) > _TURN
     near = distance.min((1, 2)) < _NEAR
-    changes = speed.max(1) - speed.min(1) > _SPEED_CHANGE
+    changes = np.ptp(speed, axis=1) > _SPEED_CHANGE
     return has_partner * (0.3 + 1.2 * turns + 0.5 * near + 0.5 * changes)
 
 

@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from symphony.data.sources.sumo.process import run_program
 
 Point = NDArray[np.float64]
+SHARPEST_ANGLE = 1.05
+"""Radians between two streets at a junction, at least where one of them is bent."""
+LATERAL_ACCELERATION = 3.0
+"""m/s² that the speed limits of curved streets allow for; drivers exceed limits by up to 30 %."""
 _COMMON = [
     "--no-turnarounds",
     "true",
@@ -147,6 +151,43 @@ def _bezier(start: Point, end: Point, bend: Point, count: int = 12) -> Point:
     return (1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * first + 3 * t**2 * (1 - t) * second + t**3 * end
 
 
+def _street(rng: np.random.Generator, nodes: Point, links: list[_Link], a: int, b: int) -> Point:
+    """Centre line from node a to b: bent, unless it would meet a street there is at a sharp angle."""
+    straight = _bezier(nodes[a], nodes[b], np.zeros(2))
+    if rng.random() > 0.7:
+        return straight
+    for _ in range(4):
+        line = _bezier(nodes[a], nodes[b], rng.normal(0, 9, 2).clip(-16, 16))
+        angles = [
+            abs(np.angle(np.exp(1j * (_departure(line if end == a else line[::-1]) - _departure(other)))))
+            for end in (a, b)
+            for other in _leaving(links, end)
+        ]
+        if min(angles, default=np.pi) > SHARPEST_ANGLE:
+            return line
+    return straight
+
+
+def _leaving(links: list[_Link], node: int) -> list[Point]:
+    """Centre lines of the streets at a node, from it outwards."""
+    return [link.line if link.a == node else link.line[::-1] for link in links if node in (link.a, link.b)]
+
+
+def _departure(line: Point) -> float:
+    """Direction of a line over its first third."""
+    towards = line[len(line) // 3] - line[0]
+    return float(np.arctan2(towards[1], towards[0]))
+
+
+def _comfortable_speed(line: Point) -> float:
+    """Speed at which the tightest bend of a street asks for :data:`LATERAL_ACCELERATION`."""
+    along = np.diff(line, axis=0)
+    turn = np.diff(np.unwrap(np.arctan2(along[:, 1], along[:, 0])))
+    step = np.linalg.norm(along, axis=-1)
+    curvature = np.abs(turn) / ((step[:-1] + step[1:]) / 2)
+    return float(np.sqrt(LATERAL_ACCELERATION / max(curvature.max(), 1e-3)))
+
+
 def town(rng: np.random.Generator, folder: Path) -> Path:
     """A jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts."""
     columns, rows = int(rng.integers(3, 6)), int(rng.integers(3, 5))
@@ -167,13 +208,12 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
     width = rng.uniform(3.2, 3.7)
     arterial = (int(rng.choice([2, 2, 3])), float(rng.choice([13.89, 15.65, 16.67])))
     collector = (int(rng.choice([1, 1, 2])), float(rng.choice([8.94, 11.18, 13.41])))
-    links = []
+    links: list[_Link] = []
     for a, b in _town_links(rng, columns, rows):
-        sideways = rng.normal(0, 9, 2).clip(-16, 16) * (rng.random() < 0.6)
+        line = _street(rng, nodes, links, a, b)
         main = is_main(a, b)
-        links.append(
-            _Link(a, b, _bezier(nodes[a], nodes[b], sideways), main, *(arterial if main else collector))
-        )
+        lanes, speed = arterial if main else collector
+        links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
 
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
@@ -237,16 +277,15 @@ def _add_nodes(
     wanted = int(rng.integers(0, 4))
     for k in rng.permutation(len(nodes)):
         meeting = [link for link in links if k in (link.a, link.b)]
-        arms = [link.line[4] if link.a == k else link.line[-5] for link in meeting]
         big = [link.arterial for link in meeting]
-        angles = np.sort([np.arctan2(*(p - nodes[k])[::-1]) for p in arms])
+        angles = np.sort([_departure(line) for line in _leaving(links, int(k))])
         gaps = np.diff([*angles, angles[0] + 2 * np.pi])
         # Wide streets close together would pave over the island.
         roomy = gaps.min() > 1.2 and max(link.lanes for link in meeting) <= 2
-        if len(rings) < wanted and len(arms) >= 3 and roomy:
+        if len(rings) < wanted and len(meeting) >= 3 and roomy:
             rings[int(k)] = _Ring(nodes[k], float(rng.uniform(15, 21)))
             continue
-        if len(arms) == 2:
+        if len(meeting) == 2:
             control = "priority"
         elif sum(big) >= 3:
             control = "traffic_light"

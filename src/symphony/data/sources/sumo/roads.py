@@ -93,7 +93,8 @@ def _shape(text: str) -> Line:
 def read_network(file: Path) -> Network:
     """Read a compiled network (``.net.xml``)."""
     root = ET.parse(file).getroot()  # noqa: S314
-    lanes, width, speed, internal, edge, names = [], [], [], [], [], []
+    lanes: list[Line] = []
+    width, speed, internal, edge, names = [], [], [], [], []
     index: dict[str, int] = {}
     for element in root.iter("edge"):
         if element.get("function") in {"crossing", "walkingarea"}:
@@ -106,7 +107,8 @@ def read_network(file: Path) -> Network:
             speed.append(float(lane.attrib["speed"]))
             internal.append(element.get("function") == "internal")
             edge.append(len(names) - 1)
-    successors, connectors, stops = [], {}, []
+    successors, stops = [], []
+    connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
         start = index[f"{link.attrib['from']}_{link.attrib['fromLane']}"]
         end = index[f"{link.attrib['to']}_{link.attrib['toLane']}"]

@@ -103,12 +103,12 @@ def simulate(
     arguments += ["--fcd-output.skip-empty", "true"]
     arguments += ["--lateral-resolution", "0.5"] if sublane else ["--lanechange.duration", "3"]
     run_program("sumo", arguments, folder)
-    time = warm_up + STEP * np.arange(round((duration - warm_up) / STEP))
+    time = warm_up + STEP * np.arange(round((duration - warm_up) / STEP), dtype=np.float64)
     front, angle = _read_tracks(folder / "tracks.csv", time, len(demand.size))
     position, heading = _smooth(front, angle, demand.size[:, 0], _wander(rng, len(demand.size)))
     velocity = np.gradient(position, STEP, axis=1)
     # At both ends of a track the difference is with an absent neighbour.
-    present = np.isfinite(velocity).all(-1)
+    present = np.isfinite(velocity[..., 0]) & np.isfinite(velocity[..., 1])
     lights = {
         light: _read_lights(folder / f"lights{k}.xml", time) for k, light in enumerate(network.connectors)
     }

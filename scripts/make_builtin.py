@@ -1,0 +1,190 @@
+"""Make the built-in data set with SUMO: ``python scripts/make_builtin.py``.
+
+Writes ``src/symphony/data/builtin/train`` and ``.../test`` anew and prints what is in them. The two share no road
+network: each network has a seed of its own. Needs the extra ``symphony[sumo]``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from symphony.data.builtin import builtin_store
+from symphony.data.segment import RunSegment
+from symphony.data.selection import interactive_agents
+from symphony.data.sources.sumo import generate_run
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.geometry import segments_of, signed_distance
+from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
+
+DURATION = 150.0
+MAPS = 2
+"""Maps taken from each network."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """What one of the two stores holds."""
+
+    segments: int
+    networks: tuple[tuple[str, int], ...]
+
+
+SPLITS = {
+    "train": Split(
+        64,
+        (
+            *(("town", seed) for seed in range(12)),
+            *(("grid", seed) for seed in range(5)),
+            *(("ramp", seed) for seed in range(3)),
+        ),
+    ),
+    "test": Split(
+        24,
+        (
+            *(("town", seed) for seed in range(1000, 1005)),
+            *(("grid", seed) for seed in range(1000, 1002)),
+            ("ramp", 1000),
+        ),
+    ),
+}
+
+
+def choose(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
+    """Some of a network's segments, spread evenly over :data:`MAPS` of its maps."""
+    by_map: dict[int, list[RunSegment]] = {}
+    for segment in segments:
+        by_map.setdefault(id(segment.road), []).append(segment)
+    rich = sorted(by_map.values(), key=len, reverse=True)
+    chosen: list[RunSegment] = []
+    groups = [rich[k] for k in rng.permutation(len(rich)) if len(rich[k]) * MAPS >= count][:MAPS]
+    for k, group in enumerate(groups or rich[:MAPS]):
+        take = (count - len(chosen)) // (max(len(groups), 1) - k) if groups else count
+        chosen += [group[i] for i in sorted(rng.permutation(len(group))[:take])]
+    return chosen[:count]
+
+
+def make(name: str, split: Split) -> tuple[int, Counter[str], float]:
+    """Write one store; returns how many segments were accepted, why others were not, and the seconds taken."""
+    path = builtin_store(name)  # type: ignore[arg-type]
+    shutil.rmtree(path, ignore_errors=True)
+    accepted, reasons, seconds = 0, Counter[str](), 0.0
+    with StoreWriter(path) as writer:
+        for k, (kind, seed) in enumerate(split.networks):
+            begin = time.perf_counter()
+            run = generate_run(kind, seed, DURATION)
+            seconds += time.perf_counter() - begin
+            accepted += len(run.segments)
+            reasons += run.reasons
+            count = -(-(split.segments - len(writer)) // (len(split.networks) - k))
+            for segment in choose(run.segments, count, np.random.default_rng(seed)):
+                writer.append(segment, tags={"kind": kind, "network": f"{kind}-{seed}"})
+    return accepted, reasons, seconds
+
+
+def describe(store: SegmentStore) -> dict[str, str]:
+    """Measures of the logged driving, of the ego and its partner (the nearest moving vehicle) in each segment."""
+    collided, off, motion, turns, errors = [], [], [], [], []
+    for segment in store:
+        pair = interactive_agents(segment, 2)
+        collided.append([_collides(segment, int(agent)) for agent in pair])
+        off.append(_off_road(segment, pair))
+        heading, velocity = segment.heading[pair].astype(float), segment.velocity[pair].astype(float)
+        speed = np.linalg.norm(velocity, axis=-1)
+        rates = [np.diff(speed, axis=1) / segment.dt, np.diff(heading, axis=1) / segment.dt]
+        motion.append(np.stack([speed[:, 1:], *rates]))
+        turns.append(np.ptp(heading, axis=1) > 0.5)
+        errors += _route_errors(segment, pair)
+    values = np.stack(motion, 1).reshape(3, -1)
+    names = ("speed (m/s)", "acceleration (m/s²)", "yaw rate (rad/s)")
+    points = (1, 50, 99)
+    return {
+        "segments with a collision of the pair": f"{np.mean(np.any(collided, 1)):.2%}",
+        "steps of the pair with the centre off the road": f"{np.mean(off):.3%}",
+        **{
+            f"{name}, percentiles {points}": " ".join(f"{q:.2f}" for q in np.percentile(row, points))
+            for name, row in zip(names, values, strict=True)
+        },
+        "egos that turn by more than 0.5 rad": f"{np.mean(turns, 0)[0]:.0%}",
+        "partners that do": f"{np.mean(turns, 0)[1]:.0%}",
+        "distance to the best feasible route, mean / largest (m)": f"{np.mean(errors):.2f} / {np.max(errors):.2f}",
+        "segments with lights": f"{np.mean([len(s.signal_lane) > 0 for s in store]):.0%}",
+    }
+
+
+def _boxes(segment: RunSegment, agent: int) -> NDArray[np.object_]:
+    """[T] rectangles."""
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * segment.size[agent, :2] / 2
+    heading = segment.heading[agent]
+    along = np.stack([np.cos(heading), np.sin(heading)], -1)
+    left = np.stack([-along[:, 1], along[:, 0]], -1)
+    center = segment.position[agent, :, None, :2]
+    return shapely.polygons(center + corners[:, :1] * along[:, None] + corners[:, 1:] * left[:, None])
+
+
+def _collides(segment: RunSegment, agent: int) -> bool:
+    own = _boxes(segment, agent)
+    for other in range(segment.num_agents):
+        both = segment.valid[agent] & segment.valid[other]
+        if other != agent and shapely.area(shapely.intersection(own, _boxes(segment, other)))[both].sum() > 0:
+            return True
+    return False
+
+
+def _off_road(segment: RunSegment, pair: NDArray[np.int64]) -> float:
+    """Share of the pair's steps."""
+    import torch  # noqa: PLC0415
+
+    boundary = segment.road.boundary
+    start, end, previous, following = (
+        torch.as_tensor(part)[None] for part in segments_of(boundary.points, boundary.offsets)
+    )
+    points = torch.as_tensor(segment.position[pair, :, :2]).reshape(1, -1, 2)
+    valid = torch.ones(start.shape[:2], dtype=torch.bool)
+    return float((signed_distance(points, start, end, valid, previous, following) > 0).float().mean())
+
+
+def _route_errors(segment: RunSegment, pair: NDArray[np.int64]) -> list[float]:
+    """Metres between each logged path and the feasible route that fits it best."""
+    graph = LaneGraph(segment.road)
+    errors = []
+    for agent in pair:
+        path = segment.position[agent, :, :2]
+        choices = feasible_routes(graph, path[0], float(segment.heading[agent, 0]))
+        errors.append(
+            float(route_errors(graph, choices, path, segment.valid[agent]).min()) if choices else np.inf
+        )
+    return errors
+
+
+def main() -> None:
+    """Make both stores, or only describe those that are there."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--describe", action="store_true", help="only print what the stores hold")
+    only_describe = parser.parse_args().describe
+    total = 0
+    for name, split in SPLITS.items():
+        print(f"{name}:")
+        if not only_describe:
+            accepted, reasons, seconds = make(name, split)
+            print(
+                f"  accepted {accepted} segments in {seconds:.0f} s: {accepted / seconds * 60:.0f} per minute"
+            )
+            print(f"  windows left out: {dict(reasons.most_common())}")
+        store = SegmentStore(builtin_store(name))  # type: ignore[arg-type]
+        total += sum(file.stat().st_size for file in Path(store.path).rglob("*") if file.is_file())
+        summary = store.summary() | {"checksum": store.checksum()} | describe(store)
+        print("\n".join(f"  {key}: {value}" for key, value in summary.items()))
+    print(f"{total / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
