@@ -1,6 +1,6 @@
 """Behavioural cloning: the row "BC" of the paper's tables.
 
-    python recipes/bc.py --data TRAIN --test TEST --out runs/bc
+python recipes/bc.py --data TRAIN --test TEST --out runs/bc
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def main(args: list[str] | None = None) -> None:
     """Run the recipe."""
     recipe = tyro.cli(Recipe, description=__doc__, args=args)
     run = train(recipe.training)
-    config = EvaluateConfig(rollouts=recipe.rollouts, seed=recipe.training.seed, device=recipe.training.device)
+    config = EvaluateConfig(
+        rollouts=recipe.rollouts, seed=recipe.training.seed, device=recipe.training.device
+    )
     judged = evaluate(str(run), recipe.test, config)
     log = evaluate("playback", recipe.test, replace(config, interactive=judged.interactive))
     rows = [log.numbers(), judged.numbers()]

@@ -291,3 +291,16 @@ def test_plot_refuses_what_it_cannot_draw(
     assert captured.err.startswith("symphony: error: ")
     assert captured.err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_every_vehicle_can_be_the_ego(
+    samples: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = str(samples / "commonroad" / "ngsim" / "USA_US101-2_1_T-1.xml")
+    for egos, least in (("one", 1), ("all", 5)):
+        out = str(tmp_path / egos)
+        assert main(["data", "convert", "commonroad", file, "--out", out, "--egos", egos]) == 0
+        assert main(["data", "info", out, "--json"]) == 0
+        found = json.loads(capsys.readouterr().out.split("converted", 1)[-1].split("┘", 1)[-1])["segments"]
+        assert (found == 1) if egos == "one" else (found >= least)
+    assert main(["data", "convert", "womd", file, "--out", out + "x", "--egos", "all"]) == 2

@@ -176,13 +176,16 @@ def test_more_rollouts_keep_the_first_ones(run: Path, store: Path) -> None:
         assert result.error.tolist() == many[name].error[:2].tolist()
 
 
-def test_experts_are_the_moving_vehicles_and_the_ego() -> None:
+def test_experts_drive_or_wait_in_a_lane_and_are_not_parked() -> None:
     segment = straight_road(4)
-    parked = segment.position.copy()
-    parked[1:3] = parked[1:3, :1]
-    found = experts(segment.replace(position=parked), Bicycle())
-    assert found.agent.tolist() == [0, 3]
+    position, velocity = segment.position.copy(), segment.velocity.copy()
+    position[1:3] = position[1:3, :1]
+    velocity[1:3] = 0
+    position[2, :, 1] += 1.5  # beside its lane
+    found = experts(segment.replace(position=position, velocity=velocity), Bicycle())
+    assert found.agent.tolist() == [0, 1, 3]
     assert found.error.max() < 0.15
+    assert (found.actions[1] == 73).all()  # who waits neither steers nor brakes
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])

@@ -37,6 +37,9 @@ class Convert:
     """Interactive agents a segment must have at its first step."""
     smooth: float = 0.0
     """Smoothing of the tracks before they are resampled: sigma in seconds, 0 for none."""
+    egos: Literal["one", "all"] = "one"
+    """CommonRoad, which names no ego vehicle: make one segment of each scenario, with the ego that has the most
+    moving vehicles around it, or one for every moving vehicle seen throughout."""
     append: bool = False
     """Add to a store that exists; what it holds already is left as it is."""
 
@@ -49,6 +52,8 @@ class Convert:
             raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
         if not self.smooth >= 0:
             raise ConfigError(f"--smooth must not be negative, is {self.smooth}")
+        if self.egos == "all" and self.format != "commonroad":
+            raise ConfigError(f"--egos all is for commonroad; {self.format} names its ego vehicle")
 
     def run(self) -> None:
         """Convert, showing how far it is, and report."""
@@ -74,6 +79,7 @@ class Convert:
                 interactive=self.interactive,
                 smooth=self.smooth,
                 append=self.append,
+                reader_options={"egos": self.egos} if self.format == "commonroad" else None,
                 progress=show,
             )
         _print_report(report, self.out)

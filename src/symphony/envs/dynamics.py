@@ -146,14 +146,17 @@ class Bicycle:
         num_steering: size of the steering grid (odd).
         heading_weight: metres that one radian of heading error counts for in the greedy fit.
         speed_weight: metres that one m/s of speed error counts for in the greedy fit.
+        effort: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of
+            steering; small, it decides where actions hardly differ, as at standstill, for the gentlest.
     """
 
-    max_acceleration: float = 5.0
+    max_acceleration: float = 4.0
     num_acceleration: int = 7
     max_steering: float = 0.5
     num_steering: int = 21
     heading_weight: float = 1.0
     speed_weight: float = 0.3
+    effort: float = 0.002
     discrete: Literal[True] = True
 
     @property
@@ -202,6 +205,7 @@ class Bicycle:
         acceleration, steering = self.grid(position)
         logged = torch.cat([position, heading[..., None], speed.clamp_min(0.0)[..., None]], -1)
         coast = self.num_actions // 2
+        effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())
         state, states, actions = logged[..., 0, :], [logged[..., 0, :]], []
         for t in range(1, position.shape[-2]):
             target = logged[..., t, :]
@@ -216,6 +220,7 @@ class Bicycle:
                 (after[..., :2] - target[..., None, :2]).square().sum(-1)
                 + (self.heading_weight * wrap(after[..., 2] - target[..., None, 2])).square()
                 + (self.speed_weight * (after[..., 3] - target[..., None, 3])).square()
+                + effort
             )
             known = valid[..., t - 1] & valid[..., t]
             action = torch.where(known, error.argmin(-1), torch.full_like(error.argmin(-1), coast))

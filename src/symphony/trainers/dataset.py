@@ -17,6 +17,11 @@ from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
 from symphony.envs.scene import SceneBatch, collate, scene
+from symphony.roadgraph import LaneGraph, lane_of
+
+
+IN_LANE = 1.0
+"""Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +44,18 @@ class Experts:
 
 
 def experts(segment: RunSegment, dynamics: Bicycle | Displacement) -> Experts:
-    """Fit every moving vehicle of a segment, and the ego whether it moves or not."""
+    """Fit every vehicle of a segment that moves or stands in a lane (waiting is driving, parking is not), and the
+    ego in any case.
+    """
     valid = segment.valid
-    chosen = (segment.agent_type == AgentType.VEHICLE) & (travel(segment) > MOVING)
+    everyone, first = np.arange(segment.num_agents), valid.argmax(1)
+    lane = lane_of(
+        LaneGraph(segment.road),
+        segment.position[everyone, first, :2],
+        segment.heading[everyone, first],
+        tolerance=IN_LANE,
+    )
+    chosen = (segment.agent_type == AgentType.VEHICLE) & ((travel(segment) > MOVING) | (lane >= 0))
     chosen[segment.ego] = True
     chosen &= (valid[:, 1:] & valid[:, :-1]).any(1)
     rows = np.flatnonzero(chosen)

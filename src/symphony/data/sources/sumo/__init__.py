@@ -18,7 +18,7 @@ from symphony.data.sources.sumo.extract import DT, RULES, STATES, CropRule, cut_
 from symphony.data.sources.sumo.networks import NETWORKS
 from symphony.data.sources.sumo.process import sumo_home
 from symphony.data.sources.sumo.roads import read_network
-from symphony.data.sources.sumo.simulate import simulate
+from symphony.data.sources.sumo.simulate import simulate_traffic
 from symphony.errors import ConfigError
 
 __all__ = ["DT", "KINDS", "STATES", "CropRule", "Generated", "generate", "generate_run", "sumo_home"]
@@ -85,7 +85,7 @@ def generate_run(kind: str, seed: int, duration: float = 150.0, *, rule: CropRul
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
         end = WARM_UP + duration
         demand = write_demand(network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane)
-        traffic = simulate(file, network, demand, drive_rng, end, WARM_UP, sublane=sublane)
+        traffic = simulate_traffic(file, network, demand, drive_rng, end, WARM_UP, sublane=sublane)
     segments, reasons = cut_segments(
         f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule or RULES[kind]
     )

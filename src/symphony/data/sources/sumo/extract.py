@@ -161,7 +161,7 @@ def _cut(
         return "no moving ego with a moving partner"
     if (tracks.unphysical[agents, window] & valid).any():
         return "unphysical motion"
-    if _overlap(position, heading, size, valid, travel > MOVING):
+    if _overlap(position, heading, size, valid):
         return "overlap"
     if not shapely.contains_xy(crop.drivable, *position[valid].T).all():
         return "off the road"
@@ -227,12 +227,9 @@ def _overlap(
     heading: NDArray[np.float64],
     size: NDArray[np.float32],
     valid: NDArray[np.bool_],
-    moving: NDArray[np.bool_],
 ) -> bool:
-    """Whether the boxes of two vehicles, one of them moving, ever share more than :data:`MAX_OVERLAP` metres."""
+    """Whether the boxes of two vehicles ever share more than :data:`MAX_OVERLAP` metres."""
     first, second = np.triu_indices(len(position), 1)
-    keep = moving[first] | moving[second]
-    first, second = first[keep], second[keep]
     half = size[:, :2].astype(np.float64) / 2
     reach = np.linalg.norm(half, axis=-1)
     gap = np.linalg.norm(position[first] - position[second], axis=-1)

@@ -290,7 +290,7 @@ def _add_nodes(
         elif sum(big) >= 3:
             control = "traffic_light"
         elif any(big):
-            control = str(rng.choice(["traffic_light", "priority", "priority_stop"], p=[0.55, 0.3, 0.15]))
+            control = str(rng.choice(["traffic_light", "priority", "priority_stop"], p=[0.7, 0.2, 0.1]))
         else:
             minor = ["priority", "allway_stop", "right_before_left", "traffic_light"]
             control = str(rng.choice(minor, p=[0.25, 0.35, 0.2, 0.2]))
@@ -303,7 +303,8 @@ def _add_nodes(
 
 def grid(rng: np.random.Generator, folder: Path) -> Path:
     """A perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
-    control = str(rng.choice(["traffic_light", "priority", "allway_stop", "right_before_left"]))
+    controls = ["traffic_light", "priority", "allway_stop", "right_before_left"]
+    control = str(rng.choice(controls, p=[0.4, 0.2, 0.2, 0.2]))
     length, spread = rng.uniform(100, 140), rng.uniform(4, 12)
     arguments = [
         "--grid",

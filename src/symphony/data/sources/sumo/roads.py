@@ -17,11 +17,11 @@ from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap
 Line = NDArray[np.float64]
 _DEFAULT_WIDTH = 3.2
 _FREEWAY_SPEED = 22.0
-_LANE_SPACING, _CONNECTOR_SPACING, _BOUNDARY_SPACING = 2.0, 1.5, 5.0
+_LANE_SPACING, _CONNECTOR_SPACING, _BOUNDARY_SPACING = 2.0, 1.5, 3.0
 _BOUNDARY_TOLERANCE = 0.04
 _SLIT = 0.3
-BOUNDARY_MARGIN = 12.0
-"""Metres by which the road boundary reaches beyond the lanes of a crop."""
+BOUNDARY_MARGIN = 25.0
+"""Metres by which the road boundary reaches beyond the lanes that are cut: connectors may reach beyond."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Network:
         edge_names: SUMO's names of the edges.
         successors: [E, 2] lanes (from, to).
         connectors: per traffic light, its (link index, the connector it controls, the lane that leads there).
-        stop_lanes: lanes that end at a stop sign.
+        stop_lanes: the rightmost lane of each edge that ends at a stop sign.
         junction_shapes: the paved area of each junction.
         centers: [J, 2] junctions where at least three streets meet or lanes split or join.
     """
@@ -117,7 +117,7 @@ def read_network(file: Path) -> Network:
         if "tl" in link.attrib:
             connectors.setdefault(link.attrib["tl"], []).append((int(link.attrib["linkIndex"]), via, start))
         if link.get("state") in {"s", "w"}:
-            stops.append(start)
+            stops.append(edge.index(edge[start]))
     shapes, centers, meeting = [], [], _meeting_points(root)
     for junction in root.iter("junction"):
         if junction.get("type") == "internal" or len(_shape(junction.get("shape", ""))) < 3:
@@ -182,16 +182,18 @@ class Crop:
 def crop_network(network: Network, center: Line, radius: float) -> Crop:
     """Cut the map within ``radius`` metres of a point.
 
-    Lanes outside junctions are cut where they first enter and last leave the circle; connectors are kept whole.
-    A lane keeps its successors only if its end is kept.
+    Lanes are cut where they first enter and last leave the circle; connectors that touch it may reach beyond, as
+    far as the road boundary does. A lane keeps its successors only if its end is kept.
     """
     kept, lines, whole_end, whole_start = [], [], [], []
     for k, shape in enumerate(network.lanes):
         local = _densify(shape - center, _CONNECTOR_SPACING if network.internal[k] else _LANE_SPACING)
-        inside = np.flatnonzero(np.linalg.norm(local, axis=-1) <= radius)
+        away = np.linalg.norm(local, axis=-1)
+        reach = radius
+        if network.internal[k] and away.min() <= radius:
+            reach = radius + BOUNDARY_MARGIN - 2 * _BOUNDARY_SPACING
+        inside = np.flatnonzero(away <= reach)
         first, last = (inside[0], inside[-1]) if len(inside) else (0, -1)
-        if network.internal[k] and len(inside):
-            first, last = 0, len(local) - 1
         if last - first < 1:
             continue
         kept.append(k)

@@ -62,7 +62,7 @@ class Traffic:
     lights: dict[str, NDArray[np.uint8]]
 
 
-def simulate(
+def simulate_traffic(
     network_file: Path,
     network: Network,
     demand: Demand,

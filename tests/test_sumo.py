@@ -1,0 +1,387 @@
+"""Simulated driving, and the built-in data set made of it."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from numpy.typing import NDArray
+
+from symphony.data.builtin import builtin_store
+from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash, validate
+from symphony.data.selection import MOVING, interactive_agents, travel, usable
+from symphony.data.sources import sumo
+from symphony.data.sources.sumo import extract, process, roads, simulate
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError, DataError
+from symphony.geometry import segments_of, signed_distance
+from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
+
+needs_sumo = pytest.mark.skipif(
+    importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony[sumo]')"
+)
+SPLITS: tuple[Literal["train", "test"], ...] = ("train", "test")
+RULE = sumo.CropRule(focuses=3, per_focus=4)
+
+
+@pytest.fixture(scope="module")
+def simulated() -> dict[str, list[RunSegment]]:
+    """Short runs of every kind; seeds with lights, roundabouts and stop signs among them."""
+    runs = (("town", 0), ("town", 3), ("grid", 1), ("ramp", 1))
+    return {f"{kind}-{seed}": sumo.generate(kind, seed, 45.0, rule=RULE) for kind, seed in runs}
+
+
+@pytest.fixture(scope="module", params=["simulated", *SPLITS])
+def segments(request: pytest.FixtureRequest) -> list[RunSegment]:
+    """Run segments that must satisfy the laws below, fresh and built in."""
+    if request.param != "simulated":
+        return list(SegmentStore(builtin_store(request.param)))
+    if importlib.util.find_spec("sumo") is None:
+        pytest.skip("SUMO is not installed (pip install 'symphony[sumo]')")
+    return [s for run in request.getfixturevalue("simulated").values() for s in run]
+
+
+def off_road(road: RoadMap, points: NDArray[Any]) -> NDArray[np.float32]:
+    """[M] metres outside the drivable area, negative inside, of points [M, 2]."""
+    start, end, before, after = (
+        torch.as_tensor(part)[None] for part in segments_of(road.boundary.points, road.boundary.offsets)
+    )
+    valid = torch.ones(start.shape[:2], dtype=torch.bool)
+    where = torch.as_tensor(np.ascontiguousarray(points), dtype=torch.float32)[None]
+    return signed_distance(where, start, end, valid, before, after)[0].numpy()
+
+
+def maps(segments: Sequence[RunSegment]) -> list[RoadMap]:
+    """The distinct maps of some segments."""
+    return list({s.road.lanes.points.tobytes(): s.road for s in segments}.values())
+
+
+def ends(road: RoadMap) -> tuple[NDArray[Any], NDArray[Any]]:
+    """First and last point [L, 2] of every lane."""
+    points, offsets = road.lanes.points[:, :2], road.lanes.offsets
+    return points[offsets[:-1]], points[offsets[1:] - 1]
+
+
+def boxes(segment: RunSegment, step: int) -> NDArray[Any]:
+    """Rectangles of the agents seen at a step."""
+    seen = segment.valid[:, step]
+    heading, half = segment.heading[seen, step], segment.size[seen, :2] / 2
+    along = np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
+    left = np.stack([-np.sin(heading), np.cos(heading)], -1)[:, None]
+    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+    corners = signs[:, :1] * half[:, None, :1] * along + signs[:, 1:] * half[:, None, 1:] * left
+    return shapely.polygons(segment.position[seen, step, None, :2] + corners)
+
+
+# Laws of all segments -------------------------------------------------------------------------------------------
+
+
+def test_segments_keep_the_schema_and_the_exclusions(segments: list[RunSegment]) -> None:
+    assert segments
+    for segment in segments:
+        validate(segment)
+        usable(segment, 2)
+        assert (segment.num_steps, segment.dt, segment.source) == (51, 0.2, "sumo")
+
+
+def test_ego_and_partner_move_and_are_seen_throughout(segments: list[RunSegment]) -> None:
+    for segment in segments:
+        pair = interactive_agents(segment, 2)
+        assert segment.valid[pair].all()
+        assert (travel(segment)[pair] > MOVING).all()
+        first = segment.position[pair, 0, :2]
+        assert np.linalg.norm(first[0] - first[1]) < 45
+
+
+def test_vehicles_are_on_the_road(segments: list[RunSegment]) -> None:
+    for segment in segments:
+        pair = interactive_agents(segment, 2)
+        assert off_road(segment.road, segment.position[pair, :, :2].reshape(-1, 2)).max() < 0
+        assert off_road(segment.road, segment.position[segment.valid][:, :2]).max() < 0.05
+
+
+def test_vehicles_do_not_overlap(segments: list[RunSegment]) -> None:
+    for segment in segments:
+        for step in range(0, segment.num_steps, 10):
+            shapes = shapely.buffer(boxes(segment, step), -0.05, join_style="mitre")
+            pairs = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+            assert (pairs[0] == pairs[1]).all(), (segment.segment_id, step)
+
+
+def test_motion_is_physical_and_consistent(segments: list[RunSegment]) -> None:
+    slip = []
+    for segment in segments:
+        both = segment.valid[:, 1:] & segment.valid[:, :-1]
+        step = np.diff(segment.position[..., :2], axis=1)
+        mean = (segment.velocity[:, 1:] + segment.velocity[:, :-1]) / 2
+        assert np.abs(step - segment.dt * mean)[both].max() < 0.08
+        assert np.linalg.norm(np.diff(segment.velocity, axis=1), axis=-1)[both].max() < 7.6 * segment.dt
+        assert np.abs(np.diff(segment.heading, axis=1))[both].max() < 1.65 * segment.dt
+        # Wheels roll: vehicles go where they point.
+        course = np.arctan2(segment.velocity[..., 1], segment.velocity[..., 0])
+        fast = segment.valid & (np.linalg.norm(segment.velocity, axis=-1) > 3)
+        slip.append(np.angle(np.exp(1j * (course - segment.heading)))[fast])
+    slips = np.concatenate(slip)
+    assert abs(np.median(slips)) < 0.005
+    assert np.percentile(np.abs(slips), 90) < 0.1
+    assert np.abs(slips).max() < 0.5
+
+
+def test_lanes_continue_where_their_predecessors_end(segments: list[RunSegment]) -> None:
+    for road in maps(segments):
+        first, last = ends(road)
+        gap = np.linalg.norm(first[road.successors[:, 1]] - last[road.successors[:, 0]], axis=-1)
+        assert len(gap) > 5
+        assert gap.max() < 0.5
+        graph = LaneGraph(road)
+        headings = [np.arctan2(*(line[-1] - line[-2])[::-1]) for line in graph.lines]
+        turn = np.array([graph.start_heading[b] - headings[a] for a, b in road.successors])
+        assert np.abs(np.angle(np.exp(1j * turn))).max() < 0.8
+
+
+def test_neighbours_mirror_each_other_on_the_right_side(segments: list[RunSegment]) -> None:
+    for road in maps(segments):
+        left = {tuple(pair) for pair in road.left_neighbors.tolist()}
+        assert left == {tuple(pair[::-1]) for pair in road.right_neighbors.tolist()}
+        for a, b in left:
+            line, other = (shapely.LineString(road.lanes[k][:, :2]) for k in (a, b))
+            side = 1 if line.length <= other.length else -1
+            if side < 0:
+                line, other = other, line
+            middle, ahead = (np.array(line.interpolate(x, normalized=True).coords[0]) for x in (0.5, 0.51))
+            beside = shapely.Point(middle)
+            across = np.array(other.interpolate(other.project(beside)).coords[0]) - middle
+            ahead = ahead - middle
+            assert side * (ahead[0] * across[1] - ahead[1] * across[0]) > 0
+            assert 2.5 < other.distance(beside) < 6
+
+
+def test_drivable_side_of_the_boundary_is_left(segments: list[RunSegment]) -> None:
+    for road in maps(segments):
+        inside = off_road(road, road.lanes.points[:, :2])
+        assert inside.max() < 0.05
+        width = np.repeat(road.lane_width, np.diff(road.lanes.offsets))
+        assert np.mean(inside < -0.45 * width) > 0.97
+        # Islands are rings, clockwise.
+        for k in range(len(road.boundary)):
+            line = road.boundary[k][:, :2]
+            if (line[0] == line[-1]).all():
+                assert not shapely.LinearRing(line).is_ccw
+
+
+def test_ego_follows_a_route_of_the_map(segments: list[RunSegment]) -> None:
+    errors = []
+    for segment in segments:
+        graph, path = LaneGraph(segment.road), segment.position[segment.ego, :, :2]
+        choices = feasible_routes(graph, path[0], float(segment.heading[segment.ego, 0]))
+        assert choices, segment.segment_id
+        errors.append(route_errors(graph, choices, path, segment.valid[segment.ego]).min())
+    assert np.mean(errors) < 0.5
+
+
+def test_lights_stand_where_their_lane_enters_the_junction(segments: list[RunSegment]) -> None:
+    assert any(len(s.signal_lane) for s in segments)
+    for segment in segments:
+        first, last = ends(segment.road)
+        assert len(np.unique(segment.signal_lane)) == len(segment.signal_lane)
+        away = np.linalg.norm(first[segment.signal_lane] - segment.signal_point[:, :2], axis=-1)
+        assert away.max(initial=0) < 0.5
+        for lane, point in zip(segment.signal_lane, segment.signal_point, strict=True):
+            before = segment.road.successors[segment.road.successors[:, 1] == lane, 0]
+            assert np.linalg.norm(last[before] - point[:2], axis=-1).min() < 1e-3
+
+
+def test_nobody_drives_over_a_red_light(segments: list[RunSegment]) -> None:
+    """Few cross the line while their light shows red: none that was red for the last two seconds."""
+    crossings = offences = 0
+    for s in segments:
+        nose = s.position[..., :2] + s.size[:, None, :1] / 2 * np.stack(
+            [np.cos(s.heading), np.sin(s.heading)], -1
+        )
+        for q, lane in enumerate(s.signal_lane):
+            line = shapely.LineString(s.road.lanes[lane][:, :2])
+            on = (shapely.distance(line, shapely.points(nose)) < 0.6) & s.valid
+            crossed = on[:, 12:] & ~on[:, 11:-1] & s.valid[:, 11:-1]
+            for agent, step in zip(*np.nonzero(crossed), strict=True):
+                near = np.linalg.norm(nose[agent, step + 11] - s.signal_point[q, :2]) < 4
+                speed = np.linalg.norm(s.velocity[agent, step + 11])
+                red = (s.signal_state[:, step + 2 : step + 12] == SignalState.STOP).all(1)
+                # Movements that share a start can't be told apart at the line.
+                same = np.linalg.norm(s.signal_point - s.signal_point[q], axis=-1) < 1
+                if near and speed > 1:
+                    crossings += 1
+                    offences += bool(red[same].all())
+    assert crossings > 5
+    assert offences == 0
+
+
+# The generator --------------------------------------------------------------------------------------------------
+
+
+@needs_sumo
+@pytest.mark.parametrize("kind", ["town", "ramp"])
+def test_same_seed_same_segments(simulated: dict[str, list[RunSegment]], kind: str) -> None:
+    name, seed = next((name, int(name[-1])) for name in simulated if name.startswith(kind))
+    again = sumo.generate(kind, seed, 45.0, rule=RULE)
+    assert [content_hash(s) for s in again] == [content_hash(s) for s in simulated[name]]
+
+
+@needs_sumo
+def test_another_seed_is_another_network(simulated: dict[str, list[RunSegment]]) -> None:
+    first, second = simulated["town-0"][0].road, simulated["town-3"][0].road
+    assert first.lanes.points.shape != second.lanes.points.shape
+
+
+@needs_sumo
+def test_segments_of_one_focus_share_map_and_origin(simulated: dict[str, list[RunSegment]]) -> None:
+    for run in simulated.values():
+        by_focus: dict[str, list[RunSegment]] = {}
+        for segment in run:
+            by_focus.setdefault(segment.segment_id.split("-w")[0], []).append(segment)
+        assert any(len(group) > 1 for group in by_focus.values())
+        for group in by_focus.values():
+            assert len({id(segment.road) for segment in group}) == 1
+            assert len({segment.origin.tobytes() for segment in group}) == 1
+        assert len({id(segment.road) for segment in run}) == len(by_focus)
+
+
+@needs_sumo
+@pytest.mark.parametrize(
+    ("limit", "value", "reason"),
+    [
+        ("MAX_OVERLAP", -9.0, "overlap"),
+        ("MAX_ACCELERATION", 0.5, "unphysical motion"),
+        ("_EGO_TRAVEL", 1e9, "no mov"),
+    ],
+)
+def test_windows_beyond_a_limit_are_left_out(
+    simulated: dict[str, list[RunSegment]],
+    monkeypatch: pytest.MonkeyPatch,
+    limit: str,
+    value: float,
+    reason: str,
+) -> None:
+    monkeypatch.setattr(extract, limit, value)
+    run = sumo.generate_run("town", 3, 45.0, rule=RULE)
+    assert len(run.segments) < len(simulated["town-3"])
+    assert sum(count for name, count in run.reasons.items() if name.startswith(reason)) > 0
+
+
+@needs_sumo
+def test_failure_of_a_program_shows_its_message(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"netconvert failed(.|\n)*absent\.xml"):
+        process.run_program("netconvert", ["--node-files", "absent.xml"], tmp_path)
+
+
+def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    process.sumo_home.cache_clear()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(DataError, match=r"symphony\[sumo\]"):
+        sumo.generate("town", 0)
+    process.sumo_home.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (("village", 0), "village"),
+        (("town", -1), "seed"),
+        (("town", 0, 5.0), "duration"),
+        (("town", 0, np.nan), "dur"),
+    ],
+)
+def test_bad_arguments(arguments: tuple[Any, ...], match: str) -> None:
+    with pytest.raises(ConfigError, match=match):
+        sumo.generate(*arguments)
+
+
+def test_smoothing_keeps_a_straight_drive_and_recovers_the_box_centre() -> None:
+    """With no wander, a constant drive comes out exactly, half a length behind the front bumper."""
+    time = np.arange(60) * simulate.STEP
+    heading = np.full((1, 60), 0.7)
+    along = np.array([np.cos(0.7), np.sin(0.7)])
+    front = (8.0 * time[:, None] * along)[None]
+    front[0, :5] = heading[0, :5] = np.nan
+    center, angle = simulate._smooth(front, heading, np.array([4.5], np.float32), np.zeros((4, 1, 4)))
+    seen = np.isfinite(angle[0])
+    assert seen[13:52].all()
+    assert not seen[:13].any()
+    assert not seen[52:].any()
+    np.testing.assert_allclose(center[0, seen], front[0, seen] - 2.25 * along, atol=1e-9)
+    np.testing.assert_allclose(angle[0, seen], 0.7, atol=1e-9)
+
+
+def test_light_states_follow_the_switches(tmp_path: Path) -> None:
+    file = tmp_path / "lights.xml"
+    rows = ((0, "Gr"), (1.0, "yr"), (1.3, "rg"))
+    lines = [f'<tlsSwitch time="{t:.2f}" state="{state}"/>' for t, state in rows]
+    file.write_text(f"<states>{''.join(lines)}</states>")
+    states = simulate._read_lights(file, 0.8 + 0.1 * np.arange(7))
+    go, caution, stop = SignalState.GO, SignalState.CAUTION, SignalState.STOP
+    assert states.tolist() == [[go] * 2 + [caution] * 3 + [stop] * 2, [stop] * 5 + [go] * 2]
+
+
+def test_overlap_agrees_with_shapely() -> None:
+    rng = np.random.default_rng(0)
+    seen = 0
+    for _ in range(300):
+        position, heading = rng.uniform(-3, 3, (2, 1, 2)), rng.uniform(-4, 4, (2, 1))
+        size = rng.uniform(1, 6, (2, 3)).astype(np.float32)
+        valid = np.ones((2, 1), bool)
+        found = extract._overlap(position, heading, size, valid)
+        turned = [
+            shapely.affinity.translate(
+                shapely.affinity.rotate(shapely.box(-a / 2, -b / 2, a / 2, b / 2), h, use_radians=True), *p
+            )
+            for (a, b, _), h, p in zip(size.tolist(), heading[:, 0], position[:, 0], strict=True)
+        ]
+        # A shared sliver thinner than the allowance counts as none.
+        area = turned[0].intersection(turned[1]).area
+        if area == 0 or area > 0.5:
+            assert found == (area > 0)
+            seen += found
+    assert 50 < seen < 290
+
+
+def test_runs_cut_a_ring_into_its_inside_stretches() -> None:
+    ring = np.array([[0, 0], [2, 0], [4, 0], [4, 4], [2, 4], [0, 4], [0, 0]], float)
+    assert len(roads._runs(ring, np.ones(7, bool))[0]) == 7
+    assert roads._runs(ring, np.zeros(7, bool)) == []
+    runs = roads._runs(ring, np.array([True, True, False, False, True, True, True]))
+    assert [run.tolist() for run in runs] == [[[2, 4], [0, 4], [0, 0], [2, 0]]]
+
+
+# The built-in set -----------------------------------------------------------------------------------------------
+
+
+def test_builtin_sets_are_small_varied_and_apart() -> None:
+    stores = {split: SegmentStore(builtin_store(split)) for split in SPLITS}
+    assert len(stores["train"]) >= 48
+    assert len(stores["test"]) >= 16
+    networks = {s: {store.tags(i)["network"] for i in range(len(store))} for s, store in stores.items()}
+    assert len(networks["train"]) >= 12
+    assert len(networks["test"]) >= 5
+    assert not networks["train"] & networks["test"]
+    assert not set(stores["train"].ids) & set(stores["test"].ids)
+    roads_of = [{content_hash(store.road(k)) for k in range(store.num_maps)} for store in stores.values()]  # type: ignore[arg-type]
+    assert not roads_of[0] & roads_of[1]
+    for store in stores.values():
+        store.verify()
+        kinds = {store.tags(i)["kind"] for i in range(len(store))}
+        assert kinds == {"town", "grid", "ramp"}
+    folder = builtin_store("train").parent
+    assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < 5e6
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_builtin_set_has_turns_and_lights(split: Literal["train", "test"]) -> None:
+    store = SegmentStore(builtin_store(split))
+    turns = [np.ptp(s.heading[s.ego]) > 0.5 for s in store]
+    assert 0.25 < np.mean(turns) < 0.8
+    assert np.mean([len(s.signal_lane) > 0 for s in store]) > 0.25
