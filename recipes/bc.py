@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -19,7 +20,7 @@ from symphony.trainers import evaluate, train
 class Recipe:
     """Train on one store, judge on another beside log playback."""
 
-    training: tyro.conf.OmitArgPrefixes[BCConfig]
+    training: Annotated[BCConfig, tyro.conf.arg(name="")]
     """The training run."""
     test: Path
     """Store of run segments to judge it on."""

@@ -19,7 +19,6 @@ from symphony.envs.observation import ObservationConfig, objects_at, observe
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.roadgraph import LaneGraph, lane_of
 
-
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
 

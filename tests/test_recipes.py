@@ -1,0 +1,59 @@
+"""Every recipe on disk runs end to end, tiny."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from helpers_segments import crossing, straight_road
+from symphony.data.store import StoreWriter
+
+RECIPES = Path(__file__).resolve().parents[1] / "recipes"
+TINY = [
+    "--steps",
+    "3",
+    "--states",
+    "16",
+    "--agent.hidden",
+    "8",
+    "--agent.head",
+    "8",
+    "--agent.num-points",
+    "10",
+]
+ARGUMENTS = {"bc.py": [*TINY, "--wandb", "disabled", "--rollouts", "2"]}
+
+
+@pytest.mark.parametrize("recipe", sorted(path.name for path in RECIPES.glob("*.py")))
+def test_recipe(
+    recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for split, seed in (("train", 0), ("test", 1)):
+        with StoreWriter(tmp_path / split) as writer:
+            writer.append(straight_road(4, seed=seed, steps=16))
+            writer.append(crossing(4, seed=seed, steps=16))
+    data = [
+        "--data",
+        str(tmp_path / "train"),
+        "--test",
+        str(tmp_path / "test"),
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    spec = importlib.util.spec_from_file_location("recipe", RECIPES / recipe)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "recipe", module)
+    spec.loader.exec_module(module)
+    module.main([*data, *ARGUMENTS[recipe]])
+    result = json.loads((tmp_path / "run" / "test.json").read_text())
+    playback, trained = result["rows"]
+    assert playback["ade"] == 0
+    assert trained["ade"] > 0
+    assert len(result["per_segment"]) == 2
+    assert f"{trained['ade']:.2f}" in capsys.readouterr().out
