@@ -295,3 +295,17 @@ def test_constant_velocity_keeps_its_speed_and_course() -> None:
         # On a straight road at constant speeds that is the log itself.
         truth = torch.from_numpy(straight_road().position[:2, 50, :2])
         torch.testing.assert_close(now[keys.STATE][0, :, :2], truth, atol=0.01, rtol=0)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_a_moved_environment_gives_the_same_numbers(dynamics: Any) -> None:
+    here = make_env(dynamics=dynamics, config=ALL)
+    there = make_env(dynamics=dynamics, config=ALL).to("cuda")
+    plan = actions(here, (2, 20))
+    a = run(here, here.start(torch.tensor([0, 1])), plan)
+    b = run(there, there.start(torch.tensor([0, 1], device="cuda")), plan.cuda()).cpu()
+    for key in (keys.STATE, keys.OWN, keys.COLLISION, keys.OFFROAD):
+        torch.testing.assert_close(a[key], b[key], atol=1e-3, rtol=0)
+    assert there.reset().device.type == "cuda"

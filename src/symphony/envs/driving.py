@@ -116,6 +116,14 @@ class DrivingEnv(EnvBase):
         if seed is not None:
             self.rng.manual_seed(seed)
 
+    def to(self, device: torch.device | str | int) -> DrivingEnv:
+        """Move the environment, its scenes included; the draws of :meth:`reset` start anew from their seed."""
+        moved = super().to(device)
+        if moved.scenes.log_state.device != moved.device:
+            moved.scenes = moved.scenes.to(moved.device)
+            moved.rng = torch.Generator(device=moved.device).manual_seed(self.rng.initial_seed())
+        return moved
+
     def start(self, scene: Int[Tensor, "*b"], rollout: Int[Tensor, "*b"] | int = 0) -> TensorDict:
         """State at the first logged step, as :meth:`reset` returns it.
 

@@ -6,6 +6,7 @@ place. Shapes: ``...`` any batch, T steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -203,12 +204,9 @@ class Bicycle:
             Joint action indices [*b, T - 1] and fitted states [*b, T, 4].
         """
         acceleration, steering = self.grid(position)
-        logged = torch.cat([position, heading[..., None], speed.clamp_min(0.0)[..., None]], -1)
-        coast = self.num_actions // 2
         effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())
-        state, states, actions = logged[..., 0, :], [logged[..., 0, :]], []
-        for t in range(1, position.shape[-2]):
-            target = logged[..., t, :]
+
+        def nearest(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
             after = bicycle_step(
                 state[..., None, :].expand(*state.shape[:-1], self.num_actions, 4),
                 acceleration,
@@ -222,15 +220,11 @@ class Bicycle:
                 + (self.speed_weight * (after[..., 3] - target[..., None, 3])).square()
                 + effort
             )
-            known = valid[..., t - 1] & valid[..., t]
-            action = torch.where(known, error.argmin(-1), torch.full_like(error.argmin(-1), coast))
+            action = error.argmin(-1).masked_fill(~known, self.num_actions // 2)
             index = action[..., None, None].expand(*action.shape, 1, 4)
-            state = after.gather(-2, index).squeeze(-2)
-            restart = valid[..., t] & ~valid[..., t - 1]
-            state = torch.where(restart[..., None], target, state)
-            states.append(state)
-            actions.append(action)
-        return torch.stack(actions, -1), torch.stack(states, -2)
+            return action, after.gather(-2, index).squeeze(-2)
+
+        return _follow(position, heading, speed.clamp_min(0.0), valid, nearest)
 
 
 @dataclass(frozen=True)
@@ -260,16 +254,36 @@ class Displacement:
         dt: float,
     ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
         """Displacements that reach every valid logged position exactly; headings follow from the motion."""
-        logged = torch.cat([position, heading[..., None], speed[..., None]], -1)
-        state, states, actions = logged[..., 0, :], [logged[..., 0, :]], []
-        for t in range(1, position.shape[-2]):
-            target = logged[..., t, :]
-            known = (valid[..., t - 1] & valid[..., t])[..., None]
+
+        def exact(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
             coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)
-            action = torch.where(known, displacement_inverse(state, target), coast)
-            state = displacement_step(state, action, size[..., 0], dt)
-            restart = (valid[..., t] & ~valid[..., t - 1])[..., None]
-            state = torch.where(restart, target, state)
-            states.append(state)
-            actions.append(action)
-        return torch.stack(actions, -2), torch.stack(states, -2)
+            action = torch.where(known[..., None], displacement_inverse(state, target), coast)
+            return action, displacement_step(state, action, size[..., 0], dt)
+
+        return _follow(position, heading, speed, valid, exact)
+
+
+def _follow(
+    position: Float[Tensor, "*b T 2"],
+    heading: Float[Tensor, "*b T"],
+    speed: Float[Tensor, "*b T"],
+    valid: Bool[Tensor, "*b T"],
+    advance: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+) -> tuple[Tensor, Float[Tensor, "*b T 4"]]:
+    """Step through a log: ``advance(state, target, known)`` gives an action and the state it leads to.
+
+    ``known`` says where the target and the logged state before it are valid. Where a log begins again after a
+    gap, so does the state.
+    """
+    logged = torch.cat([position, heading[..., None], speed[..., None]], -1)
+    time = position.ndim - 2
+    state = logged[..., 0, :]
+    states, actions = [state], []
+    for t in range(1, position.shape[-2]):
+        target = logged[..., t, :]
+        action, state = advance(state, target, valid[..., t - 1] & valid[..., t])
+        restart = valid[..., t] & ~valid[..., t - 1]
+        state = torch.where(restart[..., None], target, state)
+        states.append(state)
+        actions.append(action)
+    return torch.stack(actions, time), torch.stack(states, time)
