@@ -198,6 +198,23 @@ def test_padding_changes_nothing_an_agent_sees() -> None:
     assert torch.equal(a[keys.POINTS_MASK].sum(-1), b[keys.POINTS_MASK].sum(-1))
 
 
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_padded_interactive_agents_neither_act_nor_matter(dynamics: Any) -> None:
+    two, three = scene(crossing(6), [0, 1]), scene(straight_road(4), [0, 1, 2])
+    alone = DrivingEnv(collate([two]), dynamics, ALL)
+    padded = DrivingEnv(collate([two, three]), dynamics, ALL)
+    plan = actions(padded, (1, 20))
+    a = run(alone, alone.start(torch.tensor([0])), plan[:, :, :2])
+    start = padded.start(torch.tensor([0]))
+    b = run(padded, start, plan)
+    assert b[keys.VALID][0, 0].tolist() == [True, True, False]
+    for key in (keys.STATE, keys.OWN, keys.COLLISION, keys.OFFROAD, keys.REWARD):
+        assert torch.equal(a[key], b[key][:, :, :2])
+    torch.testing.assert_close(a[keys.OBJECTS].sum(-2), b[keys.OBJECTS][:, :, :2].sum(-2))
+    assert (b[keys.STATE][:, :, 2] == start[keys.STATE][:, None, 2]).all()
+    assert not (b[keys.COLLISION] | b[keys.OFFROAD])[:, :, 2].any()
+
+
 def test_nearest_elements_are_the_ones_seen() -> None:
     env = make_env(crossing(9), config=ObservationConfig(num_objects=3, num_points=40))
     td, scenes = env.start(torch.tensor([0])), env.scenes

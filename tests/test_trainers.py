@@ -105,7 +105,9 @@ def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
     out = train(
         config(store, tmp_path / "long", steps=60, states=128, learning_rate=3e-3, checkpoint_every=60)
     )
-    losses = [r["loss_bc"] for r in read_metrics(out)]
+    losses, rates = ([r[name] for r in read_metrics(out)] for name in ("loss_bc", "learning_rate"))
+    assert rates[0] == 3e-3
+    assert rates[-1] == pytest.approx(3e-4, rel=0.05)
     assert losses[0] == pytest.approx(math.log(147), rel=0.1)
     assert sum(losses[-5:]) < 0.85 * sum(losses[:5])
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import one_hot
+from torch.nn.functional import one_hot, pad
 
 from symphony.data.segment import AgentType, SignalState
 from symphony.envs.scene import PointType, SceneBatch
@@ -103,11 +103,12 @@ def objects_at(
         heading, speed = state[..., 2], state[..., 3:]
         forward = torch.stack([heading.cos(), heading.sin()], -1)
         simulated = torch.cat([state[..., :3], speed * forward], -1)
-        # Padded agents write their own row's logged value back, so that no mask is needed after the scatter.
-        wide = index[..., None].expand(*index.shape, 5)
-        simulated = torch.where(index_valid[..., None], simulated, logged.gather(1, wide))
-        logged = logged.scatter(1, wide, simulated)
-        valid = valid.scatter(1, index, index_valid | valid.gather(1, index))
+        # Padded agents are written to a column past the last one, which is cut off again.
+        agents = logged.shape[1]
+        column = torch.where(index_valid, index, agents)
+        wide = column[..., None].expand(*column.shape, 5)
+        logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
+        valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
     return Objects(logged, valid, scenes.box_size[scene], scenes.agent_type[scene])
 
 
@@ -228,8 +229,8 @@ def _nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
     available = min(count, squared.shape[-1])
     values, index = squared.topk(available, dim=-1, largest=False, sorted=False)
     if available < count:
-        values = torch.nn.functional.pad(values, (0, count - available), value=torch.inf)
-        index = torch.nn.functional.pad(index, (0, count - available))
+        values = pad(values, (0, count - available), value=torch.inf)
+        index = pad(index, (0, count - available))
     return values, index
 
 

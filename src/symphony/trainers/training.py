@@ -75,7 +75,7 @@ def train(config: BCConfig) -> Path:
                     values = {name: losses[name].item() for name in ("loss_bc", "accuracy", "entropy")}
                     speed = (step - first) / (time.perf_counter() - began)
                     values |= {"gradient_norm": norm.item(), "updates_per_second": speed}
-                    tracker.log(step, values | {"learning_rate": _learning_rate(config, step - 1)})
+                    tracker.log(step, values | {"learning_rate": optimizer.param_groups[0]["lr"]})
                     progress.update(task, loss=values["loss_bc"])
                 progress.update(task, completed=step)
                 if step % config.checkpoint_every == 0 or step == config.steps:
