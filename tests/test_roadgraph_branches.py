@@ -131,7 +131,7 @@ def test_batch_equals_one_at_a_time():
     for i in np.ndindex(3, 4):
         np.testing.assert_array_equal(together[i], visited_regions(graph, position[i], heading[i], valid[i]))
     curvature = visited_curvatures(graph, position, heading, valid)
-    assert sorted(curvature) == sorted(np.broadcast_to(graph.region_curvature, together.shape)[together])
+    assert sorted(curvature) == sorted(np.broadcast_to(graph.regions.curvature, together.shape)[together])
 
 
 def test_rigid_motion_changes_nothing():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import crossing, hide, random_segment, segments, straight_road
-from symphony.data.segment import Polylines, RunSegment, content_hash, recenter, validate
+from symphony.data.segment import Polylines, RunSegment, content_hash, validate
 from symphony.errors import DataError
 
 ARRAYS = [
@@ -245,28 +245,6 @@ def test_any_map_number_changes_the_hash(name: str) -> None:
     segment = full()
     changed = change_road(segment, **{name: getattr(segment.road, name) + 1})
     assert content_hash(changed) != content_hash(segment)
-
-
-# --- re-centring -------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=30, deadline=None)
-@given(segments())
-def test_recentring_moves_everything_alike_and_is_done_once(segment: RunSegment) -> None:
-    moved = validate(recenter(segment))
-    shift = moved.origin - segment.origin
-    np.testing.assert_allclose(shift, np.round(shift), atol=1e-6)
-    for name in ("lanes", "boundary", "marks"):
-        before, after = getattr(segment.road, name), getattr(moved.road, name)
-        np.testing.assert_allclose(after.points + shift, before.points, atol=1e-3)
-        assert np.array_equal(before.offsets, after.offsets)
-    valid = segment.valid
-    np.testing.assert_allclose((moved.position + shift)[valid], segment.position[valid], atol=1e-3)
-    assert not moved.position[~valid].any()
-    np.testing.assert_allclose(moved.signal_point + shift, segment.signal_point, atol=1e-3)
-    first = segment.valid[segment.ego].argmax()
-    assert np.abs(moved.position[segment.ego, first]).max() <= 0.5
-    assert content_hash(recenter(moved)) == content_hash(moved)
 
 
 # --- the scenes other tests use ----------------------------------------------------------------------------

@@ -14,7 +14,6 @@ STEP: Key = "step"
 STREAM: Key = "stream"
 """[..., 1] int64: identity of the rollout, from which all its random numbers derive."""
 
-AGENTS = "agents"
 VALID: Key = ("agents", "valid")
 """[..., N] bool: False for padding."""
 STATE: Key = ("agents", "state")

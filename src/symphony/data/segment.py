@@ -202,31 +202,6 @@ class RunSegment:
         return dataclasses.replace(self, **changes)
 
 
-def recenter(segment: RunSegment) -> RunSegment:
-    """Subtract the ego's first valid position (rounded to metres), so that float32 is enough.
-
-    Meant for readers whose coordinates are already small relative to their own origin; large (UTM-like)
-    coordinates must be re-centred in float64 before they become float32.
-    """
-    steps = np.flatnonzero(segment.valid[segment.ego])
-    if len(steps) == 0:
-        return segment
-    shift = np.round(segment.position[segment.ego, steps[0]]).astype(np.float32)
-    road = segment.road
-
-    def move(lines: Polylines) -> Polylines:
-        return Polylines(lines.points - shift, lines.offsets)
-
-    return segment.replace(
-        position=np.where(segment.valid[..., None], segment.position - shift, 0).astype(np.float32),
-        road=dataclasses.replace(
-            road, lanes=move(road.lanes), boundary=move(road.boundary), marks=move(road.marks)
-        ),
-        signal_point=segment.signal_point - shift,
-        origin=segment.origin + shift.astype(np.float64),
-    )
-
-
 def content_hash(segment: RunSegment) -> str:
     """SHA-256 over every field, array dtypes and shapes included; equal content gives equal hashes."""
     digest = hashlib.sha256()

@@ -136,11 +136,6 @@ class LaneGraph:
         """Indices of the usable lanes."""
         return np.flatnonzero(self.usable)
 
-    @property
-    def region_curvature(self) -> Reals:
-        """[R] average signed curvature of the branching regions, 1/m."""
-        return self.regions.curvature
-
     @cached_property
     def index(self) -> LineIndex:
         """Spatial index over the usable lanes (line k is lane ``usable_lanes[k]``)."""

@@ -20,7 +20,7 @@ from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.errors import DataError
 from symphony.metrics import RolloutMetrics, collisions, offroad
-from symphony.roadgraph import LaneGraph, visited_regions
+from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.streams import fold_in, uniform
 from symphony.trainers.agents import Agent, load_agent
 from symphony.trainers.dataset import SceneDataset
@@ -187,5 +187,4 @@ def _curvatures(graph: LaneGraph, state: Tensor, counted: Tensor) -> NDArray[np.
     """
     valid = torch.cat([counted[..., :1, :], counted], -2)
     path = state.transpose(-2, -3).numpy()
-    visited = visited_regions(graph, path[..., :2], path[..., 2], valid.transpose(-1, -2).numpy())
-    return np.broadcast_to(graph.region_curvature, visited.shape)[visited]
+    return visited_curvatures(graph, path[..., :2], path[..., 2], valid.transpose(-1, -2).numpy())
