@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -248,6 +250,30 @@ def test_info_as_json_and_as_text_agree(store: Path, capsys: pytest.CaptureFixtu
     assert rows["segments"].startswith("2 (2 from made)")
     assert rows["agents"].strip() == str(found["agents"])
     assert rows["checksum"].startswith(found["checksum"][:16])
+
+
+def test_info_says_who_is_interactive(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def found(*arguments: str) -> dict[str, Any]:
+        assert main(["data", "info", str(store), "--json", *arguments]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    counts = found()["interactive"]
+    assert counts["count"] == 2
+    assert sum(counts["contexts"].values()) == 2
+    assert "segments" not in counts
+    listed = found("--segments")["interactive"]
+    assert listed.pop("segments").keys() == set(SegmentStore(store).ids)
+    assert listed == counts
+    assert found("--interactive", "99")["interactive"] == {"count": 99, "contexts": {}, "too_few": 2}
+    assert "interactive" not in found("--interactive", "0")
+    assert main(["data", "info", str(store)]) == 0
+    text = capsys.readouterr().out
+    for context, count in counts["contexts"].items():
+        assert re.search(rf"partner: {context} +{count}\b", text)
+    assert main(["data", "info", str(store), "--segments"]) == 2
+    assert "--json" in capsys.readouterr().err
+    assert main(["data", "info", str(store), "--interactive", "-1"]) == 2
+    assert "negative" in capsys.readouterr().err
 
 
 def test_info_of_an_empty_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

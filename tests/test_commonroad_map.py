@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from helpers_sources import ROAD, bound, driver, lanelet, signed_area
 from helpers_sources import convert_xml as convert
 from symphony.data.segment import LaneType, MarkType, SignalState
-from symphony.data.sources.commonroad_map import SLIT, drivable_rings
+from symphony.data.sources.lines import SLIT, drivable_rings
 
 
 @pytest.fixture

@@ -151,7 +151,7 @@ def test_keys_are_free():
         3,
         [group],
         actions=4,
-        own_key="own",
+        own_keys=("own",),
         valid_key="ok",
         logits_key="l",
         action_key="a",

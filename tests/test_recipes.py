@@ -25,7 +25,27 @@ TINY = [
     "--agent.num-points",
     "10",
 ]
-ARGUMENTS = {"bc.py": [*TINY, "--wandb", "disabled", "--rollouts", "2"]}
+COMMON = [*TINY, "--wandb", "disabled", "--rollouts", "2"]
+SEARCH = [
+    "--search.branches",
+    "2",
+    "--search.test-branches",
+    "2",
+    "--search.updates",
+    "2",
+    "--checkpoint-every",
+    "2",
+    "--search.states",
+    "8",
+    "--discriminator.states",
+    "8",
+]
+ARGUMENTS = {
+    "bc.py": COMMON,
+    "bc_h.py": COMMON,
+    "bc_ts.py": [*COMMON, *SEARCH],
+    "bc_ts_h.py": [*COMMON, *SEARCH],
+}
 
 
 @pytest.mark.parametrize("recipe", sorted(path.name for path in RECIPES.glob("*.py")))

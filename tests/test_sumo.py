@@ -95,8 +95,11 @@ def test_ego_and_partner_move_and_are_seen_throughout(segments: list[RunSegment]
         pair = interactive_agents(segment, 2)
         assert segment.valid[pair].all()
         assert (travel(segment)[pair] > MOVING).all()
-        first = segment.position[pair, 0, :2]
-        assert np.linalg.norm(first[0] - first[1]) < 45
+        # The partner may come from farther away, to merge or cross; that somebody is near is the generator's part.
+        first = segment.position[:, 0, :2]
+        away = np.linalg.norm(first - first[segment.ego], axis=-1)
+        away[segment.ego] = np.inf
+        assert away[segment.valid.all(1) & (travel(segment) > MOVING)].min() < 45
 
 
 def test_vehicles_are_on_the_road(segments: list[RunSegment]) -> None:

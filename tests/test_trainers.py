@@ -13,7 +13,7 @@ import torch
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.cli import main
-from symphony.config import AgentConfig, BCConfig, EvaluateConfig, from_dict, to_json
+from symphony.config import AgentConfig, EvaluateConfig, SearchConfig, TrainConfig, from_dict, to_json
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
@@ -36,8 +36,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def config(store: Path, out: Path, **changes: object) -> BCConfig:
-    base = BCConfig(
+def config(store: Path, out: Path, **changes: object) -> TrainConfig:
+    base = TrainConfig(
+        "bc",
         data=store,
         out=out,
         steps=6,
@@ -67,7 +68,7 @@ def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_leaves_its_config_metrics_and_last_checkpoints(run: Path, store: Path) -> None:
-    saved = from_dict(BCConfig, json.loads((run / "config.json").read_text()))
+    saved = from_dict(TrainConfig, json.loads((run / "config.json").read_text()))
     assert saved == config(store, run)
     assert [r["step"] for r in read_metrics(run)] == [1, 2, 3, 4, 5, 6]
     assert [int(p.name[-12:]) for p in checkpoints(run / "checkpoints")] == [2, 4, 6]
@@ -196,7 +197,7 @@ def test_expert_batches_show_what_the_environment_shows(
 ) -> None:
     dataset = SceneDataset(SegmentStore(store), 2, dynamics)
     rng = torch.Generator().manual_seed(0)
-    batch = dataset.sample_states(2, 50, ObservationConfig(num_objects=4, num_points=20), rng)
+    batch = dataset.sample_states([0, 1], 50, ObservationConfig(num_objects=4, num_points=20), rng)
     assert batch.shape == (50,)
     assert batch[keys.POINTS].shape == (50, 1, 20, 22)
     assert batch[keys.VALID].all()
@@ -249,10 +250,10 @@ def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
 def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> None:
     saved = json.loads(to_json(config(store, tmp_path)))
     with pytest.raises(ConfigError, match="did you mean 'learning_rate'"):
-        from_dict(BCConfig, {**saved, "learning_rat": 1})
+        from_dict(TrainConfig, {**saved, "learning_rat": 1})
     with pytest.raises(ConfigError, match="unknown format"):
-        from_dict(BCConfig, {**saved, "format": 99})
+        from_dict(TrainConfig, {**saved, "format": 99})
     with pytest.raises(ConfigError, match="missing"):
-        from_dict(BCConfig, {"out": "x"})
+        from_dict(TrainConfig, {"out": "x", "method": "bc"})
     with pytest.raises(ConfigError, match="steps must be positive"):
         replace(config(store, tmp_path), steps=0)

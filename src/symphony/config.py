@@ -12,9 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from tyro.conf import Positional
+
 from symphony.errors import ConfigError
 
-FORMAT = 1
+FORMAT = 2
 """Version of a saved configuration."""
 
 
@@ -24,9 +26,13 @@ def _positive(config: Any, *names: str) -> None:
             raise ConfigError(f"{name.replace('_', '-')} must be positive, is {getattr(config, name)}")
 
 
+Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h"]
+"""Rows of the paper's tables: behavioural cloning, with goals (H: hierarchy), with tree search (TS), with both."""
+
+
 @dataclass(frozen=True)
 class AgentConfig:
-    """What an agent sees and how large its network is; saved with its weights."""
+    """What an agent sees and how large its networks are; saved with its weights."""
 
     interactive: int = 2
     """Interactive agents per run segment (the paper uses 2 and 8)."""
@@ -44,9 +50,76 @@ class AgentConfig:
 
 
 @dataclass(frozen=True)
-class BCConfig:
-    """Train an agent by behavioural cloning."""
+class DiscriminatorConfig:
+    """The network that judges realism, and how it learns."""
 
+    features: Literal["clearance", "paper"] = "clearance"
+    """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge."""
+    radius: float = 20.0
+    """Metres around an agent that it sees."""
+    hidden: int = 32
+    """Width of its encoders."""
+    head: int = 64
+    """Width of its head."""
+    states: int = 256
+    """States of either kind (simulated, logged) per update, each with all its interactive agents."""
+    learning_rate: float = 1e-3
+    """Of its Adam."""
+    gradient_penalty: float = 0.0
+    """Weight of the squared gradient at logged states (0: none)."""
+    instance_noise: float = 0.0
+    """Standard deviation of noise on what it sees in training (0: none)."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "radius", "hidden", "head", "states", "learning_rate")
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """The beam search and what is learned from it (methods with TS)."""
+
+    branches: int = 4
+    """Branches per run segment in training (S)."""
+    test_branches: int = 16
+    """Branches per run segment in evaluation."""
+    prune_every: int = 10
+    """Steps between prunings (T_p)."""
+    keep: float = 0.5
+    """Share of the branches that survives a pruning."""
+    segments: int = 16
+    """Run segments searched at a time."""
+    updates: int = 10
+    """Updates made from the results of one search before the next."""
+    states: int = 256
+    """States of surviving rollouts per update, each with all its interactive agents."""
+    weight: float = 1.0
+    """Of the surviving rollouts beside the expert data in the policy's loss."""
+    survivors: Literal["all", "best"] = "all"
+    """Learn from every surviving branch or only from the best of each tree."""
+
+    def __post_init__(self) -> None:
+        _positive(
+            self,
+            "branches",
+            "test_branches",
+            "prune_every",
+            "keep",
+            "segments",
+            "updates",
+            "states",
+        )
+        if self.keep > 1:
+            raise ConfigError(f"keep must not exceed 1, is {self.keep}")
+        if self.weight < 0:
+            raise ConfigError(f"weight must not be negative, is {self.weight}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Train agents."""
+
+    method: Positional[Method]
+    """What to train: behavioural cloning, with goals (h), with tree search (ts), with both."""
     data: Path
     """Store of run segments to learn from (see `symphony data convert`)."""
     out: Path
@@ -61,10 +134,18 @@ class BCConfig:
     """Run segments per update."""
     states: int = 1024
     """Expert states per update, drawn from those segments."""
+    goals: int = 256
+    """Expert routes per update of the goal policy (methods with H)."""
     learning_rate: float = 1e-3
     """Of Adam, falling to a tenth along a cosine."""
     clip: float = 1.0
     """Largest norm of the gradient."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """The beam search (methods with TS)."""
+    discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
+    """The discriminator (methods with TS)."""
+    warm_start: Path | None = None
+    """Folder of a run whose networks training starts from; new ones where that run has none."""
     checkpoint_every: int = 1000
     """Updates between checkpoints."""
     log_every: int = 20
@@ -77,9 +158,23 @@ class BCConfig:
     """`cpu`, `cuda` or `cuda:N`."""
 
     def __post_init__(self) -> None:
-        _positive(
-            self, "steps", "segments", "states", "learning_rate", "clip", "checkpoint_every", "log_every"
-        )
+        _positive(self, "steps", "segments", "states", "goals", "learning_rate", "clip")
+        _positive(self, "checkpoint_every", "log_every")
+        if self.searches and self.checkpoint_every % self.search.updates:
+            raise ConfigError(
+                f"checkpoint-every ({self.checkpoint_every}) must be a multiple of search.updates "
+                f"({self.search.updates}), so that a resumed run repeats no search"
+            )
+
+    @property
+    def hierarchical(self) -> bool:
+        """Whether agents follow goals."""
+        return self.method in ("bc_h", "bc_ts_h")
+
+    @property
+    def searches(self) -> bool:
+        """Whether rollouts are refined by the search."""
+        return self.method in ("bc_ts", "bc_ts_h")
 
 
 @dataclass(frozen=True)
@@ -87,7 +182,16 @@ class EvaluateConfig:
     """How agents are judged."""
 
     rollouts: int = 16
-    """Simulations per run segment."""
+    """Simulations per run segment that are judged."""
+    search: Literal["agent", "none", "tree", "oracle", "best"] = "agent"
+    """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `oracle`: by the true collision
+    and off-road flags; `best`: independent rollouts, of which the one with the best score is judged."""
+    trees: int = 1
+    """Search trees per run segment, each with goals of its own; each gives its share of the rollouts."""
+    branches: int = 0
+    """Branches of each tree; 0: as many as it gives rollouts, or more where the agent was trained so."""
+    logged_goals: bool = False
+    """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
     """Of everything drawn at random in them."""
     interactive: int = 0
@@ -98,7 +202,9 @@ class EvaluateConfig:
     """`cpu`, `cuda` or `cuda:N`."""
 
     def __post_init__(self) -> None:
-        _positive(self, "rollouts", "batch")
+        _positive(self, "rollouts", "batch", "trees")
+        if self.rollouts % self.trees:
+            raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
         if self.interactive < 0:
             raise ConfigError(f"interactive must not be negative, is {self.interactive}")
 
@@ -133,13 +239,14 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, file: Path | None = No
             close = difflib.get_close_matches(name, fields, 1)
             hint = f", did you mean '{close[0]}'?" if close else ""
             raise ConfigError(f"{where}unknown setting '{name}'{hint}")
-    nested = {"agent": AgentConfig}
+    nested = {"agent": AgentConfig, "search": SearchConfig, "discriminator": DiscriminatorConfig}
     built = {}
     for name, value in values.items():
-        if name in nested:
+        if name in nested and isinstance(value, dict):
             built[name] = from_dict(nested[name], value, file=file)
         else:
-            built[name] = Path(value) if fields[name].type == "Path" else value
+            is_path = "Path" in str(fields[name].type) and value is not None
+            built[name] = Path(value) if is_path else value
     try:
         return kind(**built)
     except TypeError as error:

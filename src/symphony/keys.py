@@ -18,6 +18,8 @@ VALID: Key = ("agents", "valid")
 """[..., N] bool: False for padding."""
 STATE: Key = ("agents", "state")
 """[..., N, 4] float: x, y, heading, speed."""
+GOAL: Key = ("agents", "goal")
+"""[..., N] int64: the route the agent follows, a row of its scene's table; -1 for none."""
 ACTION: Key = ("agents", "action")
 """[..., N] int64 (bicycle) or [..., N, 2] float (displacement)."""
 REWARD: Key = ("agents", "reward")
@@ -28,6 +30,14 @@ OFFROAD: Key = ("agents", "offroad")
 NOISE: Key = ("agents", "noise")
 """[..., N] float in (0, 1): the random number that decides an action."""
 LOGITS: Key = ("agents", "logits")
+SCORE: Key = ("agents", "score")
+"""[..., N] float: the discriminator's logit; high where a state looks simulated."""
+SIMULATED: Key = ("agents", "simulated")
+"""[..., N] bool: the state comes from a simulation, not from the log."""
+ROLLOUT: Key = ("agents", "rollout")
+"""[..., N] bool: the action comes from a rollout that survived the search, not from the log."""
+RANK: Key = ("agents", "rank")
+"""[..., N] int64: place of the rollout among those of its tree, 0 for the best."""
 
 OWN: Key = ("agents", "observation", "own")
 """[..., N, Fs] float."""
@@ -37,3 +47,17 @@ OBJECTS_MASK: Key = ("agents", "observation", "objects_mask")
 POINTS: Key = ("agents", "observation", "points")
 """[..., N, P, Fp] float."""
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
+ROUTE: Key = ("agents", "observation", "route")
+"""[..., N, Fr] float: the agent's route as it sees it."""
+GAP: Key = ("agents", "observation", "gap")
+"""[..., N, O] float: signed gap to the box of each object, metres."""
+ROAD: Key = ("agents", "observation", "road")
+"""[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
+
+ROUTES: Key = ("agents", "routes")
+"""[..., N, G, Fg] float: every feasible route, as the goal policy sees it."""
+ROUTES_MASK: Key = ("agents", "routes_mask")
+GOAL_LOGITS: Key = ("agents", "goal_logits")
+"""[..., N, G] float."""
+GOAL_NOISE: Key = ("agents", "goal_noise")
+"""[..., N] float in (0, 1): the random number that decides a goal."""

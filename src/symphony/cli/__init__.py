@@ -28,7 +28,7 @@ SYMPHONY_DEBUG=1 in the environment, errors come with their traceback."""
 # Every command is a dataclass: its fields are the arguments, `run` does the work and raises what goes wrong.
 app = tyro.extras.SubcommandApp()
 app.command(data.app, name="data", help=data.__doc__)
-app.command(train.app, name="train", help=train.__doc__)
+app.command(name="train")(train.Train)
 app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="demo")(demo.Demo)
 

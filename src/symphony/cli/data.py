@@ -22,7 +22,7 @@ class Convert:
     A record that can't be used is skipped, counted and reported. A new store appears once it is complete.
     """
 
-    format: tyro.conf.Positional[Literal["womd", "commonroad"]]
+    format: tyro.conf.Positional[Literal["womd", "commonroad", "argoverse2"]]
     """Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML)."""
     files: Annotated[
         tyro.conf.Positional[tuple[Path, ...]],
@@ -94,12 +94,29 @@ class Info:
     """Folder of the store."""
     json: bool = False
     """Print everything as JSON, the skipped records included."""
+    interactive: int = 2
+    """Choose that many interactive agents in each segment and count why the ego's partner was chosen; 0 for not
+    doing so."""
+    segments: bool = False
+    """In the JSON, say for each segment which agents were chosen, and why."""
+
+    def __post_init__(self) -> None:
+        if self.interactive < 0:
+            raise ConfigError(f"--interactive must not be negative, is {self.interactive}")
+        if self.segments and not (self.json and self.interactive):
+            raise ConfigError("--segments goes with --json and interactive agents")
 
     def run(self) -> None:
         """Print it."""
         from symphony.data.convert import info
+        from symphony.data.selection import choices
+        from symphony.data.store import SegmentStore
 
         found = info(self.store)
+        if self.interactive:
+            found["interactive"] = choices(SegmentStore(self.store), self.interactive)
+            if not self.segments:
+                del found["interactive"]["segments"]
         if self.json:
             _write(jsonlib.dumps(found, indent=2))
         else:
@@ -124,7 +141,7 @@ class Plot:
 
     def run(self) -> None:
         """Draw it."""
-        from symphony.data.selection import interactive_agents
+        from symphony.data.selection import interactive_choice
         from symphony.data.store import SegmentStore
         from symphony.render import plot_segment
 
@@ -136,8 +153,10 @@ class Plot:
             raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
         if self.interactive < 1:
             raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
-        chosen = interactive_agents(segment, self.interactive)
-        plot_segment(segment, self.out, step=self.step, interactive=chosen.tolist())
+        choice = interactive_choice(segment, self.interactive)
+        title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
+        chosen = choice.agents.tolist()
+        plot_segment(segment, self.out, step=self.step, interactive=chosen, title=title)
 
 
 def _write(text: str) -> None:
@@ -184,6 +203,7 @@ def _print_info(found: dict[str, Any]) -> None:
         ("maps", f"{found['maps']}"),
         ("lanes per segment", span("lanes")),
         ("map points per segment", span("map_points")),
+        *_interactive_rows(found.get("interactive")),
         ("size on disk", f"{found['bytes'] / 2**20:.1f} MiB"),
         ("checksum", f"{found['checksum'][:16]}… (in full with --json)"),
         ("skipped", f"{found['skipped']}"),
@@ -196,3 +216,11 @@ def _print_info(found: dict[str, Any]) -> None:
     for name, value in rows:
         table.add_row(escape(name), escape(value))
     Console().print(table)
+
+
+def _interactive_rows(found: dict[str, Any] | None) -> list[tuple[str, str]]:
+    if found is None:
+        return []
+    rows = [(f"  partner: {context}", str(count)) for context, count in found["contexts"].items()]
+    too_few = [("  too few vehicles", str(found["too_few"]))] if found["too_few"] else []
+    return [("interactive agents", str(found["count"])), *rows, *too_few]

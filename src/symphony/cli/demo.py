@@ -8,7 +8,7 @@ from pathlib import Path
 
 from symphony.cli.evaluate import evaluate_with_bar
 from symphony.cli.tables import print_metrics, write_json
-from symphony.config import AgentConfig, BCConfig, EvaluateConfig
+from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,9 @@ class Demo:
         # Half the states and fewer points than by default: more, cheaper updates suit so few segments.
         small = AgentConfig(num_points=128)
         train(
-            BCConfig(learn, run, steps=self.steps, seed=self.seed, agent=small, states=512, wandb="disabled")
+            TrainConfig(
+                "bc", learn, run, steps=self.steps, seed=self.seed, agent=small, states=512, wandb="disabled"
+            )
         )
         console.print(f"Simulating {judge}, which it has not seen")
         config = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)

@@ -28,6 +28,7 @@ def draw_rollouts(
         seed: of the rollouts.
         panels: how many segments.
     """
+    from symphony.config import EvaluateConfig
     from symphony.data.store import SegmentStore
     from symphony.render import plot_grid, plot_rollout
     from symphony.trainers.dataset import SceneDataset
@@ -36,11 +37,12 @@ def draw_rollouts(
     store = SegmentStore(data)
     panels = min(panels, len(store))
     chosen = [i * len(store) // panels for i in range(panels)]
-    dataset = SceneDataset(store, interactive, agent.dynamics)
+    dataset = SceneDataset(store, interactive, agent.dynamics, routes=agent.goals is not None)
+    config = EvaluateConfig(rollouts=SHOWN, seed=seed)
 
     def panel(i: int) -> Callable[[Any], Any]:
         segment, scene = dataset.segment(i), dataset.scene(i)
-        runs: Rollouts = playback(scene) if agent.policy is None else simulated(agent, scene, SHOWN, seed)
+        runs: Rollouts = playback(scene) if agent.policy is None else simulated(agent, scene, config)
         state = runs.state[0].transpose(1, 2)
         flags = {
             name: getattr(runs, name)[0].transpose(1, 2).numpy()

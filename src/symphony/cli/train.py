@@ -7,20 +7,17 @@ from typing import Annotated
 
 import tyro
 
-from symphony.config import BCConfig
-
-app = tyro.extras.SubcommandApp()
+from symphony.config import TrainConfig
 
 
-@app.command(name="bc")
 @dataclass(frozen=True)
-class BC:
-    """Train an agent by behavioural cloning."""
+class Train:
+    """Learn agents from a store of run segments."""
 
-    config: Annotated[BCConfig, tyro.conf.arg(name="")]
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
     def run(self) -> None:
-        """Train it."""
+        """Train them."""
         from rich.console import Console
 
         from symphony.trainers import train

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.context import Context, relations
 from symphony.data.segment import AgentType, Polylines, RunSegment
 from symphony.errors import DataError
 
@@ -27,21 +33,33 @@ def travel(segment: RunSegment) -> NDArray[np.float32]:
     return np.where(segment.valid, away, 0).max(1)
 
 
-def interactive_agents(segment: RunSegment, count: int, *, moving: float = MOVING) -> NDArray[np.int64]:
+@dataclass(frozen=True)
+class InteractiveChoice:
+    """The agents that are simulated, and why.
+
+    Attributes:
+        agents: [count] agent indices: the ego, its partner, the rest.
+        context: what made the second the ego's partner; None if the ego is alone.
+    """
+
+    agents: NDArray[np.int64]
+    context: Context | None
+
+
+def interactive_choice(segment: RunSegment, count: int, *, moving: float = MOVING) -> InteractiveChoice:
     """Pick the agents that are simulated.
 
-    First the ego. Then one partner: the nearest of the agents the source marks as interacting, else of those
-    it marks for prediction that move, else of all that move. Then the nearest that move. All are vehicles
-    seen at the first step; "nearest" is to the ego at that step, and agents seen until the last step (which
-    the log can judge throughout) go before the others.
+    First the ego. Then one partner, chosen by context: the nearest of the agents the source marks as interacting,
+    else of those it marks for prediction that move, else the one the ego merges with, crosses, follows or leads
+    (:mod:`symphony.data.context`; the one with the smallest time gap, then the nearest), else the nearest that
+    moves. Then the nearest that move. All are vehicles seen at the first step; "nearest" is to the ego at that
+    step, and agents seen at every step (which the log can judge throughout) go before the others, whatever
+    their context.
 
     Args:
         segment: the segment.
         count: how many, N_I (2 or 8 in the paper).
         moving: metres of :func:`travel` past which an agent moves.
-
-    Returns:
-        [count] agent indices, the ego first.
 
     Raises:
         DataError: there are not as many.
@@ -50,25 +68,75 @@ def interactive_agents(segment: RunSegment, count: int, *, moving: float = MOVIN
         raise ValueError(f"count must be positive, is {count}")
     seen = segment.valid[:, 0] & (segment.agent_type == AgentType.VEHICLE)
     others = seen & (np.arange(segment.num_agents) != segment.ego)
-    moves = others & (travel(segment) > moving)
     order = _nearest_first(segment)
-
-    def marked(indices: NDArray[np.integer]) -> NDArray[np.bool_]:
-        return np.isin(np.arange(segment.num_agents), indices)
-
-    partners = (others & marked(segment.interest), moves & marked(segment.predict), moves)
-    chosen = [segment.ego] if segment.valid[segment.ego, 0] else []
-    for group in partners:
-        if chosen and group.any():
-            chosen.append(int(order[group[order]][0]))
-            break
-    rest = moves & ~marked(np.asarray(chosen))
-    chosen += order[rest[order]].tolist()
-    if len(chosen) < count or not segment.valid[segment.ego, 0]:
-        has = len(chosen) if segment.valid[segment.ego, 0] else "no ego"
+    others, moves = order[others[order]], order[(others & (travel(segment) > moving))[order]]
+    has_ego = bool(segment.valid[segment.ego, 0])
+    partner, context = None, None
+    if has_ego and count > 1:
+        partner, context = _partner(segment, others, moves)
+    chosen = [segment.ego] if partner is None else [segment.ego, partner]
+    chosen += [agent for agent in moves.tolist() if agent != partner]
+    if len(chosen) < count or not has_ego:
+        has = len(chosen) if has_ego else "no ego"
         message = f"needs {count} interactive agents at its first step, has {has}"
         raise DataError(message, file=segment.file or None, segment=segment.segment_id, field="agents")
-    return np.asarray(chosen[:count], np.int64)
+    return InteractiveChoice(np.asarray(chosen[:count], np.int64), context)
+
+
+def interactive_agents(segment: RunSegment, count: int, *, moving: float = MOVING) -> NDArray[np.int64]:
+    """[count] the agents of :func:`interactive_choice`, the ego first."""
+    return interactive_choice(segment, count, moving=moving).agents
+
+
+def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
+    """The choices in many segments, as JSON can hold them.
+
+    Returns:
+        ``count``; ``contexts``: how many segments have a partner of each :class:`Context`; ``too_few``: how many
+        have fewer vehicles; ``segments``: by segment id the ``context`` and the ``agents`` (the source's ids).
+    """
+    found: dict[str, dict[str, Any]] = {}
+    too_few = 0
+    for segment in segments:
+        try:
+            choice = interactive_choice(segment, count)
+        except DataError:
+            too_few += 1
+            continue
+        agents = segment.agent_id[choice.agents].tolist()
+        found[segment.segment_id] = {"context": choice.context, "agents": agents}
+    counts = Counter(each["context"] for each in found.values())
+    contexts = {str(context): counts[context] for context in Context if counts[context]}
+    return {"count": count, "contexts": contexts, "too_few": too_few, "segments": found}
+
+
+def _partner(
+    segment: RunSegment, others: NDArray[np.int64], moves: NDArray[np.int64]
+) -> tuple[int | None, Context | None]:
+    """The ego's partner among others and those of them that move, both in the order of preference."""
+    for group, marks, context in (
+        (others, segment.interest, Context.INTEREST),
+        (moves, segment.predict, Context.PREDICT),
+    ):
+        marked = group[np.isin(group, marks)]
+        if len(marked):
+            return int(marked[0]), context
+    if len(moves) == 0:
+        return None, None
+    throughout = segment.valid[moves].all(1)
+    pool = moves[throughout] if throughout.any() else moves
+    found = relations(segment, pool)
+    for gaps, contexts in (
+        ((found.merge,), (Context.MERGE,)),
+        ((found.crossing,), (Context.CROSSING,)),
+        ((found.leader, found.follower), (Context.LEADER, Context.FOLLOWER)),
+    ):
+        gap = np.min(gaps, axis=0)
+        # The first of the smallest gaps, so the nearest of them.
+        best = int(gap.argmin())
+        if np.isfinite(gap[best]):
+            return int(pool[best]), contexts[int(np.argmin([each[best] for each in gaps]))]
+    return int(pool[0]), Context.NEAREST
 
 
 def _nearest_first(segment: RunSegment) -> NDArray[np.int64]:

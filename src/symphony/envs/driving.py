@@ -17,10 +17,12 @@ from symphony.envs.observation import (
     POINT_FEATURES,
     SELF_FEATURES,
     Objects,
+    Observation,
     ObservationConfig,
     objects_at,
     observe,
 )
+from symphony.envs.routes import ROUTE_FEATURES, pick_routes, route_ahead, route_choices
 from symphony.envs.scene import SceneBatch
 from symphony.streams import fold_in
 
@@ -29,7 +31,7 @@ class DrivingEnv(EnvBase):
     """A batch of logged scenes in which N agents are driven by actions (paper, section III).
 
     All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity
-    (``stream``) and the state of the interactive agents. The environment holds only constants, so forking a
+    (``stream``), the state of the interactive agents and the routes they follow. The environment holds only constants, so forking a
     branch is an index and one instance serves every batch shape. An episode ends (``truncated``) at the last
     logged step.
 
@@ -92,7 +94,15 @@ class DrivingEnv(EnvBase):
             },
             shape=(n,),
         )
-        agents = {"observation": seen, "valid": flags(n), "state": floats(n, 4)}
+        if config.route:
+            seen["route"] = floats(n, ROUTE_FEATURES)
+        if config.clearance:
+            seen["gap"], seen["road"] = floats(n, config.num_objects), floats(n, 5)
+
+        def goals() -> Unbounded:
+            return Unbounded(shape=(n,), dtype=torch.int64, device=device)
+
+        agents = {"observation": seen, "valid": flags(n), "state": floats(n, 4), "goal": goals()}
         outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
         progress = {"scene": numbers(), "step": numbers(), "stream": numbers()}
         self.observation_spec = Composite(
@@ -101,7 +111,7 @@ class DrivingEnv(EnvBase):
         self.state_spec = Composite(
             {
                 **{name: spec.clone() for name, spec in progress.items()},
-                "agents": Composite({"valid": flags(n), "state": floats(n, 4)}, shape=(n,)),
+                "agents": Composite({"valid": flags(n), "state": floats(n, 4), "goal": goals()}, shape=(n,)),
             }
         )
         if self.dynamics.discrete:
@@ -134,9 +144,38 @@ class DrivingEnv(EnvBase):
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)
+        valid = self._valid(scene)
+        goal = torch.full_like(valid, -1, dtype=torch.int64)
         return self._from_state(
-            scene, torch.zeros_like(scene), stream, self._logged_state(scene), self._valid(scene)
+            scene, torch.zeros_like(scene), stream, self._logged_state(scene), valid, goal
         )
+
+    def at(self, state: TensorDictBase) -> TensorDict:
+        """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
+        return self._from_state(*self._read(state))
+
+    def choices(self, state: TensorDictBase) -> TensorDictBase:
+        """Add the feasible routes of a start state, as the goal policy sees them.
+
+        Writes ``ROUTES`` [..., N, G, F] and ``ROUTES_MASK`` [..., N, G] into a copy.
+        """
+        row = state.get(keys.SCENE).squeeze(-1)
+        position = state.get(keys.STATE)
+        features, mask = route_choices(
+            position.reshape(-1, *position.shape[-2:]),
+            self.scenes.route[row.flatten()],
+            self.scenes.route_count[row.flatten()],
+            self.observation.distance_scale,
+        )
+        out = state.copy()
+        out.set(keys.ROUTES, features.unflatten(0, row.shape))
+        return out.set(keys.ROUTES_MASK, mask.unflatten(0, row.shape))
+
+    def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
+        """A start state whose agents follow the given routes (by default those nearest to the log)."""
+        scene, step, stream, agents, valid, _ = self._read(state)
+        goal = self.scenes.route_logged[scene] if goal is None else goal
+        return self._from_state(scene, step, stream, agents, valid, goal)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
@@ -163,19 +202,20 @@ class DrivingEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scene, step, stream, state, valid = self._read(tensordict)
+        scene, step, stream, state, valid, goal = self._read(tensordict)
         index = self.scenes.interactive[scene]
         size = _rows(self.scenes.box_size, scene, index)
         after = self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
         after = torch.where(valid[..., None], after, state)
-        out = self._from_state(scene, step + 1, stream, after, valid)
+        out = self._from_state(scene, step + 1, stream, after, valid, goal)
         bad = out.get(keys.COLLISION) | out.get(keys.OFFROAD)
         out.set(keys.REWARD, -bad.to(after.dtype))
         return out
 
-    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
-        return scene, step, stream, tensordict.get(keys.STATE), tensordict.get(keys.VALID)
+        state, valid, goal = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL))
+        return scene, step, stream, state, valid, goal
 
     def _valid(self, scene: Tensor) -> Bool[Tensor, "*b N"]:
         return self.scenes.interactive_valid[scene]
@@ -187,7 +227,7 @@ class DrivingEnv(EnvBase):
         return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
 
     def _from_state(
-        self, scene: Tensor, step: Tensor, stream: Tensor, state: Tensor, valid: Tensor
+        self, scene: Tensor, step: Tensor, stream: Tensor, state: Tensor, valid: Tensor, goal: Tensor
     ) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
         shape = scene.shape
@@ -196,36 +236,35 @@ class DrivingEnv(EnvBase):
         index = self.scenes.interactive[row]
         objects = objects_at(self.scenes, row, at, moved, index, real)
         seen = observe(self.scenes, row, at, objects, index, self.observation)
-        collision, offroad = self._flags(row, objects, index, real)
+        collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
+        observation = {name: value for name, value in seen._asdict().items() if value is not None}
+        if self.observation.route:
+            follows = goal.reshape(-1, goal.shape[-1])
+            points, count = pick_routes(self.scenes.route, self.scenes.route_count, row, follows)
+            observation["route"] = route_ahead(moved, points, count, self.observation.distance_scale)
 
         def back(value: Tensor) -> Tensor:
             return value.reshape((*shape, *value.shape[1:]))
 
+        each = [*shape, self.num_agents]
+        agents = TensorDict(
+            {
+                "observation": TensorDict({k: back(v) for k, v in observation.items()}, batch_size=each),
+                "valid": valid,
+                "state": state,
+                "goal": goal,
+                "collision": back(collision)[..., None],
+                "offroad": back(offroad)[..., None],
+            },
+            batch_size=each,
+        )
         return TensorDict(
             {
                 "scene": scene[..., None],
                 "step": step[..., None],
                 "stream": stream[..., None],
-                "agents": TensorDict(
-                    {
-                        "observation": TensorDict(
-                            {
-                                "own": back(seen.own),
-                                "objects": back(seen.objects),
-                                "objects_mask": back(seen.objects_mask),
-                                "points": back(seen.points),
-                                "points_mask": back(seen.points_mask),
-                            },
-                            batch_size=[*shape, self.num_agents],
-                        ),
-                        "valid": valid,
-                        "state": state,
-                        "collision": back(collision)[..., None],
-                        "offroad": back(offroad)[..., None],
-                    },
-                    batch_size=[*shape, self.num_agents],
-                ),
+                "agents": agents,
                 "done": back(truncated)[..., None],
                 "truncated": back(truncated)[..., None],
                 "terminated": back(torch.zeros_like(truncated))[..., None],
@@ -236,10 +275,12 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()
     def _flags(
-        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor
+        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor, seen: Observation
     ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
-        position = _rows_of(objects.state, index)[..., :2]
         collision = collision_flags(objects, index) & valid
+        if seen.road is not None:
+            return collision, (seen.road[..., 0] > 0) & valid
+        position = _rows_of(objects.state, index)[..., :2]
         return collision, offroad_flags(self.scenes, scene, position) & valid
 
 

@@ -6,10 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.envs.observation import Objects
+from symphony.envs.observation import Objects, road_distance
 from symphony.envs.scene import SceneBatch
 from symphony.geometry.boxes import boxes_overlap
-from symphony.geometry.polylines import signed_distance
 
 
 def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
@@ -34,17 +33,3 @@ def offroad_flags(
 ) -> Bool[Tensor, "M N"]:
     """Whether each box centre lies off the drivable area (nowhere, in a scene without boundary)."""
     return road_distance(scenes, scene, position) > 0
-
-
-def road_distance(
-    scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M K 2"]
-) -> Float[Tensor, "M K"]:
-    """Signed distance in metres to the edge of the drivable area, positive off the road."""
-    return signed_distance(
-        position,
-        scenes.edge_start[scene],
-        scenes.edge_end[scene],
-        scenes.edge_valid[scene],
-        scenes.edge_previous[scene],
-        scenes.edge_following[scene],
-    )

@@ -15,7 +15,9 @@ from torch.nn.functional import one_hot, pad
 
 from symphony.data.segment import AgentType, SignalState
 from symphony.envs.scene import PointType, SceneBatch
+from symphony.geometry.boxes import box_corners, box_gap
 from symphony.geometry.frames import rotate, wrap
+from symphony.geometry.polylines import signed_distance
 
 SELF_FEATURES = 4
 OBJECT_FEATURES = 8 + len(AgentType)
@@ -33,6 +35,8 @@ class ObservationConfig:
         distance_scale: metres that become 1.
         speed_scale: m/s that become 1.
         size_scale: metres of a box side that become 1.
+        route: whether it sees the route that is its goal.
+        clearance: whether it sees how far its box is from others and from the edge of the road.
     """
 
     num_objects: int = 16
@@ -40,6 +44,8 @@ class ObservationConfig:
     distance_scale: float = 20.0
     speed_scale: float = 10.0
     size_scale: float = 5.0
+    route: bool = False
+    clearance: bool = False
 
 
 class Objects(NamedTuple):
@@ -67,6 +73,8 @@ class Observation(NamedTuple):
         objects_mask: [M, N, O].
         points: [M, N, P, 22].
         points_mask: [M, N, P].
+        gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked; None if not asked for.
+        road: [M, N, 5] metres of centre and corners off the road, negative on it; None if not asked for.
     """
 
     own: Tensor
@@ -74,6 +82,8 @@ class Observation(NamedTuple):
     objects_mask: Tensor
     points: Tensor
     points_mask: Tensor
+    gap: Tensor | None = None
+    road: Tensor | None = None
 
 
 def objects_at(
@@ -138,14 +148,19 @@ def observe(
         ],
         -1,
     )
-    seen, seen_mask = _see_objects(objects, index, origin, heading, config)
+    seen, seen_mask, gap = _see_objects(objects, index, own, own_size, config)
     points, points_mask = _see_points(scenes, scene, step, origin, heading, config)
-    return Observation(features, seen, seen_mask, points, points_mask)
+    road = None
+    if config.clearance:
+        corners = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
+        road = road_distance(scenes, scene, corners.flatten(1, 2)).unflatten(1, corners.shape[1:3])
+    return Observation(features, seen, seen_mask, points, points_mask, gap, road)
 
 
 def _see_objects(
-    objects: Objects, index: Tensor, origin: Tensor, heading: Tensor, config: ObservationConfig
-) -> tuple[Tensor, Tensor]:
+    objects: Objects, index: Tensor, own: Tensor, own_size: Tensor, config: ObservationConfig
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    origin, heading = own[..., :2], own[..., 2]
     agents = objects.state.shape[1]
     with torch.no_grad():
         squared = (objects.state[:, None, :, :2] - origin[:, :, None]).square().sum(-1)
@@ -170,7 +185,32 @@ def _see_objects(
         ],
         -1,
     )
-    return features * mask[..., None], mask
+    gap = None
+    if config.clearance:
+        between = box_gap(
+            origin[..., None, :],
+            heading[..., None],
+            own_size[..., None, :],
+            state[..., :2],
+            state[..., 2],
+            size,
+        )
+        gap = torch.where(mask, between, 0.0)
+    return features * mask[..., None], mask, gap
+
+
+def road_distance(
+    scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M K 2"]
+) -> Float[Tensor, "M K"]:
+    """Signed distance in metres to the edge of the drivable area, positive off the road."""
+    return signed_distance(
+        position,
+        scenes.edge_start[scene],
+        scenes.edge_end[scene],
+        scenes.edge_valid[scene],
+        scenes.edge_previous[scene],
+        scenes.edge_following[scene],
+    )
 
 
 def _see_points(

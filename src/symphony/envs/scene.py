@@ -19,8 +19,10 @@ from torch import Tensor
 
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
+from symphony.envs.routes import POINTS, RouteTable, route_table
 from symphony.errors import DataError
 from symphony.geometry.polylines import segments_of
+from symphony.roadgraph import LaneGraph
 from symphony.streams import stream_of
 
 SPACING = 2.0
@@ -74,6 +76,9 @@ class SceneBatch(TensorClass):
         edge_following: [B, E] int64.
         edge_valid: [B, E].
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
+        route: [B, N, G, K, 2] points of the feasible routes of the interactive agents; G = 0 where not asked for.
+        route_count: [B, N, G] int64 points that exist; 0 for padding.
+        route_logged: [B, N] int64 the route nearest to what the log shows, -1 for none.
     """
 
     log_state: Tensor
@@ -96,14 +101,20 @@ class SceneBatch(TensorClass):
     edge_following: Tensor
     edge_valid: Tensor
     stream: Tensor
+    route: Tensor
+    route_count: Tensor
+    route_logged: Tensor
 
 
-def scene(segment: RunSegment, interactive: int | Sequence[int] = 2) -> SceneBatch:
+def scene(
+    segment: RunSegment, interactive: int | Sequence[int] = 2, graph: LaneGraph | None = None
+) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
     Args:
         segment: a validated run segment.
         interactive: how many agents are interactive (chosen by the paper's rule), or their rows.
+        graph: of the segment's lanes; with it the scene holds the routes of its interactive agents.
 
     Raises:
         DataError: if the segment has fewer usable agents.
@@ -138,6 +149,7 @@ def scene(segment: RunSegment, interactive: int | Sequence[int] = 2) -> SceneBat
         "edge_valid": np.ones(len(start), bool),
         "stream": np.array(stream_of(segment.segment_id)),
         **_points(segment),
+        **_routes([] if graph is None else [route_table(segment, graph, int(a)) for a in chosen], len(chosen)),
     }
     return SceneBatch(
         **{name: torch.from_numpy(np.array(value))[None] for name, value in fields.items()}, batch_size=[1]
@@ -165,6 +177,16 @@ def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
 
 
 _INDEX_FIELDS = {"point_light", "edge_previous", "edge_following"}
+
+
+def _routes(tables: Sequence[RouteTable], agents: int) -> dict[str, NDArray[Any]]:
+    most = max((len(table.count) for table in tables), default=0)
+    points = np.zeros((agents, most, POINTS, 2), np.float32)
+    count = np.zeros((agents, most), np.int64)
+    for k, table in enumerate(tables):
+        points[k, : len(table.count)], count[k, : len(table.count)] = table.points, table.count
+    logged = np.array([table.logged for table in tables] or [-1] * agents, np.int64)
+    return {"route": points, "route_count": count, "route_logged": logged}
 
 
 def _edges(boundary: Polylines) -> tuple[NDArray[Any], ...]:

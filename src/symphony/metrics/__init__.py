@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from symphony.metrics.curvature import curvature_histogram, jensen_shannon
+from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.realism import collisions, displacement, offroad
 from symphony.metrics.summary import RolloutMetrics, SegmentResult
 
 __all__ = [
+    "CollisionKind",
+    "CollisionKinds",
     "RolloutMetrics",
     "SegmentResult",
+    "collision_kinds",
     "collisions",
     "curvature_histogram",
     "displacement",

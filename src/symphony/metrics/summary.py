@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.metrics.curvature import curvature_histogram, jensen_shannon
+from symphony.metrics.kinds import CollisionKind, CollisionKinds
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class SegmentResult:
         logged: agent-steps at which the log is valid, of one rollout.
         histogram: [201] curvatures of the branching regions visited by the rollouts.
         histogram_log: [201] likewise by the log.
+        kinds: [kinds, 2] rollouts by the :class:`CollisionKind` of their first collision, with an interactive agent
+            and with a playback agent; None where not asked for.
     """
 
     collided: int
@@ -42,6 +45,7 @@ class SegmentResult:
     logged: int
     histogram: NDArray[np.int64]
     histogram_log: NDArray[np.int64]
+    kinds: NDArray[np.int64] | None = None
 
 
 class RolloutMetrics:
@@ -64,6 +68,7 @@ class RolloutMetrics:
         logged: Bool[Tensor, "B N T"],
         curvature: Sequence[NDArray[Any]],
         curvature_log: Sequence[NDArray[Any]],
+        kinds: CollisionKinds | None = None,
     ) -> None:
         """Add the rollouts of some segments.
 
@@ -76,10 +81,11 @@ class RolloutMetrics:
             logged: where the log is valid; the rest does not count for ADE and minSADE.
             curvature: per segment, the average curvature of every branching region visited by each rollout.
             curvature_log: per segment, likewise by the log.
+            kinds: [B, K, N] of the collisions of simulated agents, for all segments or for none.
 
         Raises:
-            ValueError: for a segment that was added before, shapes that do not fit together, or a displacement or
-                curvature that is not finite.
+            ValueError: for a segment that was added before, shapes that do not fit together, a displacement or
+                curvature that is not finite, or kinds of other collisions.
         """
         _check_shapes(len(segment_ids), simulated, collided, offroad, displacement, logged)
         compared = simulated & logged[:, None]
@@ -91,7 +97,9 @@ class RolloutMetrics:
         if not np.isfinite(error).all():
             bad = segment_ids[int(np.argwhere(~np.isfinite(error))[0, 0])]
             raise ValueError(f"segment {bad}: displacement is not finite")
-        hits = (collided & simulated).flatten(2).any(-1).sum(1)
+        hit = (collided & simulated).flatten(2).any(-1)
+        counts = None if kinds is None else _count_kinds(segment_ids, kinds, hit)
+        hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
         # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
         count = compared.sum((2, 3)).amax(1)
@@ -107,6 +115,7 @@ class RolloutMetrics:
                 logged=int(count[b]),
                 histogram=curvature_histogram(seen),
                 histogram_log=curvature_histogram(seen_log),
+                kinds=None if counts is None else counts[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -145,10 +154,13 @@ class RolloutMetrics:
             ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
             all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
             standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
-            ``segments`` and ``rollouts`` (per segment).
+            ``segments`` and ``rollouts`` (per segment). Where kinds were given, likewise the percent of rollouts
+            whose first collision is of a kind, ``collision_into_leader`` and so on for every
+            :class:`CollisionKind` (they sum to ``collision_rate``), that is with a playback agent,
+            ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``.
 
         Raises:
-            ValueError: if nothing was added.
+            ValueError: if nothing was added, or kinds for some segments only.
         """
         if not self.segments:
             raise ValueError("no segments were added")
@@ -166,6 +178,7 @@ class RolloutMetrics:
             "offroad_time": (100 * column([s.offroad for s in found]), column([s.steps for s in found])),
             "ade": (column([s.error.mean() for s in found]), logged),
             "min_sade": (column([s.error.min() for s in found]), logged),
+            **_kind_rates(found),
         }
         out: dict[str, Any] = {}
         for name, (total, weight) in parts.items():
@@ -176,6 +189,37 @@ class RolloutMetrics:
         out["segments"] = len(found)
         out["rollouts"] = max(s.rollouts for s in found)
         return out
+
+
+def _count_kinds(
+    segment_ids: Sequence[str], kinds: CollisionKinds, hit: Bool[Tensor, "B K"]
+) -> NDArray[np.int64]:
+    """Rollouts [B, kinds, 2] by kind and whether the other is a playback agent."""
+    kind, playback = (value.cpu().numpy() for value in kinds.first())
+    if kind.shape != tuple(hit.shape):
+        raise ValueError(f"kinds are of {list(kind.shape)} rollouts, expected {list(hit.shape)}")
+    wrong = ((kind >= 0) != hit.cpu().numpy()).any(1)
+    if wrong.any():
+        raise ValueError(f"segment {segment_ids[int(wrong.argmax())]}: kinds are not those of its collisions")
+    both = np.stack([~playback, playback], -1)[..., None, :]
+    return ((kind[..., None] == np.array(CollisionKind))[..., None] & both).sum(1)
+
+
+def _kind_rates(
+    found: Sequence[SegmentResult],
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Percent times rollouts, and rollouts, of every segment."""
+    given = [s.kinds for s in found if s.kinds is not None]
+    if not given:
+        return {}
+    if len(given) < len(found):
+        raise ValueError(f"collision kinds were given for {len(given)} of {len(found)} segments")
+    counts = 100.0 * np.stack(given)
+    rollouts = np.array([s.rollouts for s in found], dtype=np.float64)
+    rates = {kind.name.lower(): counts[:, kind].sum(-1) for kind in CollisionKind}
+    rates["with_playback"] = counts[..., 1].sum(-1)
+    rates["rear_ended_by_playback"] = counts[:, CollisionKind.REAR_ENDED, 1]
+    return {f"collision_{name}": (total, rollouts) for name, total in rates.items()}
 
 
 def _ratio(total: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, float]:

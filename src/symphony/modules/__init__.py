@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from symphony.modules.discriminator import Discriminator, discriminator
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
 from symphony.modules.policy import NoiseSampler, discrete_policy
 from symphony.modules.pooling import pool_elements
 from symphony.modules.rows import in_blocks, mlp
 from symphony.modules.sampling import inverse_cdf
 
 __all__ = [
+    "Discriminator",
     "ElementGroup",
     "NoiseSampler",
+    "RouteScores",
     "SceneEncoder",
     "SceneNetwork",
     "discrete_policy",
+    "discriminator",
+    "drawn_goals",
+    "goal_policy",
     "in_blocks",
     "inverse_cdf",
     "mlp",

@@ -88,14 +88,36 @@ class SceneNetwork(nn.Module):
         return in_blocks(self.head, self.encoder(own, valid, *elements_and_masks))
 
 
+class _JoinOwn(nn.Module):
+    """Concatenates the own features that come under several keys."""
+
+    def __init__(self, network: nn.Module, owns: int) -> None:
+        super().__init__()
+        self.network, self.owns = network, owns
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.network(torch.cat(inputs[: self.owns], -1), *inputs[self.owns :])
+
+
 def scene_module(
-    network: SceneEncoder | SceneNetwork,
+    network: nn.Module,
     groups: Sequence[ElementGroup],
     out_key: NestedKey,
     *,
-    own_key: NestedKey = OWN,
+    own_keys: Sequence[NestedKey] = (OWN,),
     valid_key: NestedKey = VALID,
+    more_keys: Sequence[NestedKey] = (),
 ) -> TensorDictModule:
-    """Wrap a network over scenes so that it reads its inputs, in order, from a TensorDict."""
+    """Wrap a network over scenes so that it reads its inputs, in order, from a TensorDict.
+
+    Args:
+        network: called with own features, mask, the elements and mask of each group, and what ``more_keys`` hold.
+        groups: types of elements.
+        out_key: where its result goes.
+        own_keys: features of the agent itself, concatenated.
+        valid_key: mask of the agents.
+        more_keys: further inputs.
+    """
     pairs = [key for group in groups for key in (group.key, group.mask_key)]
-    return TensorDictModule(network, in_keys=[own_key, valid_key, *pairs], out_keys=[out_key])
+    joined = network if len(own_keys) == 1 else _JoinOwn(network, len(own_keys))
+    return TensorDictModule(joined, in_keys=[*own_keys, valid_key, *pairs, *more_keys], out_keys=[out_key])

@@ -83,7 +83,7 @@ def discrete_policy(
     actions: int = 147,
     hidden: int = 64,
     head: Sequence[int] = (128, 128),
-    own_key: NestedKey = OWN,
+    own_keys: Sequence[NestedKey] = (OWN,),
     valid_key: NestedKey = VALID,
     logits_key: NestedKey = LOGITS,
     action_key: NestedKey = ACTION,
@@ -94,14 +94,14 @@ def discrete_policy(
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).
 
-    Weights follow `torch.manual_seed`. Reads each group's keys, the own features and the agents' mask; writes
+    Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys`. Reads each group's keys, the own features and the agents' mask; writes
     logits `[..., N, actions]` and actions `[..., N]` int64, sampled according to TorchRL's exploration type
     (RANDOM unless set; see :class:`NoiseSampler`). It does not depend on the number of agents or elements.
     """
     encoder = SceneEncoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
     network = SceneNetwork(encoder, actions, head=head)
     return ProbabilisticTensorDictSequential(
-        scene_module(network, groups, logits_key, own_key=own_key, valid_key=valid_key),
+        scene_module(network, groups, logits_key, own_keys=own_keys, valid_key=valid_key),
         NoiseSampler(
             logits_key,
             action_key,

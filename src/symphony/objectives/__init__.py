@@ -3,5 +3,9 @@
 from __future__ import annotations
 
 from symphony.objectives.bc import BCLoss
+from symphony.objectives.discriminator import DiscriminatorLoss
+from symphony.objectives.distillation import DistillationLoss
+from symphony.objectives.goal import GoalLoss
+from symphony.objectives.statistics import auc
 
-__all__ = ["BCLoss"]
+__all__ = ["BCLoss", "DiscriminatorLoss", "DistillationLoss", "GoalLoss", "auc"]

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from symphony import keys
-from symphony.config import AgentConfig, BCConfig, from_dict
+from symphony.config import SearchConfig, TrainConfig, from_dict
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle, Displacement
-from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
+from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
-from symphony.modules import ElementGroup, discrete_policy
 from symphony.trainers.checkpoint import latest, load_checkpoint
+from symphony.trainers.networks import build_networks, observation_config
 
 PLAYBACK = "playback"
 """Name of the logged trajectories themselves, judged like an agent."""
@@ -32,6 +31,9 @@ class Agent:
         dynamics: the action space it acts in.
         observation: what it sees.
         interactive: how many agents a segment it was trained with.
+        goals: draws routes from first states; None for agents that follow none.
+        discriminator: scores states; None for agents trained without search.
+        search: how branches are pruned, where there is a discriminator.
     """
 
     name: str
@@ -39,26 +41,9 @@ class Agent:
     dynamics: Bicycle | Displacement
     observation: ObservationConfig
     interactive: int = 2
-
-
-def observation_config(config: AgentConfig) -> ObservationConfig:
-    """The part of an agent's configuration that the environment needs."""
-    return ObservationConfig(num_objects=config.num_objects, num_points=config.num_points)
-
-
-def build_policy(config: AgentConfig, dynamics: Bicycle) -> TensorDictModuleBase:
-    """A freshly initialised policy; seed torch beforehand."""
-    groups = (
-        ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
-        ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
-    )
-    return discrete_policy(
-        SELF_FEATURES,
-        groups,
-        actions=dynamics.num_actions,
-        hidden=config.hidden,
-        head=(config.head, config.head),
-    )
+    goals: TensorDictModuleBase | None = None
+    discriminator: TensorDictModuleBase | None = None
+    search: SearchConfig = field(default_factory=SearchConfig)
 
 
 def load_agent(name: str, device: str = "cpu") -> Agent:
@@ -82,18 +67,23 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     if newest is None:
         raise ConfigError(f"{folder}: the run has no checkpoint yet")
     dynamics = Bicycle()
-    policy = build_policy(config.agent, dynamics)
-    load_checkpoint(newest, modules={"policy": policy}, partial=True, restore_rng=False)
+    networks = build_networks(config, dynamics)
+    load_checkpoint(newest, modules=networks.present(), partial=True, restore_rng=False)
+    for module in networks.present().values():
+        module.to(torch.device(device)).eval()
     return Agent(
         name,
-        policy.to(torch.device(device)).eval(),
+        networks.policy,
         dynamics,
-        observation_config(config.agent),
+        observation_config(config),
         config.agent.interactive,
+        networks.goals,
+        networks.discriminator,
+        config.search,
     )
 
 
-def read_config(folder: Path) -> BCConfig:
+def read_config(folder: Path) -> TrainConfig:
     """The configuration a run was started with."""
     path = folder / "config.json"
     if not path.is_file():
@@ -105,4 +95,4 @@ def read_config(folder: Path) -> BCConfig:
         values = json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise ConfigError(f"{path}: not valid JSON ({error})") from error
-    return from_dict(BCConfig, values, file=path)
+    return from_dict(TrainConfig, values, file=path)

@@ -195,6 +195,16 @@ def checkpoints(folder: Path) -> list[Path]:
     return [found[step] for step in sorted(found)]
 
 
+def parts_of(path: Path) -> set[str]:
+    """Names of the modules that a checkpoint holds.
+
+    Raises:
+        CheckpointError: if the folder is no complete checkpoint of this format.
+    """
+    parts = _read_manifest(Path(path))["parts"]
+    return {name.removeprefix("module.") for name in parts if name.startswith("module.")}
+
+
 def latest(folder: Path) -> Path | None:
     """The complete checkpoint of the highest step in `folder`, or None."""
     found = checkpoints(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,11 +17,18 @@ from symphony.data.selection import MOVING, travel
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
+from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices, route_table
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.roadgraph import LaneGraph, lane_of
 
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
+
+
+KEEP = 5000
+"""Segments held in memory once they are prepared, about 0.3 MB each."""
+GRAPHS = 64
+"""Lane graphs held in memory."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,7 @@ class Experts:
         actions: [K, T - 1] or [K, T - 1, 2].
         valid: [K, T - 1] where the log is valid before and after the action.
         error: [K] metres between the last valid fitted and logged position.
+        routes: feasible routes of each expert from its first valid state; empty where not asked for.
     """
 
     agent: Tensor
@@ -40,16 +49,30 @@ class Experts:
     actions: Tensor
     valid: Tensor
     error: Tensor
+    routes: tuple[RouteTable, ...] = ()
 
 
-def experts(segment: RunSegment, dynamics: Bicycle | Displacement) -> Experts:
+def experts(
+    segment: RunSegment,
+    dynamics: Bicycle | Displacement,
+    graph: LaneGraph | None = None,
+    *,
+    routes: bool = False,
+) -> Experts:
     """Fit every vehicle of a segment that moves or stands in a lane (waiting is driving, parking is not), and the
     ego in any case.
+
+    Args:
+        segment: the run segment.
+        dynamics: the action space.
+        graph: of its lanes, made here if not given.
+        routes: whether to find the experts' routes.
     """
     valid = segment.valid
+    graph = LaneGraph(segment.road) if graph is None else graph
     everyone, first = np.arange(segment.num_agents), valid.argmax(1)
     lane = lane_of(
-        LaneGraph(segment.road),
+        graph,
         segment.position[everyone, first, :2],
         segment.heading[everyone, first],
         tolerance=IN_LANE,
@@ -74,7 +97,8 @@ def experts(segment: RunSegment, dynamics: Bicycle | Displacement) -> Experts:
     last = mask.shape[1] - 1 - mask.flip(1).int().argmax(1)
     which = torch.arange(len(rows))
     error = (states[which, last, :2] - position[which, last]).norm(dim=-1)
-    return Experts(torch.from_numpy(rows), states, actions, mask[:, 1:] & mask[:, :-1], error)
+    tables = tuple(route_table(segment, graph, int(row)) for row in rows) if routes else ()
+    return Experts(torch.from_numpy(rows), states, actions, mask[:, 1:] & mask[:, :-1], error, tables)
 
 
 class SceneDataset:
@@ -85,6 +109,8 @@ class SceneDataset:
         interactive: agents per segment that act.
         dynamics: action space the experts are fitted to.
         indices: rows of the store to use; all by default.
+        routes: whether scenes and experts come with their routes.
+        keep: segments held in memory once they are prepared.
     """
 
     def __init__(
@@ -93,13 +119,18 @@ class SceneDataset:
         interactive: int = 2,
         dynamics: Bicycle | Displacement | None = None,
         indices: Sequence[int] | None = None,
+        *,
+        routes: bool = False,
+        keep: int = KEEP,
     ) -> None:
         self.store = store
         self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
-        self._scenes: dict[int, SceneBatch] = {}
-        self._experts: dict[int, Experts] = {}
+        self.routes = routes
+        self.scene = lru_cache(keep)(self._scene)
+        self.experts = lru_cache(keep)(self._experts)
+        self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -108,60 +139,147 @@ class SceneDataset:
         """The run segment behind item ``i``."""
         return self.store[self.indices[i]]
 
-    def scene(self, i: int) -> SceneBatch:
+    def graph(self, i: int) -> LaneGraph:
+        """The lane graph of item ``i``; segments on one map share it."""
+        return self._graph(int(self.store.map_index[self.indices[i]]))
+
+    def _scene(self, i: int) -> SceneBatch:
         """Item ``i`` as a batch of one scene."""
-        if i not in self._scenes:
-            self._scenes[i] = scene(self.segment(i), self.interactive)
-        return self._scenes[i]
+        return scene(self.segment(i), self.interactive, self.graph(i) if self.routes else None)
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""
         return collate([self.scene(i) for i in items])
 
-    def experts(self, i: int) -> Experts:
+    def _experts(self, i: int) -> Experts:
         """The demonstrations of item ``i``."""
-        if i not in self._experts:
-            self._experts[i] = experts(self.segment(i), self.dynamics)
-        return self._experts[i]
+        return experts(self.segment(i), self.dynamics, self.graph(i), routes=self.routes)
+
+    def draw(self, count: int, rng: torch.Generator) -> list[int]:
+        """Different items at random (all, if there are fewer)."""
+        return torch.randperm(len(self), generator=rng)[:count].tolist()
 
     def sample_states(
         self,
-        segments: int,
+        items: Sequence[int],
         states: int,
         observation: ObservationConfig,
         rng: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> TensorDict:
-        """A training batch: expert states drawn uniformly from a few random segments.
+        """A training batch: expert states drawn uniformly from some segments.
 
         Returns:
             TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
         """
-        order = torch.randperm(len(self), generator=rng)[:segments].tolist()
-        found = [self.experts(i) for i in order]
-        scene_of, agent, step, state, action = [], [], [], [], []
-        for row, expert in enumerate(found):
-            which, when = expert.valid.nonzero(as_tuple=True)
-            scene_of.append(torch.full_like(which, row))
-            agent.append(expert.agent[which])
-            step.append(when)
-            state.append(expert.states[which, when])
-            action.append(expert.actions[which, when])
-        available = sum(map(len, step))
-        pick = torch.randint(available, (states,), generator=rng)
-
-        def choose(parts: list[Tensor]) -> Tensor:
-            return torch.cat(parts)[pick].to(device)
-
+        found = [self.experts(i) for i in items]
+        places = [expert.valid.nonzero(as_tuple=True) for expert in found]
+        sizes = torch.tensor([len(which) for which, _ in places])
+        pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
+        item = torch.repeat_interleave(torch.arange(len(items)), sizes)[pick]
+        which, when = (torch.cat(parts)[pick] for parts in zip(*places, strict=True))
+        ends = torch.tensor([len(expert.agent) for expert in found]).cumsum(0)
+        row = which + torch.cat([ends.new_zeros(1), ends[:-1]])[item]
+        # Segments may differ in length, so rows of states are looked up by their place in one flat list.
+        lengths = torch.cat([torch.full((len(e.agent),), e.states.shape[1]) for e in found])
+        begin = lengths.cumsum(0) - lengths
+        state = torch.cat([e.states.flatten(0, 1) for e in found])[begin[row] + when]
+        ordinal = torch.arange(len(lengths))
+        action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
+        agent = torch.cat([e.agent for e in found])[row]
+        taken = logged_routes([table for e in found for table in e.routes], row) if self.routes else None
         return expert_batch(
-            self.scenes(order).to(device),
-            choose(scene_of),
-            choose(step),
-            choose(agent),
-            choose(state),
-            choose(action),
+            self.scenes(items).to(device),
+            item.to(device),
+            when.to(device),
+            agent.to(device),
+            state.to(device),
+            observation,
+            action=action.to(device),
+            routes=None if taken is None else (taken[0].to(device), taken[1].to(device)),
+        )
+
+    def sample_goals(
+        self,
+        items: Sequence[int],
+        count: int,
+        observation: ObservationConfig,
+        rng: torch.Generator,
+        device: torch.device | str = "cpu",
+    ) -> TensorDict:
+        """A training batch for the goal policy: experts at their first state, their routes and the one they took.
+
+        Returns:
+            TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK`` and ``GOAL``
+            (-1 for vehicles on no lane).
+        """
+        found = [(i, self.experts(item), k) for i, item in enumerate(items) for k in range(len(self.experts(item).agent))]
+        pick = torch.randint(len(found), (count,), generator=rng).tolist()
+        chosen = [found[k] for k in pick]
+        when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
+        tables = [e.routes[k] for _, e, k in chosen]
+        most = max(1, *(len(table.count) for table in tables))
+        points, counts = np.zeros((count, most, POINTS, 2), np.float32), np.zeros((count, most), np.int64)
+        for row, table in enumerate(tables):
+            points[row, : len(table.count)], counts[row, : len(table.count)] = table.points, table.count
+        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(device)
+        batch = expert_batch(
+            self.scenes(items).to(device),
+            torch.tensor([i for i, _, _ in chosen], device=device),
+            when.to(device),
+            torch.stack([e.agent[k] for _, e, k in chosen]).to(device),
+            state,
             observation,
         )
+        features, mask = route_choices(
+            state[:, None],
+            torch.from_numpy(points)[:, None].to(device),
+            torch.from_numpy(counts)[:, None].to(device),
+            observation.distance_scale,
+        )
+        batch.set(keys.ROUTES, features)
+        batch.set(keys.ROUTES_MASK, mask)
+        batch.set(keys.GOAL, torch.tensor([[table.logged] for table in tables], device=device))
+        return batch
+
+    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor]:
+        """What the interactive agents of some segments did, as the fit to the action space has it.
+
+        Args:
+            items: the segments.
+            scenes: their scenes.
+
+        Returns:
+            States [B, T, N, 4] and where the log is valid [B, T, N]; agents that are no experts as logged.
+        """
+        state, valid = logged(scenes)
+        state, valid = state.clone(), valid.clone()
+        for b, i in enumerate(items):
+            expert = self.experts(i)
+            steps = expert.states.shape[1]
+            hit = expert.agent[:, None].to(scenes.device) == scenes.interactive[b]
+            which, place = hit.nonzero(as_tuple=True)
+            state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
+        return state, valid
+
+
+def logged_routes(tables: Sequence[RouteTable], row: Tensor) -> tuple[Tensor, Tensor]:
+    """Points [M, K, 2] and their number [M] (0 where there is none) of the routes that experts took."""
+    none = np.zeros((POINTS, 2), np.float32)
+    points = np.stack([table.points[table.logged] if table.logged >= 0 else none for table in tables])
+    count = np.array([table.count[table.logged] if table.logged >= 0 else 0 for table in tables])
+    return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
+
+
+def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
+    """What the interactive agents did in the log: states [B, T, N, 4] and validity [B, T, N]."""
+    steps = scenes.log_valid.shape[1]
+    index = scenes.interactive[:, None].expand(-1, steps, -1)
+    log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
+    heading, velocity = log[..., 2], log[..., 3:]
+    speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
+    valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
+    return torch.cat([log[..., :3], speed[..., None]], -1), valid
 
 
 def expert_batch(
@@ -170,10 +288,14 @@ def expert_batch(
     step: Tensor,
     agent: Tensor,
     state: Tensor,
-    action: Tensor,
     observation: ObservationConfig,
+    *,
+    action: Tensor | None = None,
+    routes: tuple[Tensor, Tensor] | None = None,
 ) -> TensorDict:
-    """Observations of agents [M] in given states [M, 4], everyone else as logged, beside their actions."""
+    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and, from
+    points [M, K, 2] and counts [M], their routes, where given.
+    """
     index, here = agent[:, None], state[:, None]
     real = torch.ones_like(index, dtype=torch.bool)
     objects = objects_at(scenes, scene_of, step, here, index, real)
@@ -186,7 +308,12 @@ def expert_batch(
         (keys.POINTS, seen.points),
         (keys.POINTS_MASK, seen.points_mask),
         (keys.VALID, real),
-        (keys.ACTION, action[:, None]),
     ):
         batch.set(key, value)
+    if action is not None:
+        batch.set(keys.ACTION, action[:, None])
+    if routes is not None:
+        points, count = routes
+        ahead = route_ahead(here, points[:, None], count[:, None], observation.distance_scale)
+        batch.set(keys.ROUTE, ahead)
     return batch

@@ -9,22 +9,20 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
-from symphony import keys
+from symphony.collectors import KeepAll, KeepBest, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 from symphony.metrics import RolloutMetrics, collisions, offroad
 from symphony.roadgraph import LaneGraph, visited_curvatures
-from symphony.streams import fold_in, uniform
 from symphony.trainers.agents import Agent, load_agent
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.simulate import Rollouts, simulate
+from symphony.trainers.dataset import SceneDataset, logged
+from symphony.trainers.simulate import Rollouts, SeededNoise, draw_goals, rollouts_of, search, simulate
 
 
 @dataclass(frozen=True)
@@ -53,30 +51,6 @@ class Evaluation:
         }
 
 
-class SeededNoise(TensorDictModuleBase):
-    """Gives every agent the random number its next action is decided by.
-
-    It depends on the seed, the rollout's identity, the step and the agent's place alone (never on the batch).
-
-    Args:
-        seed: of the evaluation.
-    """
-
-    in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
-    out_keys = [keys.NOISE]  # noqa: RUF012
-
-    def __init__(self, seed: int) -> None:
-        super().__init__()
-        self.seed = seed
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write numbers [..., N] in (0, 1)."""
-        agents = tensordict.get(keys.VALID).shape[-1]
-        place = torch.arange(agents, device=tensordict.device)
-        stream = fold_in(tensordict.get(keys.STREAM), place)
-        return tensordict.set(keys.NOISE, uniform(self.seed, stream, tensordict.get(keys.STEP)))
-
-
 def evaluate(
     agent: Agent | str,
     data: SegmentStore | Path,
@@ -100,7 +74,7 @@ def evaluate(
     if len(store) == 0:
         raise DataError("the store holds no run segments", file=store.path)
     interactive = config.interactive or agent.interactive
-    dataset = SceneDataset(store, interactive, agent.dynamics)
+    dataset = SceneDataset(store, interactive, agent.dynamics, routes=agent.goals is not None, keep=config.batch)
     metrics = RolloutMetrics()
     for first in range(0, len(dataset), config.batch):
         items = list(range(first, min(first + config.batch, len(dataset))))
@@ -116,17 +90,17 @@ def _evaluate_batch(
     scenes = dataset.scenes(items).to(torch.device(config.device))
     log, log_valid = logged(scenes)
     playing = agent.policy is None
-    rollouts = playback(scenes) if playing else simulated(agent, scenes, config.rollouts, config.seed)
-    segments = [dataset.segment(i) for i in items]
+    rollouts = playback(scenes) if playing else simulated(agent, scenes, config)
+    segments = [dataset.segment(i).segment_id for i in items]
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     driven, judged, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
     regions, regions_log = [], []
-    for b, segment in enumerate(segments):
-        graph = LaneGraph(segment.road)
+    for b, item in enumerate(items):
+        graph = dataset.graph(item)
         regions.append(_curvatures(graph, driven[b], judged[b]))
         regions_log.append(_curvatures(graph, log[b], log_valid[b, 1:]))
     metrics.update(
-        [segment.segment_id for segment in segments],
+        segments,
         collided=rollouts.collision.transpose(2, 3).cpu(),
         offroad=rollouts.offroad.transpose(2, 3).cpu(),
         displacement=away.transpose(2, 3).cpu(),
@@ -137,16 +111,71 @@ def _evaluate_batch(
     )
 
 
-def simulated(agent: Agent, scenes: SceneBatch, rollouts: int, seed: int) -> Rollouts:
-    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch."""
+def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
+    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
+
+    Raises:
+        ConfigError: if the search needs a discriminator and the agent has none.
+    """
     if agent.policy is None:
         raise ValueError("log playback has nothing to simulate")
     env = DrivingEnv(scenes, agent.dynamics, agent.observation)
-    shape = (len(scenes), rollouts)
-    scene = torch.arange(len(scenes), device=scenes.device)[:, None].expand(shape)
-    number = torch.arange(rollouts, device=scenes.device).expand(shape)
-    policy = TensorDictSequential(SeededNoise(seed), agent.policy)
-    return simulate(env, policy, env.start(scene, number))
+    trees, branches, taken = _plan(agent, config)
+    number = torch.arange(trees * branches, device=scenes.device).reshape(trees, branches)
+    scene = torch.arange(len(scenes), device=scenes.device)[:, None, None]
+    start = env.start(scene.expand(-1, trees, branches), number.expand(len(scenes), -1, -1))
+    if agent.goals is not None:
+        roots, tree = start[..., 0], torch.arange(trees, device=scenes.device).expand(len(scenes), trees)
+        goal = draw_goals(env, None if config.logged_goals else agent.goals, roots, config.seed, tree)
+        start = env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
+    if _kind(agent, config) == "none":
+        policy = TensorDictSequential(SeededNoise(config.seed), agent.policy)
+        found = simulate(env, policy, start)
+    else:
+        best = config.search == "best"
+        with torch.no_grad():
+            result = search(
+                env,
+                agent.policy,
+                None if config.search == "oracle" else agent.discriminator,
+                start,
+                seed=config.seed,
+                rule=KeepAll() if best else KeepBest(agent.search.keep),
+                prune_every=agent.search.prune_every,
+            )
+        found = rollouts_of(env, start, result.trajectories)
+        if best:
+            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            found = Rollouts(*(_branches(part, order) for part in found))
+    return Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
+
+
+def _kind(agent: Agent, config: EvaluateConfig) -> str:
+    if config.search == "agent":
+        return "none" if agent.discriminator is None else "tree"
+    if config.search in ("tree", "best") and agent.discriminator is None:
+        raise ConfigError(f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none")
+    return config.search
+
+
+def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
+    """Trees per segment, branches per tree, and rollouts taken from each tree."""
+    kind = _kind(agent, config)
+    if kind == "none":
+        return config.rollouts, 1, 1
+    branches = config.branches or agent.search.test_branches
+    if kind == "best":
+        return config.rollouts, branches, 1
+    taken = config.rollouts // config.trees
+    if taken > branches:
+        raise ConfigError(f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts")
+    return config.trees, branches, taken
+
+
+def _branches(part: Tensor, order: Tensor) -> Tensor:
+    """part [B, trees, S, ...] at the branches order [B, trees, K]."""
+    index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
+    return part.gather(2, index)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:
@@ -164,17 +193,6 @@ def playback(scenes: SceneBatch) -> Rollouts:
     )
     off = offroad(log[..., :2], *edges) & valid
     return Rollouts(log[:, None], hit[:, None, 1:], off[:, None, 1:], valid[:, None, 1:])
-
-
-def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
-    """What the interactive agents did in the log: states [B, T, N, 4] and validity [B, T, N]."""
-    steps = scenes.log_valid.shape[1]
-    index = scenes.interactive[:, None].expand(-1, steps, -1)
-    log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
-    heading, velocity = log[..., 2], log[..., 3:]
-    speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
-    valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
-    return torch.cat([log[..., :3], speed[..., None]], -1), valid
 
 
 def _curvatures(graph: LaneGraph, state: Tensor, counted: Tensor) -> NDArray[np.float64]:

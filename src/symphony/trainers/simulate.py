@@ -1,4 +1,4 @@
-"""Closed-loop simulation without keeping what nobody reads afterwards."""
+"""Closed-loop simulation, with and without search, keeping only what is read afterwards."""
 
 from __future__ import annotations
 
@@ -7,11 +7,22 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
+from symphony.collectors import BeamSearchResult, KeyScore, PruningRule, beam_search
 from symphony.envs.driving import DrivingEnv
+from symphony.modules import drawn_goals
+from symphony.streams import fold_in, uniform
+
+ENDED = -100.0
+"""Score past a scene's last logged step, below all others: it decides no maximum, and in a mean or sum it weighs
+equally on all branches.
+"""
+_GOALS = 1 << 40
+"""Number of the stream that goals are drawn from, far above the numbers of rollouts."""
 
 
 class Rollouts(NamedTuple):
@@ -28,6 +39,30 @@ class Rollouts(NamedTuple):
     collision: Tensor
     offroad: Tensor
     counted: Tensor
+
+
+class SeededNoise(TensorDictModuleBase):
+    """Gives every agent the random number its next action is decided by.
+
+    It depends on the seed, the rollout's identity, the step and the agent's place alone (never on the batch).
+
+    Args:
+        seed: of the evaluation.
+    """
+
+    in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
+    out_keys = [keys.NOISE]  # noqa: RUF012
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.seed = seed
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write numbers [..., N] in (0, 1)."""
+        agents = tensordict.get(keys.VALID).shape[-1]
+        place = torch.arange(agents, device=tensordict.device)
+        stream = fold_in(tensordict.get(keys.STREAM), place)
+        return tensordict.set(keys.NOISE, uniform(self.seed, stream, tensordict.get(keys.STEP)))
 
 
 @torch.no_grad()
@@ -47,19 +82,113 @@ def simulate(
         start: as returned by :meth:`DrivingEnv.start`, any batch shape.
         steps: decisions; by default up to the last logged step of the longest scene.
     """
-    horizon = env.scenes.last_step[start.get(keys.SCENE).squeeze(-1)]
-    steps = int(horizon.max()) if steps is None else steps
-    now, states, collisions, offroads, counted = start, [start.get(keys.STATE)], [], [], []
+    steps = _steps(env, start) if steps is None else steps
+    now, states, collisions, offroads = start, [start.get(keys.STATE)], [], []
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(steps):
             now = step_mdp(env.step(policy(now)), exclude_reward=True)
             states.append(now.get(keys.STATE))
             collisions.append(now.get(keys.COLLISION).squeeze(-1))
             offroads.append(now.get(keys.OFFROAD).squeeze(-1))
-            counted.append((now.get(keys.STEP).squeeze(-1) <= horizon)[..., None] & now.get(keys.VALID))
     return Rollouts(
         torch.stack(states, -3),
         torch.stack(collisions, -2),
         torch.stack(offroads, -2),
-        torch.stack(counted, -2),
+        _counted(env, start, steps),
     )
+
+
+def draw_goals(
+    env: DrivingEnv, goals: TensorDictModuleBase | None, start: TensorDictBase, seed: int, tree: Tensor
+) -> Tensor:
+    """The route [..., N] each agent follows from a start state, -1 for none.
+
+    Args:
+        env: the environment.
+        goals: the goal policy; None takes the routes nearest to the log.
+        start: [...], one entry per draw.
+        seed: of the draw.
+        tree: [...] number of the draw within its scene, so that it is the same whatever the batch.
+    """
+    if goals is None:
+        return env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)]
+    seen = env.choices(start)
+    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _GOALS), tree[..., None])
+    place = torch.arange(env.num_agents, device=start.device)
+    seen.set(keys.GOAL_NOISE, uniform(seed, fold_in(stream, place), 0))
+    with set_exploration_type(ExplorationType.RANDOM):
+        seen = goals(seen)
+    return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
+
+
+def flag_score(state: TensorDictBase) -> Tensor:
+    """Score [..., N] of an oracle: 1 where an agent collides or is off the road."""
+    bad = state.get(keys.COLLISION) | state.get(keys.OFFROAD)
+    return (bad.squeeze(-1) & state.get(keys.VALID)).float()
+
+
+def search(
+    env: DrivingEnv,
+    policy: TensorDictModuleBase,
+    discriminator: TensorDictModuleBase | None,
+    start: TensorDictBase,
+    *,
+    seed: int,
+    rule: PruningRule,
+    prune_every: int,
+    keep_tree: bool = False,
+) -> BeamSearchResult:
+    """Beam search from a start state [..., S] to the last logged step (paper, section IV-A).
+
+    Args:
+        env: the environment.
+        policy: writes the action.
+        discriminator: scores the states; None takes the true collision and off-road flags (an oracle).
+        start: all branches of a tree with the same goals.
+        seed: of the actions.
+        rule: which branches go on.
+        prune_every: T_p.
+        keep_tree: also return the pruned branches.
+    """
+    score: Callable[[TensorDictBase], Tensor] = flag_score
+    if discriminator is not None:
+        score = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID)
+    last = env.scenes.last_step
+
+    def until_the_end(state: TensorDictBase) -> Tensor:
+        going = state.get(keys.STEP) <= last[state.get(keys.SCENE)]
+        return torch.where(going, score(state), ENDED)
+
+    following = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
+    return beam_search(
+        env,
+        TensorDictSequential(SeededNoise(seed), policy),
+        until_the_end,
+        start,
+        steps=_steps(env, start),
+        prune_every=prune_every,
+        rule=rule,
+        # A copy takes the random numbers of the place it lands in, so that forks part.
+        slot_keys=(keys.STREAM,),
+        keep=[keys.STATE, keys.ACTION, keys.STEP, *following],
+        keep_tree=keep_tree,
+    )
+
+
+def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
+    """What the evaluator reads, from the trajectories [..., S, T] of a search."""
+    state = torch.cat([start.get(keys.STATE)[..., None, :, :], trajectories.get(("next", *keys.STATE))], -3)
+    collision, offroad = (
+        trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)
+    )
+    return Rollouts(state, collision, offroad, _counted(env, start, collision.shape[-2]))
+
+
+def _steps(env: DrivingEnv, start: TensorDictBase) -> int:
+    return int(env.scenes.last_step[start.get(keys.SCENE)].max())
+
+
+def _counted(env: DrivingEnv, start: TensorDictBase, steps: int) -> Tensor:
+    step = start.get(keys.STEP) + torch.arange(1, steps + 1, device=start.device)
+    within = step <= env.scenes.last_step[start.get(keys.SCENE)]
+    return within[..., None] & start.get(keys.VALID)[..., None, :]

@@ -11,26 +11,30 @@ from pathlib import Path
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from symphony.config import BCConfig, to_json
+from symphony.config import TrainConfig, to_json
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle
 from symphony.errors import ConfigError, DataError
-from symphony.objectives import BCLoss
-from symphony.trainers.agents import build_policy, observation_config, read_config
-from symphony.trainers.checkpoint import latest, load_checkpoint, prune, save_checkpoint
+from symphony.trainers.agents import read_config
+from symphony.trainers.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
 from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.learner import Learner
+from symphony.trainers.networks import Networks, build_networks
 from symphony.trainers.tracking import Tracker
 
-_SEED_STRIDE = 1_000_003
 KEEP = 3
 """Checkpoints kept in a run's folder."""
 
 
-def train(config: BCConfig) -> Path:
+def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
     """Train an agent as configured.
 
     The data of every update is drawn from (seed, update) alone, and checkpoints hold weights and optimiser, so a
     run that was stopped and resumed ends with the same weights as one that was not.
+
+    Args:
+        config: what to train.
+        dataset: the prepared data, if several runs are to share it; by default made from ``config.data``.
 
     Returns:
         The run's folder: ``config.json``, ``metrics.jsonl`` and ``checkpoints/``.
@@ -40,48 +44,42 @@ def train(config: BCConfig) -> Path:
         DataError: if the store can't be read or holds nothing to learn from.
     """
     device = _device(config.device)
-    store = SegmentStore(config.data)
-    if len(store) == 0:
+    dynamics = Bicycle()
+    if dataset is None:
+        store = SegmentStore(config.data)
+        dataset = SceneDataset(store, config.agent.interactive, dynamics, routes=config.hierarchical)
+    if len(dataset) == 0:
         raise DataError("the store holds no run segments", file=config.data)
     done = _prepare(config)
-    dynamics = Bicycle()
-    dataset = SceneDataset(store, config.agent.interactive, dynamics)
     torch.manual_seed(config.seed)
-    policy = build_policy(config.agent, dynamics).to(device)
-    loss_module = BCLoss(policy)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+    networks = build_networks(config, dynamics)
+    if config.warm_start is not None and done is None:
+        _warm_start(networks, config.warm_start)
+    for module in networks.present().values():
+        module.to(device)
+    learner = Learner(config, networks, dataset, device)
+    step = 0
     if done is not None:
-        step = load_checkpoint(done, modules={"policy": policy}, optimizers={"adam": optimizer}).step
-    else:
-        step = 0
+        step = load_checkpoint(done, modules=networks.present(), optimizers=learner.optimizers).step
     tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
-    seen, rng = observation_config(config.agent), torch.Generator()
     try:
         with _progress() as progress:
             task = progress.add_task("training", total=config.steps, completed=step, loss=math.nan)
             began, first = time.perf_counter(), step
             while step < config.steps:
-                rng.manual_seed(config.seed * _SEED_STRIDE + step)
-                batch = dataset.sample_states(config.segments, config.states, seen, rng, device)
-                for group in optimizer.param_groups:
-                    group["lr"] = _learning_rate(config, step)
-                losses = loss_module(batch)
-                optimizer.zero_grad(set_to_none=True)
-                losses["loss_bc"].backward()
-                norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), config.clip)
-                optimizer.step()
+                values = learner.update(step)
                 step += 1
                 if step % config.log_every == 0 or step == config.steps:
-                    values = {name: losses[name].item() for name in ("loss_bc", "accuracy", "entropy")}
-                    speed = (step - first) / (time.perf_counter() - began)
-                    values |= {"gradient_norm": norm.item(), "updates_per_second": speed}
-                    tracker.log(step, values | {"learning_rate": optimizer.param_groups[0]["lr"]})
-                    progress.update(task, loss=values["loss_bc"])
+                    numbers = {name: value.item() for name, value in values.items()}
+                    numbers["updates_per_second"] = (step - first) / (time.perf_counter() - began)
+                    numbers["learning_rate"] = learner.optimizers["policy"].param_groups[0]["lr"]
+                    tracker.log(step, numbers)
+                    progress.update(task, loss=numbers[learner.policy_loss.out_keys[0]])
                 progress.update(task, completed=step)
                 if step % config.checkpoint_every == 0 or step == config.steps:
                     folder = config.out / "checkpoints"
                     save_checkpoint(
-                        folder, step=step, modules={"policy": policy}, optimizers={"adam": optimizer}
+                        folder, step=step, modules=networks.present(), optimizers=learner.optimizers
                     )
                     prune(folder, KEEP)
     finally:
@@ -89,7 +87,17 @@ def train(config: BCConfig) -> Path:
     return config.out
 
 
-def _prepare(config: BCConfig) -> Path | None:
+def _warm_start(networks: Networks, folder: Path) -> None:
+    """Take over the networks that another run has too."""
+    newest = latest(folder / "checkpoints")
+    if newest is None:
+        raise ConfigError(f"{folder}: no run with a checkpoint to start from")
+    there = parts_of(newest)
+    shared = {name: module for name, module in networks.present().items() if name in there}
+    load_checkpoint(newest, modules=shared, partial=True, restore_rng=False)
+
+
+def _prepare(config: TrainConfig) -> Path | None:
     """Write the configuration, or find the checkpoint to go on from."""
     done = latest(config.out / "checkpoints")
     if (config.out / "config.json").exists():
@@ -119,12 +127,6 @@ def _device(name: str) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ConfigError(f"device '{name}': this PyTorch sees no CUDA device")
     return device
-
-
-def _learning_rate(config: BCConfig, step: int) -> float:
-    """Cosine from the configured rate to a tenth of it."""
-    share = 0.5 * (1 + math.cos(math.pi * step / config.steps))
-    return config.learning_rate * (0.1 + 0.9 * share)
 
 
 def _progress() -> Progress:

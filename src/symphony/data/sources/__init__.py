@@ -12,6 +12,7 @@ from symphony.errors import ConfigError
 __all__ = ["Reader", "get_reader", "readers"]
 
 _READERS = {
+    "argoverse2": ("symphony.data.sources.argoverse2", "Argoverse2Reader"),
     "commonroad": ("symphony.data.sources.commonroad", "CommonRoadReader"),
     "womd": ("symphony.data.sources.womd", "WomdReader"),
 }

@@ -46,6 +46,10 @@ class Reader(ABC):
         except OSError as error:
             yield DataError(f"can't be read: {error.strerror or error}", file=path)
 
+    def companions(self, path: Path) -> tuple[Path, ...]:
+        """Further files that a file of this format is read together with, such as its map; none by default."""
+        return ()
+
     @staticmethod
     def _checked(item: Item, path: Path) -> Item:
         if isinstance(item, DataError):

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from shapely.geometry.polygon import orient
 
-from symphony.data.segment import Floats, LaneType, MarkType, Polylines, RoadMap, SignalState
+from symphony.data.segment import Floats, LaneType, MarkType, RoadMap, SignalState
 from symphony.data.sources.base import pairs, to_float32
 from symphony.data.sources.commonroad_xml import (
     Doubles,
@@ -21,10 +19,8 @@ from symphony.data.sources.commonroad_xml import (
     points,
     references,
 )
+from symphony.data.sources.lines import drivable_rings, evenly, polylines
 from symphony.errors import DataError
-
-SLIT = 0.1
-"""Metres by which neighbouring lanelets may miss each other on either side and still bound no slit."""
 
 MAX_CYCLE = 10**8
 """Steps in one cycle of a traffic light: more would not fit the arithmetic."""
@@ -137,7 +133,7 @@ def _lanelet(node: ET.Element, limits: dict[int, float]) -> Lanelet:
         left = right = np.zeros((0, 2))
     elif len(left) != len(right):
         count = max(len(left), len(right))
-        left, right = _evenly(left, count), _evenly(right, count)
+        left, right = evenly(left, count), evenly(right, count)
 
     speeds = [number(child.text, f"{field}: speedLimit") for child in node.findall("speedLimit")]
     speeds += [
@@ -174,34 +170,8 @@ def _is_marked(bound: ET.Element | None) -> bool:
     return marking is not None and marking.strip() not in {"", "no_marking", "unknown"}
 
 
-def _evenly(line: Doubles, count: int) -> Doubles:
-    """[count, 2] points at equal arc length along a line."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    where = np.linspace(0, along[-1], count)
-    return np.stack([np.interp(where, along, line[:, k]) for k in range(2)], axis=-1)
-
-
 def _lane_type(kinds: set[str] | frozenset[str], default: LaneType) -> LaneType:
     return next((lane_type for lane_type, names in _LANE_TYPES if kinds & names), default)
-
-
-def drivable_rings(outlines: Sequence[Doubles]) -> tuple[Doubles, ...]:
-    """Closed rings [P, 2] around the union of outlines, the inside on the left; holes run the other way.
-
-    Slits and holes up to 2 * :data:`SLIT` wide are closed.
-    """
-    try:
-        polygons = shapely.make_valid(np.array([shapely.Polygon(outline) for outline in outlines]))
-        union = shapely.union_all(polygons)
-        closed = union.buffer(SLIT, join_style="mitre").buffer(-SLIT, join_style="mitre").simplify(0.01)
-    except shapely.errors.ShapelyError as error:
-        raise DataError(f"the union of the lanelets can't be formed: {error}", field="lanelet") from error
-    rings = []
-    for part in shapely.get_parts(closed):
-        if part.geom_type == "Polygon" and not part.is_empty:
-            polygon = orient(part, 1.0)
-            rings += [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
-    return tuple(rings)
 
 
 def road_map(network: Network, origin: Doubles) -> RoadMap:
@@ -215,7 +185,7 @@ def road_map(network: Network, origin: Doubles) -> RoadMap:
     marks = _markings(network)
     types = [_lane_type(lane.kinds, network.kind) for lane in lanes]
     return RoadMap(
-        lanes=_polylines([lane.center for lane in lanes], origin),
+        lanes=polylines([lane.center for lane in lanes], origin),
         lane_id=np.array([lane.lanelet_id for lane in lanes], np.int64),
         lane_type=np.array(types, np.uint8),
         speed_limit=to_float32(np.array([lane.speed_limit for lane in lanes])),
@@ -223,8 +193,8 @@ def road_map(network: Network, origin: Doubles) -> RoadMap:
         successors=pairs(flow),
         left_neighbors=pairs(left),
         right_neighbors=pairs(right),
-        boundary=_polylines(network.rings, origin),
-        marks=_polylines(marks + [lanelet.ring for lanelet in network.crosswalks], origin),
+        boundary=polylines(network.rings, origin),
+        marks=polylines(marks + [lanelet.ring for lanelet in network.crosswalks], origin),
         mark_type=np.array(
             [MarkType.ROAD_LINE] * len(marks) + [MarkType.CROSSWALK] * len(network.crosswalks), np.uint8
         ),
@@ -239,10 +209,6 @@ def _markings(network: Network) -> list[Doubles]:
             if marked and bound[::-1].tobytes() not in found:
                 found.setdefault(bound.tobytes(), bound)
     return list(found.values())
-
-
-def _polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
-    return Polylines.of([to_float32(line - origin) for line in lines])
 
 
 def read_signals(

@@ -14,20 +14,33 @@ import numpy as np
 
 from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.demand import write_demand
-from symphony.data.sources.sumo.extract import DT, RULES, STATES, CropRule, cut_segments
-from symphony.data.sources.sumo.networks import NETWORKS
-from symphony.data.sources.sumo.process import sumo_home
+from symphony.data.sources.sumo.extract import DT, STATES, CropRule, crop_rule, cut_segments
+from symphony.data.sources.sumo.networks import NETWORKS, RAMP_RADIUS, ramp
+from symphony.data.sources.sumo.process import sumo_home, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.simulate import simulate_traffic
 from symphony.errors import ConfigError
 
-__all__ = ["DT", "KINDS", "STATES", "CropRule", "Generated", "generate", "generate_run", "sumo_home"]
+__all__ = [
+    "DT",
+    "KINDS",
+    "STATES",
+    "CropRule",
+    "Generated",
+    "crop_rule",
+    "generate",
+    "generate_run",
+    "sumo_home",
+    "sumo_version",
+]
 
 KINDS = tuple(NETWORKS)
 """Kinds of network that :func:`generate` knows."""
 WARM_UP = 30.0
-"""Simulated seconds before the first segment starts."""
+"""Simulated seconds before the first segment starts, at least."""
 SUBLANE_SHARE = 1 / 3
+_SLOW = 10.0
+"""m/s at which a longer freeway fills during a longer warm-up."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +59,7 @@ class Generated:
 def generate(
     kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None
 ) -> list[RunSegment]:
-    """Make one network, simulate its traffic once and cut run segments of 10 s at 5 Hz out of it.
+    """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
 
     The light of a movement is attached to the connector lane inside the junction, which only that movement
     takes; its stop point is the end of the lane before. Equal arguments give equal segments.
@@ -54,8 +67,9 @@ def generate(
     Args:
         kind: one of :data:`KINDS`.
         seed: of every random choice; another seed is another network.
-        duration: recorded seconds, after :data:`WARM_UP`.
-        rule: how maps and egos are chosen; the kind's own where not given.
+        duration: recorded seconds, after a warm-up.
+        rule: how maps and egos are chosen, and how long segments are (:func:`crop_rule`); the kind's own for
+            10 s where not given.
 
     Returns:
         Validated segments; those of one focus share one map object.
@@ -67,12 +81,23 @@ def generate(
     return generate_run(kind, seed, duration, rule=rule).segments
 
 
-def generate_run(kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None) -> Generated:
-    """As :func:`generate`, with the reasons for which windows were left out."""
+def generate_run(
+    kind: str,
+    seed: int,
+    duration: float = 150.0,
+    *,
+    rule: CropRule | None = None,
+    straight: float = 1.0,
+) -> Generated:
+    """As :func:`generate`, with the reasons for which windows were left out.
+
+    Routes go straight on at a junction ``straight`` times as likely as they take one of the turns.
+    """
     if kind not in NETWORKS:
         raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
-    if not duration >= STATES * DT:
-        raise ConfigError(f"duration must be at least {STATES * DT:.1f} s, is {duration}")
+    rule = rule or crop_rule(kind)
+    if not duration >= rule.steps * DT:
+        raise ConfigError(f"duration must be at least {rule.steps * DT:.1f} s, is {duration}")
     if seed < 0:
         raise ConfigError(f"seed must not be negative, is {seed}")
     roads_rng, demand_rng, drive_rng, cut_rng = (
@@ -80,13 +105,18 @@ def generate_run(kind: str, seed: int, duration: float = 150.0, *, rule: CropRul
     )
     with tempfile.TemporaryDirectory(prefix="symphony-sumo-") as name:
         folder = Path(name)
-        file = NETWORKS[kind](roads_rng, folder)
+        # A freeway must be longer than the map: what its ends do to traffic is not for a segment to show.
+        longer = max(0.0, rule.radius - RAMP_RADIUS) if kind == "ramp" else 0.0
+        file = ramp(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
         network = read_network(file)
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
-        end = WARM_UP + duration
-        demand = write_demand(network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane)
-        traffic = simulate_traffic(file, network, demand, drive_rng, end, WARM_UP, sublane=sublane)
+        warm_up = WARM_UP + longer / _SLOW
+        end = warm_up + duration
+        demand = write_demand(
+            network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane, straight=straight
+        )
+        traffic = simulate_traffic(file, network, demand, drive_rng, end, warm_up, sublane=sublane)
     segments, reasons = cut_segments(
-        f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule or RULES[kind]
+        f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule
     )
     return Generated(segments, reasons)

@@ -19,6 +19,8 @@ _BODIES = (
 )
 _DRIVERS = ("IDM", "EIDM", "Krauss")
 TYPES = 24
+_STRAIGHT = 0.6
+"""Radians between two streets up to which one goes on as the other."""
 DEPART_WITHIN = 15.0
 """Seconds in which the vehicles of a closed network enter it."""
 
@@ -60,19 +62,45 @@ def _walk(
     rng: np.random.Generator,
     start: int,
     following: list[list[int]],
+    chance: list[NDArray[np.float64]] | None,
     length: NDArray[np.float64],
     reach: float,
 ) -> list[int]:
-    """Edges of a random walk (uniform among the edges that follow) until it is ``reach`` metres long or ends."""
+    """Edges of a random walk until it is ``reach`` metres long or ends.
+
+    Of the edges that follow each has its ``chance``, the same one where none are given.
+    """
     route, total = [start], float(length[start])
     while total < reach and following[route[-1]]:
-        route.append(following[route[-1]][int(rng.integers(len(following[route[-1]])))])
+        at = route[-1]
+        if chance is None:
+            route.append(following[at][int(rng.integers(len(following[at])))])
+        else:
+            route.append(int(rng.choice(following[at], p=chance[at])))
         total += float(length[route[-1]])
     return route
 
 
+def _chances(network: Network, following: list[list[int]], straight: float) -> list[NDArray[np.float64]]:
+    """Per edge, the chances of the edges that follow: ``straight`` for the one straight on, to 1 for a turn."""
+    first, last = network.edge_headings()
+    chances = []
+    for edge, after in enumerate(following):
+        turn = np.abs(np.angle(np.exp(1j * (first[after] - last[edge]))))
+        weight = np.where(turn < _STRAIGHT, straight, 1.0)
+        chances.append(weight / weight.sum() if len(after) else weight)
+    return chances
+
+
 def write_demand(
-    network: Network, rng: np.random.Generator, folder: Path, duration: float, *, through: bool, sublane: bool
+    network: Network,
+    rng: np.random.Generator,
+    folder: Path,
+    duration: float,
+    *,
+    through: bool,
+    sublane: bool,
+    straight: float = 1.0,
 ) -> Demand:
     """Write vehicle types and vehicles with their routes.
 
@@ -84,10 +112,12 @@ def write_demand(
         through: traffic enters at the sources of the network during the whole run and leaves it at the end;
             else a fixed number of vehicles starts everywhere and circulates.
         sublane: the run uses the sublane model.
+        straight: how many times likelier a route goes straight on at a junction than it takes one of the turns.
     """
     types, sizes, shares = _types(rng, sublane)
     following, length, lanes = network.edge_graph()
     speed = network.edge_speed()
+    chance = None if straight == 1.0 else _chances(network, following, straight)
     if through:
         # Sources are edges nothing leads into; each lane carries 600-1 300 vehicles per hour.
         entered = {edge for edges in following for edge in edges}
@@ -110,7 +140,7 @@ def write_demand(
     lines = ["<routes>", *types]
     for k, i in enumerate(order):
         reach = (duration - departs[i] + 30) * float(speed.max())
-        route = _walk(rng, starts[i], following, length, reach)
+        route = _walk(rng, starts[i], following, chance, length, reach)
         edges = " ".join(network.edge_names[e] for e in route)
         lines.append(
             f'<vehicle id="{k}" type="t{kinds[k]}" depart="{departs[i]:.2f}" {place}>'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -16,7 +16,7 @@ from symphony.data.sources.sumo.simulate import STEP, Traffic
 
 DT = 0.2
 STATES = 51
-"""Steps of a segment: 10 s, that is 50 decisions after the first state."""
+"""Steps of a segment unless told otherwise: 10 s, that is 50 decisions after the first state."""
 EVERY = round(DT / STEP)
 
 MAX_OVERLAP = 0.05
@@ -39,6 +39,9 @@ class CropRule:
         partner_distance: metres from the ego to the nearest other vehicle that moves, at the first step.
         focuses: how many points of the network, at most.
         per_focus: how many segments share one map, at most.
+        steps: of a segment, its first state included.
+        interactive: moving vehicles a segment must have at its first step (N_I).
+        turn_interest: what a turn adds to a vehicle's chance of being the ego, where driving on has 0.3.
     """
 
     radius: float = 110.0
@@ -47,14 +50,40 @@ class CropRule:
     partner_distance: float = 40.0
     focuses: int = 6
     per_focus: int = 12
+    steps: int = STATES
+    interactive: int = 2
+    turn_interest: float = 1.2
 
 
 RULES = {
     "town": CropRule(),
     "grid": CropRule(),
     "ramp": CropRule(radius=190, ego_radius=165, agent_radius=180, focuses=4),
+    "random": CropRule(),
 }
 """Defaults per kind of network: freeways need longer maps for the same ten seconds."""
+_GROWTH = {"ramp": 13.5}
+"""Metres per second beyond the tenth by which all radii grow; elsewhere :data:`_TOWN_GROWTH`."""
+_TOWN_GROWTH = 4.5
+
+
+def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRule:
+    """The kind's rule for segments of so many seconds.
+
+    Longer segments get larger maps, so that a vehicle which drives on has road ahead of it to the end, and from
+    fewer points of the network, as those maps overlap more.
+    """
+    rule = RULES[kind]
+    more = max(0.0, seconds - 10.0)
+    grown = more * _GROWTH.get(kind, _TOWN_GROWTH)
+    return replace(
+        rule,
+        radius=rule.radius + grown,
+        ego_radius=rule.ego_radius + grown,
+        agent_radius=rule.agent_radius + grown,
+        steps=round(seconds / DT) + 1,
+        interactive=interactive,
+    )
 
 
 @dataclass(frozen=True)
@@ -73,7 +102,7 @@ class _Tracks:
 def cut_segments(
     name: str, network: Network, traffic: Traffic, rng: np.random.Generator, rule: CropRule
 ) -> tuple[list[RunSegment], Counter[str]]:
-    """Cut ten-second segments, one ego each, from windows that do not overlap at each focus.
+    """Cut segments, one ego each, from windows that do not overlap at each focus.
 
     Segments of one focus share one :class:`RoadMap` object and one origin.
 
@@ -94,8 +123,9 @@ def cut_segments(
         crop = crop_network(network, center, rule.radius)
         shapely.prepare(crop.drivable)
         found = 0
-        offset = int(rng.integers(0, STATES // 2))
-        for window, start in enumerate(range(offset, tracks.present.shape[1] - STATES + 1, STATES)):
+        offset = int(rng.integers(0, rule.steps // 2))
+        last = tracks.present.shape[1] - rule.steps
+        for window, start in enumerate(range(offset, last + 1, rule.steps)):
             if found == rule.per_focus:
                 break
             result = _cut(f"{name}-f{focus}-w{window:02d}", crop, tracks, start, rng, rule)
@@ -143,7 +173,7 @@ def _cut(
     name: str, crop: Crop, tracks: _Tracks, start: int, rng: np.random.Generator, rule: CropRule
 ) -> RunSegment | str:
     """One segment, or why there is none."""
-    window = slice(start, start + STATES)
+    window = slice(start, start + rule.steps)
     position = tracks.position[:, window] - crop.center
     away = np.linalg.norm(position, axis=-1)
     with np.errstate(invalid="ignore"):
@@ -159,6 +189,8 @@ def _cut(
     weight = _interest(position, heading, velocity, valid, travel, rule) * (stays & (travel > _EGO_TRAVEL))
     if weight.sum() == 0:
         return "no moving ego with a moving partner"
+    if (valid[:, 0] & (travel > MOVING)).sum() < rule.interactive:
+        return "too few moving vehicles at the first step"
     if (tracks.unphysical[agents, window] & valid).any():
         return "unphysical motion"
     if _overlap(position, heading, size, valid):
@@ -187,7 +219,7 @@ def _cut(
             road=crop.road,
             signal_lane=crop.signal_lane,
             signal_point=crop.signal_point,
-            signal_state=np.array(lights, np.uint8).reshape(len(lights), STATES),
+            signal_state=np.array(lights, np.uint8).reshape(len(lights), rule.steps),
             origin=np.array([*crop.center, 0.0]),
         )
     )
@@ -219,7 +251,7 @@ def _interest(
     turns = np.where(whole, np.abs(heading[:, -1] - heading[:, 0]), 0) > _TURN
     near = distance.min((1, 2)) < _NEAR
     changes = np.ptp(speed, axis=1) > _SPEED_CHANGE
-    return has_partner * (0.3 + 1.2 * turns + 0.5 * near + 0.5 * changes)
+    return has_partner * (0.3 + rule.turn_interest * turns + 0.5 * near + 0.5 * changes)
 
 
 def _overlap(

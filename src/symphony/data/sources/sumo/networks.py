@@ -5,6 +5,8 @@ All networks are for driving on the right. Every random choice comes from the ge
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET  # files are our own
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.sources.sumo.process import run_program
+from symphony.errors import DataError
 
 Point = NDArray[np.float64]
 SHARPEST_ANGLE = 1.05
 """Radians between two streets at a junction, at least where one of them is bent."""
 LATERAL_ACCELERATION = 3.0
 """m/s² that the speed limits of curved streets allow for; drivers exceed limits by up to 30 %."""
+_THROUGH = 0.75
+"""Cosine of the sharpest bend of an arterial at a junction."""
+_FEWEST_STREETS = 8
 _COMMON = [
     "--no-turnarounds",
     "true",
@@ -215,6 +221,13 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
         lanes, speed = arterial if main else collector
         links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
 
+    return _build(rng, folder, nodes, links, width)
+
+
+def _build(
+    rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Link], width: float
+) -> Path:
+    """Compile two-way streets with junctions of mixed control and roundabouts where they meet."""
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
     for link in links:
@@ -330,20 +343,106 @@ def grid(rng: np.random.Generator, folder: Path) -> Path:
     return folder / "net.net.xml"
 
 
+# Random networks ------------------------------------------------------------------------------------------------
+
+
+def random(rng: np.random.Generator, folder: Path) -> Path:
+    """Streets of all directions and lengths, without a grid: grown by ``netgenerate``, then built like a town's."""
+    nodes, pairs = _grown(rng, folder)
+    main = _through_road(rng, nodes, pairs)
+    width = rng.uniform(3.2, 3.7)
+    arterial = (int(rng.choice([2, 2, 3])), float(rng.choice([13.89, 15.65, 16.67])))
+    collector = (int(rng.choice([1, 1, 2])), float(rng.choice([8.94, 11.18, 13.41])))
+    links: list[_Link] = []
+    for a, b in pairs:
+        line = _street(rng, nodes, links, a, b)
+        lanes, speed = arterial if (a, b) in main else collector
+        links.append(_Link(a, b, line, (a, b) in main, lanes, min(speed, _comfortable_speed(line))))
+    return _build(rng, folder, nodes, links, width)
+
+
+def _grown(rng: np.random.Generator, folder: Path) -> tuple[Point, list[tuple[int, int]]]:
+    """Nodes [N, 2] and the two-way streets between them, from a random network; no street ends nowhere."""
+    nearest = rng.uniform(65, 85)
+    arguments = ["--rand", "--rand.iterations", str(rng.integers(50, 90)), "--rand.num-tries", "60"]
+    arguments += ["--rand.min-distance", f"{nearest:.2f}", "--rand.max-distance", f"{nearest * 1.8:.2f}"]
+    arguments += ["--rand.min-angle", "65", "--rand.connectivity", "0.98"]
+    for arms, chance in enumerate((0, 0, 5, 10, 1, 0), start=1):
+        arguments += [f"--rand.neighbor-dist{arms}", str(chance)]
+    arguments += ["--seed", str(rng.integers(1, 2**30)), "--output-file", "grown.net.xml"]
+    run_program("netgenerate", [*arguments, "--plain-output-prefix", "grown"], folder)
+    places = {
+        node.attrib["id"]: np.array([float(node.attrib["x"]), float(node.attrib["y"])])
+        for node in ET.parse(folder / "grown.nod.xml").getroot().iter("node")  # noqa: S314
+    }
+    streets = {
+        tuple(sorted((edge.attrib["from"], edge.attrib["to"])))
+        for edge in ET.parse(folder / "grown.edg.xml").getroot().iter("edge")  # noqa: S314
+    }
+    pairs = sorted(streets)
+    while True:
+        arms = Counter(end for pair in pairs for end in pair)
+        kept = [pair for pair in pairs if min(arms[end] for end in pair) > 1]
+        if len(kept) == len(pairs):
+            break
+        pairs = kept
+    if len(pairs) < _FEWEST_STREETS:
+        raise DataError(f"a random network came out with {len(pairs)} streets only")
+    names = sorted(arms)
+    return np.array([places[name] for name in names]), [(names.index(a), names.index(b)) for a, b in pairs]
+
+
+def _through_road(
+    rng: np.random.Generator, nodes: Point, pairs: list[tuple[int, int]]
+) -> set[tuple[int, int]]:
+    """Streets of an arterial: from a random one on both ways, each time into the street that bends least."""
+    first = pairs[int(rng.integers(len(pairs)))]
+    road = {first}
+    for before, here in (first, first[::-1]):
+        while True:
+            options = []
+            for pair in pairs:
+                if here in pair and pair not in road:
+                    end = pair[0] + pair[1] - here
+                    ahead, away = nodes[here] - nodes[before], nodes[end] - nodes[here]
+                    cosine = float(ahead @ away / np.linalg.norm(ahead) / np.linalg.norm(away))
+                    options.append((cosine, pair, end))
+            if not options or max(options)[0] < _THROUGH:
+                break
+            _, pair, end = max(options)
+            road.add(pair)
+            before, here = here, end  # noqa: PLW2901
+    return road
+
+
 # Freeway ramps --------------------------------------------------------------------------------------------------
 
 
-def ramp(rng: np.random.Generator, folder: Path) -> Path:
-    """Two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane."""
+RAMP_RADIUS = 190.0
+"""Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
+
+
+def ramp(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path:
+    """Two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
+
+    All ends, those of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
+    """
     net = PlainNetwork()
     width = rng.uniform(3.5, 3.75)
     speed = float(rng.choice([24.6, 26.8, 29.1]))
     direction = rng.uniform(0, 2 * np.pi)
-    curvature = rng.uniform(-1, 1) / 1500
+    # A longer road turns as much, not more.
+    curvature = rng.uniform(-1, 1) / 1500 * (600 / (600 + longer))
     for side in range(2):
         lanes = int(rng.integers(2, 4))
         _carriageway(
-            net, rng, side, (lanes, speed, width), direction + side * np.pi, curvature * (1 - 2 * side)
+            net,
+            rng,
+            side,
+            (lanes, speed, width),
+            direction + side * np.pi,
+            curvature * (1 - 2 * side),
+            longer,
         )
     return net.compile(folder, ["--default.junctions.radius", "4", "--junctions.scurve-stretch", "1.5"])
 
@@ -355,13 +454,14 @@ def _carriageway(
     road: tuple[int, float, float],
     direction: float,
     curvature: float,
+    longer: float,
 ) -> None:
     """One direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
     lanes, speed, width = road
     weaving = rng.random() < 0.4
-    stations = np.cumsum([0, 300, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
+    stations = np.cumsum([0, 300 + longer, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
     stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
-    stations = np.append(stations, stations[-1] + 300)
+    stations = np.append(stations, stations[-1] + 300 + longer)
     shift = stations[-1] / 2
     median = 5.0
 
@@ -411,9 +511,10 @@ def _carriageway(
     on, off = 1, len(extra) - 1
     # Ramps are longer than a crop's radius, so that their ends are never on a map.
     reach = np.linspace(1.7, 0, 20)
-    gap = 3 * reach + 30 * reach**2
-    start = along(marks[on] - 150 * reach, edge + gap)
-    end = along(marks[off] + 150 * reach[::-1], edge + gap[::-1])
+    far = 150 + longer
+    gap = (3 * reach + 30 * reach**2) * (far / 150)
+    start = along(marks[on] - far * reach, edge + gap)
+    end = along(marks[off] + far * reach[::-1], edge + gap[::-1])
     net.node(f"c{side}on", start[0], "priority")
     net.node(f"c{side}off", end[-1], "priority")
     options = {"lanes": 1, "width": width, "priority": 4}
@@ -423,5 +524,10 @@ def _carriageway(
     net.connect(ids[off - 1], last, [(0, 0)])
 
 
-NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {"town": town, "grid": grid, "ramp": ramp}
+NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
+    "town": town,
+    "grid": grid,
+    "ramp": ramp,
+    "random": random,
+}
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
 import subprocess
@@ -26,6 +27,17 @@ def sumo_home() -> Path:
         if (folder / "bin").is_dir():
             return folder
     raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony[sumo]'")
+
+
+@cache
+def sumo_version() -> str:
+    """Version of the installed SUMO, such as "1.28.0".
+
+    Raises:
+        DataError: the optional dependency is not installed.
+    """
+    sumo_home()
+    return importlib.metadata.version("eclipse-sumo")
 
 
 def run_program(name: str, arguments: list[str], folder: Path) -> str:

@@ -17,6 +17,7 @@ from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap
 Line = NDArray[np.float64]
 _DEFAULT_WIDTH = 3.2
 _FREEWAY_SPEED = 22.0
+_APPROACH = 15.0
 _LANE_SPACING, _CONNECTOR_SPACING, _BOUNDARY_SPACING = 2.0, 1.5, 3.0
 _BOUNDARY_TOLERANCE = 0.04
 _SLIT = 0.3
@@ -74,6 +75,17 @@ class Network:
             length[self.edge[k]] = _length(self.lanes[k])
             lanes[self.edge[k]] += 1
         return [sorted(f) for f in following], length, lanes
+
+    def edge_headings(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions in radians in which each edge begins and ends, over :data:`_APPROACH` metres."""
+        first, last = np.zeros(len(self.edge_names)), np.zeros(len(self.edge_names))
+        for k, line in enumerate(self.lanes):
+            for out, piece in ((first, line), (last, line[::-1])):
+                away = np.linalg.norm(piece - piece[0], axis=-1)
+                far = int(np.argmax(away > _APPROACH)) or len(piece) - 1
+                step = piece[far] - piece[0] if out is first else piece[0] - piece[far]
+                out[self.edge[k]] = np.arctan2(step[1], step[0])
+        return first, last
 
     def edge_speed(self) -> NDArray[np.float64]:
         """Speed limit per edge."""

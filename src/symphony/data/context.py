@@ -1,0 +1,223 @@
+"""How two vehicles have to do with each other, read off their logged paths (paper, section V-A).
+
+Only geometry in space and time: where the paths meet, at which angle, and how far apart in time. A lane graph would
+be slow to build and is not exact for every source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import RunSegment
+
+Reals = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+
+HALF_LANE = 1.5
+"""Metres sideways within which two paths are one. Vehicles in neighbouring lanes are about 3.5 m apart."""
+APART = 2.5
+"""Metres between two paths that count as different lanes before they become one."""
+SAME_WAY = np.deg2rad(30)
+"""Heading difference below which two vehicles at the same place go the same way. From there to 150 degrees they
+cross; what is beyond are vehicles that meet head on."""
+SHARED = 5.0
+"""Metres of path two vehicles must have in common."""
+LOOKBACK = 50.0
+"""Metres before the place where two paths become one in which they are compared. A lane change takes about 4 s."""
+TIME_GAP = 3.0
+"""Seconds between two vehicles at the same place within which one follows the other."""
+CONFLICT_GAP = 4.0
+"""Seconds between two vehicles at the place where their paths cross or become one within which they interact,
+centre to centre. Enough for giving way at a stop; between two customary limits: 3 s on the difference in time to
+the conflict point (INTERACTION data set, Zhan et al., 2019, arXiv:1910.03088) and 5 s on the post-encroachment
+time (SSAM, FHWA-HRT-08-051, 2008)."""
+QUEUE_SPEED = 5.0
+"""m/s; slower vehicles follow within the distance that is driven in ``TIME_GAP`` at this speed."""
+KEPT = 1.0
+"""Seconds for which a vehicle must be that close in the same lane."""
+
+
+class Context(StrEnum):
+    """Why the partner of the ego was chosen; the later ones say what it is to the ego. Best first."""
+
+    INTEREST = "interest"
+    """The source marks it as interacting (WOMD: objects of interest)."""
+    PREDICT = "predict"
+    """The source marks it for prediction (WOMD: tracks to predict)."""
+    MERGE = "merge"
+    """Both come into one lane from different lanes (a junction, a ramp, a lane change), shortly after each other."""
+    CROSSING = "crossing"
+    """The paths cross, and the two pass there shortly after each other."""
+    LEADER = "leader"
+    """It drives ahead on the ego's path, a short time gap away."""
+    FOLLOWER = "follower"
+    """It drives behind on the ego's path, likewise."""
+    NEAREST = "nearest"
+    """None of these: the nearest that moves."""
+
+
+@dataclass(frozen=True)
+class Relations:
+    """What each of K vehicles is to the ego; infinite gaps where it is not.
+
+    Attributes:
+        merge: [K] seconds between the two where their paths become one.
+        crossing: [K] seconds between the two where their paths cross.
+        leader: [K] smallest time gap to it, on the path in common.
+        follower: [K] likewise.
+    """
+
+    merge: Reals
+    crossing: Reals
+    leader: Reals
+    follower: Reals
+
+
+def relations(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Relations:
+    """Relate vehicles to the ego by the paths that were logged.
+
+    Args:
+        segment: the segment.
+        others: [K] agents, without the ego.
+    """
+    merge, crossing = np.full(len(others), np.inf), np.full(len(others), np.inf)
+    leader, follower = _queue_gap(segment, others, -1), _queue_gap(segment, others, 1)
+    rows = np.flatnonzero(_boxes_meet(segment, others))
+    if len(rows):
+        meeting = _Meeting.of(segment, others[rows])
+        shared, gap = meeting.shared, meeting.gap
+        together = meeting.length_in_common() >= SHARED
+        before = np.where(shared & (gap < 0), -gap, np.inf).min((1, 2))
+        after = np.where(shared & (gap > 0), gap, np.inf).min((1, 2))
+        for on_path, field in ((before, leader), (after, follower)):
+            field[rows] = np.minimum(np.where(together, on_path, np.inf), field[rows])
+        # Two paths that become one, or stop being one, cross on the way: those relations have their own names.
+        apart = ~shared.any((1, 2))
+        crossing[rows[apart]] = np.where(meeting.crossing[apart], np.abs(gap), np.inf).min((1, 2))
+        for k in np.flatnonzero(together & (np.minimum(before, after) <= CONFLICT_GAP)):
+            merge[rows[k]] = _merge_gap(segment, int(others[rows[k]]), shared[k], meeting.along[k])
+    limits = ((merge, CONFLICT_GAP), (crossing, CONFLICT_GAP), (leader, TIME_GAP), (follower, TIME_GAP))
+    return Relations(*(np.where(gaps <= limit + 1e-6, gaps, np.inf) for gaps, limit in limits))
+
+
+@dataclass(frozen=True)
+class _Meeting:
+    """K vehicles and the ego, T steps of each with each.
+
+    Attributes:
+        spacing: [T] metres the ego drives in a step, half before and half after it.
+        along: [K, T, T] metres the ego, at the step of the first axis, is ahead of the other at the second.
+        shared: [K, T, T] both at the same place, going the same way.
+        crossing: [K, T, T] both at the same place, at an angle.
+        gap: [T, T] seconds from the ego's step to the other's; negative where the other is there first.
+    """
+
+    spacing: Reals
+    along: Reals
+    shared: Bools
+    crossing: Bools
+    gap: Reals
+
+    @classmethod
+    def of(cls, segment: RunSegment, others: NDArray[np.integer[Any]]) -> _Meeting:
+        ego = segment.ego
+        position = segment.position[..., :2]
+        delta = position[ego, None, :, None] - position[others][:, None]
+        heading = segment.heading[others]
+        cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+        along = np.abs(cos * delta[..., 0] + sin * delta[..., 1])
+        aside = np.abs(cos * delta[..., 1] - sin * delta[..., 0])
+        turn = segment.heading[ego, None, :, None] - heading[:, None]
+        turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+        mine = _spacing(position[ego], segment.valid[ego])
+        theirs = _spacing(position[others], segment.valid[others])[:, None]
+        both = segment.valid[ego, None, :, None] & segment.valid[others][:, None]
+        # A place lies between two logged steps as a rule: half the way to the next one is added.
+        both &= along <= theirs / 2 + 0.5
+        shared = both & (turn < SAME_WAY) & (aside <= HALF_LANE)
+        crosses = (turn >= SAME_WAY) & (turn <= np.pi - SAME_WAY)
+        crossing = both & crosses & (aside <= mine[:, None] / 2 + 0.5)
+        time = np.arange(segment.num_steps) * segment.dt
+        return cls(mine, along, shared, crossing, time - time[:, None])
+
+    def length_in_common(self) -> Reals:
+        """[K] metres of the ego's path that are the other's, too."""
+        return self.shared.any(2) @ self.spacing
+
+
+def _spacing(position: Reals, valid: Bools) -> Reals:
+    """[..., T] half the way from the step before plus half the way to the next, in metres."""
+    sides = np.linalg.norm(np.diff(position, axis=-2), axis=-1)
+    sides = np.where(valid[..., 1:] & valid[..., :-1], sides, 0)
+    padded = np.concatenate([sides[..., :1], sides, sides[..., -1:]], -1)
+    return (padded[..., 1:] + padded[..., :-1]) / 2
+
+
+def _boxes_meet(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Bools:
+    """[K] whether the boxes around the two paths come close: cheap, and leaves few."""
+    position, valid = segment.position[..., :2], segment.valid[..., None]
+    rows = np.append(others, segment.ego)
+    low = np.where(valid[rows], position[rows], np.inf).min(1) - HALF_LANE
+    high = np.where(valid[rows], position[rows], -np.inf).max(1) + HALF_LANE
+    return ((low[:-1] <= high[-1]) & (low[-1] <= high[:-1])).all(1)
+
+
+def _queue_gap(segment: RunSegment, others: NDArray[np.integer[Any]], sign: int) -> Reals:
+    """[K] smallest time gap kept for a while by two in one lane at the same step; infinite if they don't.
+
+    In a queue, paths in common are too short to tell and time gaps grow without limit: there the distance counts,
+    as if the one behind drove ``QUEUE_SPEED``.
+
+    Args:
+        segment: the segment.
+        others: [K] agents.
+        sign: -1 for those ahead of the ego, 1 for those behind it.
+    """
+    ego = segment.ego
+    delta = sign * (segment.position[ego, :, :2] - segment.position[others, :, :2])
+    heading = segment.heading[others]
+    cos, sin = np.cos(heading), np.sin(heading)
+    along, aside = cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
+    behind = [ego] if sign < 0 else others
+    speed = np.linalg.norm(segment.velocity[behind], axis=-1)
+    gap = along / np.maximum(speed, QUEUE_SPEED)
+    turn = np.abs((segment.heading[ego] - heading + np.pi) % (2 * np.pi) - np.pi)
+    kept = segment.valid[ego] & segment.valid[others] & (along > 0) & (gap <= TIME_GAP)
+    kept &= (np.abs(aside) <= HALF_LANE) & (turn < SAME_WAY)
+    long_enough = kept.sum(1) * segment.dt >= KEPT
+    return np.where(long_enough, np.where(kept, gap, np.inf).min(1), np.inf)
+
+
+def _merge_gap(segment: RunSegment, other: int, shared: Bools, along: Reals) -> float:
+    """Seconds between the ego and another where their paths [T, T] become one; infinite if they always were.
+
+    Both paths are followed backwards from that place by the same distances: they must have been apart or at an
+    angle. What one of them did before the log begins is unknown, so a short way back proves nothing.
+    """
+    mine = int(shared.any(1).argmax())
+    theirs = int(np.where(shared[mine], along[mine], np.inf).argmin())
+    ahead, beside = _way_back(segment, segment.ego, mine), _way_back(segment, other, theirs)
+    reach = min(ahead[0][-1], beside[0][-1], LOOKBACK)
+    back = np.arange(1.0, reach + 1e-6)
+    if len(back) == 0:
+        return np.inf
+    ego, partner = (np.stack([np.interp(back, way[0], row) for row in way[1:]]) for way in (ahead, beside))
+    turn = np.abs((ego[2] - partner[2] + np.pi) % (2 * np.pi) - np.pi)
+    apart = np.hypot(*(ego[:2] - partner[:2])) >= APART
+    if not (apart | (turn >= 1.5 * SAME_WAY)).any():
+        return np.inf
+    return abs(theirs - mine) * segment.dt
+
+
+def _way_back(segment: RunSegment, agent: int, step: int) -> Reals:
+    """[4, n] distance driven since, x, y and heading at the logged steps from one back to the first."""
+    steps = np.flatnonzero(segment.valid[agent, : step + 1])[::-1]
+    position = segment.position[agent, steps, :2].astype(np.float64)
+    heading = np.unwrap(segment.heading[agent, steps].astype(np.float64))
+    driven = np.append(0, np.cumsum(np.hypot(*np.diff(position, axis=0).T)))
+    return np.stack([driven, *position.T, heading])

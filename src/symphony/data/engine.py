@@ -1,0 +1,176 @@
+"""One function over many tasks, in other processes of this machine or on a Ray cluster."""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from typing import Any, Literal, TypeVar
+
+from symphony.errors import ConfigError, SymphonyError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+Engine = Literal["local", "ray"]
+
+IN_FLIGHT = 2
+"""Tasks per worker that are submitted and not yet collected."""
+# A worker has one core: OpenMP threads of several workers would only take the cores from each other.
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+
+
+def ordered_map(
+    function: Callable[[T], R], tasks: Iterable[T], *, workers: int = 1, engine: Engine = "local"
+) -> Iterator[R]:
+    """Apply a function to every task; results come in the order of the tasks, whoever is done first.
+
+    Lazy: tasks are taken from the iterable as results are asked for, at most ``2 * workers`` ahead. One local
+    worker is this very process. When an error, an interrupt or the end of the caller's loop cuts it short, the
+    tasks under way are abandoned.
+
+    Args:
+        function: a function of a module (it is pickled, and so are tasks and results).
+        tasks: its arguments.
+        workers: processes; with Ray, tasks at a time are between this and ``2 * workers``, as CPUs are free.
+        engine: ``local`` for processes of this machine, ``ray`` for Ray: the cluster at ``RAY_ADDRESS`` or the
+            one ``ray.init`` was called for, else one on this machine.
+
+    Returns:
+        An iterator over the results.
+
+    Raises:
+        ConfigError: ``workers`` or ``engine`` can't be used, or Ray is not installed.
+        SymphonyError: a worker process died, while iterating; what ``function`` raises comes through unchanged.
+    """
+    if workers < 1:
+        raise ConfigError(f"workers must be at least 1, is {workers}")
+    if engine == "ray":
+        return _ray_map(_ray(workers), function, iter(tasks), IN_FLIGHT * workers)
+    if engine != "local":
+        raise ConfigError(f"unknown engine {engine!r} (known: local, ray)")
+    return map(function, tasks) if workers == 1 else _local_map(function, iter(tasks), workers)
+
+
+def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterator[deque[Any]]:
+    """Before each result, the submitted tasks, the one whose turn it is first."""
+    pending = deque(map(submit, itertools.islice(tasks, count)))
+    while pending:
+        yield pending
+        pending.popleft()
+        pending.extend(map(submit, itertools.islice(tasks, 1)))
+
+
+def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:
+    spawn = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads without their state
+    lifeline, stop = spawn.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, spawn, _begin_worker, (lifeline,))
+
+    def submit(task: T) -> Any:
+        with _environment(WORKER_ENVIRONMENT):  # processes are started here, as there is work for them
+            return pool.submit(_interruptible, function, task)
+
+    try:
+        for pending in _ahead(submit, tasks, IN_FLIGHT * workers):
+            yield pending[0].result()
+    except BrokenProcessPool as error:
+        message = (
+            "a worker process ended before its task was done: killed (out of memory?), crashed, or started "
+            "from a script without `if __name__ == '__main__':`"
+        )
+        raise SymphonyError(message) from error
+    finally:
+        stop.close()
+        pool.shutdown(wait=True, cancel_futures=True)
+        lifeline.close()
+
+
+_stopped = threading.Event()  # in a worker: the parent wants no more results
+
+
+def _begin_worker(lifeline: Connection) -> None:
+    """Stop when the parent closes its end of the pipe, and end when it ends, in whatever way."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # outside of tasks: a result half sent would hang the parent
+
+    def wait() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            lifeline.recv_bytes()
+        _stopped.set()
+        if hasattr(signal, "pthread_kill"):  # a real signal also ends a sleep or a read
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        else:
+            _thread.interrupt_main()
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _interruptible(function: Callable[[T], R], task: T) -> R:
+    """One task in a worker."""
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if _stopped.is_set():
+            raise KeyboardInterrupt
+        return function(task)
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def _environment(changes: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _ray(workers: int) -> Any:
+    """Ray, connected."""
+    try:
+        import ray  # noqa: PLC0415 (optional)
+    except ImportError as error:
+        message = "the engine 'ray' needs Ray: pip install 'symphony[ray]'"
+        raise ConfigError(message) from error
+    if not ray.is_initialized():
+        address = os.environ.get("RAY_ADDRESS")
+        size = {} if address else {"num_cpus": workers, "include_dashboard": False}
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level="warning", **size)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ConfigError(f"no Ray cluster at RAY_ADDRESS={address}: {error}") from error
+    return ray
+
+
+def _ray_map(ray: Any, function: Callable[[T], R], tasks: Iterator[T], count: int) -> Iterator[R]:
+    remote = ray.remote(num_cpus=1, runtime_env={"env_vars": WORKER_ENVIRONMENT})(function)
+    pending: deque[Any] = deque()
+    try:
+        for pending in _ahead(remote.remote, tasks, count):
+            yield ray.get(pending[0])
+    except ray.exceptions.RayTaskError as error:
+        # Unwrapped, so that callers catch what the function raised.
+        raise error.cause if isinstance(error.cause, Exception) else SymphonyError(str(error)) from error
+    except ray.exceptions.RayError as error:
+        raise SymphonyError(f"a Ray worker failed: {error}") from error
+    finally:
+        for reference in pending:
+            with contextlib.suppress(ray.exceptions.RayError):
+                ray.cancel(reference, force=True)

@@ -1,0 +1,358 @@
+"""Simulated run segments in any number: plans, the standard sets, and the generator that can be killed and resumed.
+
+A plan is a list of road networks, each with a seed of its own, from each of which a few segments are taken; many
+networks with few segments each give the most variety. Networks are made by any number of processes and written in
+the order of the plan, so a store depends on the plan alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from symphony.data.engine import Engine, ordered_map
+from symphony.data.segment import RunSegment
+from symphony.data.selection import usable
+from symphony.data.sources.sumo import KINDS, crop_rule, generate_run, sumo_version
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import ConfigError, DataError
+
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+DURATIONS = (10, 20, 30)
+"""Seconds a segment may last."""
+
+VERSION = 1
+"""Of this generator: another one may give other segments for the same plan, so a store is not continued by it."""
+FIRST_NETWORK = 1_000_000
+"""Seeds of networks below this are left to the built-in set and to experiments."""
+BLOCK = 100_000
+"""Networks that a seed has for each split."""
+MAX_SEED = 9_999
+PER_NETWORK = 8
+"""Segments taken from one network."""
+RECORDED = 90.0
+"""Simulated seconds per network, for segments of 10 s."""
+STRAIGHT = 5.0
+"""How many times likelier routes go straight on than they take one of the turns; walks without a preference would
+turn far more often than people do."""
+TURN_INTEREST = 0.2
+"""What a turn adds to a vehicle's chance of being the ego (see ``CropRule``)."""
+BARREN = 50
+"""Networks in a row that may give nothing before the plan is given up."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that decides what is in a generated store.
+
+    Attributes:
+        segments: how many.
+        seed: another seed is another set of networks.
+        split: training, validation and test sets never share a network, whatever their seeds.
+        kinds: of networks, which take turns; one named twice comes twice as often.
+        duration: seconds of a segment, one of :data:`DURATIONS`.
+        interactive: moving vehicles a segment must have at its first step (N_I).
+
+    Raises:
+        ConfigError: a value out of range; names the field.
+    """
+
+    segments: int
+    seed: int = 0
+    split: Split = "train"
+    kinds: tuple[str, ...] = ("town",)
+    duration: int = 10
+    interactive: int = 2
+
+    def __post_init__(self) -> None:
+        if self.segments < 1:
+            raise ConfigError(f"segments must be at least 1, is {self.segments}")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise ConfigError(f"seed must be between 0 and {MAX_SEED}, is {self.seed}")
+        if self.split not in SPLITS:
+            raise ConfigError(f"unknown split {self.split!r} (known: {', '.join(SPLITS)})")
+        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        if unknown or not self.kinds:
+            known = f"(known: {', '.join(KINDS)})"
+            raise ConfigError(
+                f"kinds: unknown kind of network {unknown[0]!r} {known}" if unknown else f"no kinds {known}"
+            )
+        if self.duration not in DURATIONS:
+            raise ConfigError(f"duration must be one of {DURATIONS}, is {self.duration}")
+        if self.interactive < 2:
+            raise ConfigError(f"interactive must be at least 2, is {self.interactive}")
+
+    def network(self, number: int) -> Task:
+        """The plan's network of that number, counted from 0.
+
+        Raises:
+            ConfigError: the seed has no more networks.
+        """
+        if not 0 <= number < BLOCK:
+            raise ConfigError(f"one seed has {BLOCK} networks for each split: make more stores instead")
+        first = FIRST_NETWORK + (self.seed * len(SPLITS) + SPLITS.index(self.split)) * BLOCK
+        return Task(
+            self.kinds[number % len(self.kinds)], first + number, float(self.duration), self.interactive
+        )
+
+    def networks(self, start: int = 0) -> Iterator[Task]:
+        """The plan's networks from one number on."""
+        return map(self.network, range(start, BLOCK + 1))
+
+    def settings(self) -> dict[str, Any]:
+        """As kept with the store: the arguments, and the versions that decide what they give."""
+        return {
+            **asdict(self),
+            "kinds": list(self.kinds),
+            "reader": "generate",
+            "generator": VERSION,
+            "sumo": sumo_version(),
+        }
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A standard set: its three plans, and the checksums of the stores they give."""
+
+    plans: dict[Split, Plan]
+    checksums: dict[Split, str]
+
+
+MADE_WITH = "SUMO 1.28.0"
+"""What the checksums of the standard sets were taken with."""
+
+
+def _preset(train: int, validation: int, test: int, checksums: dict[Split, str]) -> Preset:
+    counts: dict[Split, int] = {"train": train, "validation": validation, "test": test}
+    return Preset({split: Plan(count, split=split) for split, count in counts.items()}, checksums)
+
+
+# Both use seed 0, so the smaller set is the beginning of the larger one.
+PRESETS: dict[str, Preset] = {
+    "town-small": _preset(2_000, 200, 500, {}),
+    "town": _preset(10_000, 200, 1_000, {}),
+}
+"""The standard sets: towns with signals, all kinds of unsignalled control and roundabouts, 10 s, N_I = 2."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One network: its kind and seed, the seconds of a segment, and N_I."""
+
+    kind: str
+    seed: int
+    duration: float
+    interactive: int
+
+    @property
+    def name(self) -> str:
+        """As in the segments' tags."""
+        return f"{self.kind}-{self.seed}"
+
+
+@dataclass(frozen=True)
+class Harvest:
+    """What one network gave.
+
+    Attributes:
+        task: the network.
+        segments: those taken.
+        accepted: how many could have been.
+        reasons: how many windows were left out, and why.
+        seconds: it took.
+        error: why the network gave nothing at all, if it failed.
+    """
+
+    task: Task
+    segments: list[RunSegment]
+    accepted: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0
+    error: str = ""
+
+
+def harvest(task: Task) -> Harvest:
+    """Make one network, simulate it, and take :data:`PER_NETWORK` segments from as many of its maps as there are."""
+    begin = time.perf_counter()
+    rule = replace(crop_rule(task.kind, task.duration, task.interactive), turn_interest=TURN_INTEREST)
+    recorded = max(RECORDED, 5 * task.duration)
+    try:
+        run = generate_run(task.kind, task.seed, recorded, rule=rule, straight=STRAIGHT)
+    except DataError as error:
+        return Harvest(task, [], seconds=time.perf_counter() - begin, error=error.message)
+    good = []
+    for segment in run.segments:
+        try:
+            usable(segment, task.interactive)
+            good.append(segment)
+        except DataError as error:
+            run.reasons[f"{error.field}: excluded by the paper's limits"] += 1
+    taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
+    return Harvest(task, taken, len(good), run.reasons, time.perf_counter() - begin)
+
+
+def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
+    """At most ``count`` of the segments, each map giving one in turn, at random."""
+    by_map: dict[int, list[RunSegment]] = {}
+    for segment in segments:
+        by_map.setdefault(id(segment.road), []).append(segment)
+    groups = list(by_map.values())
+    turns = [(turn, k, group[i]) for k, group in enumerate(groups) for turn, i in enumerate(_shuffled(group, rng))]
+    first = rng.permutation(len(groups))
+    turns.sort(key=lambda entry: (entry[0], first[entry[1]]))
+    return [segment for _, _, segment in turns[:count]]
+
+
+def _shuffled(items: list[Any], rng: np.random.Generator) -> list[int]:
+    return rng.permutation(len(items)).tolist()
+
+
+@dataclass
+class Generation:
+    """How far a plan is, as kept in its store's report.
+
+    Attributes:
+        networks: simulated, all their segments written.
+        accepted: segments they gave, of which some were taken.
+        reasons: how many windows gave none, and why.
+        failed: networks that gave nothing, and why.
+        seconds: spent on networks, summed over the workers.
+        complete: all segments are there.
+    """
+
+    networks: int = 0
+    accepted: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+    complete: bool = False
+
+    def add(self, found: Harvest) -> None:
+        """Count one more network."""
+        self.networks += 1
+        self.accepted += found.accepted
+        self.reasons = dict((Counter(self.reasons) + found.reasons).most_common())
+        self.seconds = round(self.seconds + found.seconds, 3)
+        if found.error:
+            self.failed[found.task.name] = found.error
+
+
+Progress = Callable[[int, Generation], None]
+"""Called with the segments in the store, and how far the plan is, after each network."""
+
+
+def generate(
+    plan: Plan,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    engine: Engine = "local",
+    progress: Progress | None = None,
+) -> Generation:
+    """Carry out a plan, or continue one that was interrupted at any moment; a finished store is left as it is.
+
+    Args:
+        plan: what to make.
+        out: directory of the store.
+        workers: processes; their number changes nothing in the store.
+        engine: where they are, see :func:`symphony.data.engine.ordered_map`.
+        progress: told how far it is.
+
+    Returns:
+        How the store was made, from its beginning.
+
+    Raises:
+        ConfigError: the store is being made with other arguments; names the first that differs.
+        DataError: ``out`` holds something else, SUMO is not installed, or the networks give no segments.
+    """
+    settings = plan.settings()
+    with StoreWriter(out, append=True) as writer:
+        store = SegmentStore(out)
+        state = _begin(store, settings)
+        if state.complete:
+            return state
+        _report(writer, settings, state)
+        barren = 0
+        with _closing(ordered_map(harvest, plan.networks(state.networks), workers=workers, engine=engine)) as found:
+            for result in found:
+                before = len(writer)
+                for segment in result.segments:
+                    # A network under way when a run was killed is made anew: what is there of it is skipped.
+                    if len(writer) < plan.segments and not writer.has(segment.segment_id):
+                        tags = {"kind": result.task.kind, "network": result.task.name}
+                        writer.append(segment, tags=tags)
+                state.add(result)
+                state.complete = len(writer) == plan.segments
+                _report(writer, settings, state)
+                if progress is not None:
+                    progress(len(writer), state)
+                barren = 0 if len(writer) > before or result.segments else barren + 1
+                if state.complete:
+                    break
+                if barren == BARREN:
+                    raise DataError(_in_vain(state), file=writer.path)
+    return state
+
+
+def _begin(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
+    """Where to continue, after a look at whether this is the store of the same plan."""
+    report = store.report
+    if not report and not len(store):
+        return Generation()
+    there = report.get("settings") or {}
+    if "generation" not in report or there.get("reader") != "generate":
+        raise DataError("is a segment store that was not generated: refusing to write into it", file=store.path)
+    for name, value in settings.items():
+        if there.get(name) != value:
+            raise ConfigError(
+                f"{store.path} was made with {name} {_plain(there.get(name))}, not {_plain(value)}: "
+                "give the same arguments to continue it, or choose another folder"
+            )
+    known = {entry.name for entry in fields(Generation)}
+    return Generation(**{name: value for name, value in report["generation"].items() if name in known})
+
+
+def _plain(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _report(writer: StoreWriter, settings: Mapping[str, Any], state: Generation) -> None:
+    writer.write_report(
+        {
+            "converted": len(writer),
+            "files": state.networks,
+            "settings": settings,
+            "generation": asdict(state),
+        }
+    )
+
+
+def _in_vain(state: Generation) -> str:
+    why = [f"  {count} x {reason}" for reason, count in list(state.reasons.items())[:5]]
+    why += [f"  {name}: {message}" for name, message in list(state.failed.items())[-2:]]
+    return "\n".join([f"{BARREN} networks in a row gave no segment; windows were left out because:", *why])
+
+
+@contextlib.contextmanager
+def _closing(results: Iterable[Harvest]) -> Iterator[Iterable[Harvest]]:
+    try:
+        yield results
+    finally:
+        close = getattr(results, "close", None)
+        if close is not None:
+            close()
+
+
+def add_to_report(path: str | Path, name: str, value: Any) -> None:
+    """Keep something more in the report of a store."""
+    store = SegmentStore(path)
+    with StoreWriter(path, append=True) as writer:
+        writer.write_report({**store.report, name: value})

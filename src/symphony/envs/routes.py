@@ -1,0 +1,155 @@
+"""Routes as tables of points: what a goal looks like to a policy.
+
+Legend: G feasible routes of one vehicle, K points of a route, N agents, M rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from symphony.data.segment import RunSegment
+from symphony.geometry.frames import rotate
+from symphony.roadgraph import (
+    LaneGraph,
+    feasible_routes,
+    ground_truth_route,
+    route_polyline,
+    starting_lanes,
+)
+
+SPACING = 3.0
+"""Metres between the points of a route."""
+POINTS = 64
+"""Points of a route: 189 m, past what a fast vehicle drives in 10 s."""
+AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
+"""Points of its route that a vehicle sees, counted from the one nearest to it."""
+ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
+STRIDE = 4
+"""Of the points of a route, the share (one in so many) by which the goal policy judges it."""
+CHOICE_FEATURES = 5 * (POINTS // STRIDE)
+
+
+@dataclass(frozen=True)
+class RouteTable:
+    """Feasible routes of one vehicle from its first valid state.
+
+    Attributes:
+        points: [G, K, 2] float32, :data:`SPACING` apart from beside the vehicle on; past the end the last one again.
+        count: [G] int64 points before the end.
+        logged: the route nearest to the logged trajectory, -1 where the vehicle is on no lane.
+    """
+
+    points: NDArray[np.float32]
+    count: NDArray[np.int64]
+    logged: int
+
+
+def route_table(segment: RunSegment, graph: LaneGraph, agent: int) -> RouteTable:
+    """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B)."""
+    first = int(segment.valid[agent].argmax())
+    position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
+    choices = feasible_routes(graph, position, heading)
+    if not choices:
+        return RouteTable(np.zeros((0, POINTS, 2), np.float32), np.zeros(0, np.int64), -1)
+    along = dict(starting_lanes(graph, position, heading))
+    # A route that begins with a lane change starts on the neighbour, beside the lane the vehicle is on.
+    default = next(iter(along.values()), 0.0)
+    points = np.empty((len(choices), POINTS, 2), np.float32)
+    count = np.empty(len(choices), np.int64)
+    for k, route in enumerate(choices):
+        line = route_polyline(
+            graph,
+            route,
+            spacing=SPACING,
+            start=along.get(route[0], default),
+            length=SPACING * (POINTS - 1),
+        )[:POINTS]
+        points[k, : len(line)] = line
+        points[k, len(line) :] = line[-1]
+        count[k] = len(line)
+    path, valid = segment.position[agent, :, :2], segment.valid[agent]
+    return RouteTable(points, count, ground_truth_route(graph, choices, path, valid))
+
+
+def route_ahead(
+    state: Float[Tensor, "M N 4"],
+    points: Float[Tensor, "M N K 2"],
+    count: Int[Tensor, "M N"],
+    distance_scale: float,
+) -> Float[Tensor, "M N F"]:
+    """What each agent sees of its route, in its own frame.
+
+    Whether it has one, how far to the left the route lies (metres / 5), its direction, then position and existence of
+    points ahead. All zero without a route.
+
+    Args:
+        state: x, y, heading, speed.
+        points: the agents' routes.
+        count: points of each route that exist; 0 for none.
+        distance_scale: metres that become 1.
+    """
+    position, heading = state[..., :2], state[..., 2]
+    exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
+    with torch.no_grad():
+        squared = (points - position[..., None, :]).square().sum(-1)
+        # The last point has nothing ahead of it, so the one before gives the direction.
+        nearest = squared.masked_fill(~exists, torch.inf).argmin(-1)
+        nearest = nearest.minimum((count - 2).clamp_min(0))
+        which = nearest[..., None] + torch.tensor(AHEAD, device=points.device)
+        there = which < count[..., None]
+        which = which.clamp_max(points.shape[2] - 1)
+    seen = points.gather(2, which[..., None].expand(*which.shape, 2))
+    local = rotate(seen - position[..., None, :], -heading[..., None])
+    along = local[..., 1, :] - local[..., 0, :]
+    length = along.norm(dim=-1, keepdim=True)
+    along = along / length.clamp_min(1e-3)
+    offset = along[..., 0] * local[..., 0, 1] - along[..., 1] * local[..., 0, 0]
+    has = (count > 1).to(state.dtype)[..., None]
+    ahead = torch.cat([local / distance_scale, there[..., None].to(state.dtype)], -1)
+    ahead = ahead[..., 1:, :] * there[..., 1:, None]
+    features = torch.cat(
+        [torch.ones_like(has), (offset / 5.0).clamp(-2.0, 2.0)[..., None], along, ahead.flatten(-2)], -1
+    )
+    return features * has
+
+
+def route_choices(
+    state: Float[Tensor, "M N 4"],
+    points: Float[Tensor, "M N G K 2"],
+    count: Int[Tensor, "M N G"],
+    distance_scale: float,
+) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
+    """Every feasible route as features in the agent's frame, and which of them exist (see :data:`CHOICE_FEATURES`)."""
+    kept = points[..., ::STRIDE, :]
+    angle = -state[..., None, None, 2]
+    local = rotate(kept - state[..., None, None, :2], angle)
+    following = points[..., 1::STRIDE, :] - kept
+    direction = rotate(following / following.norm(dim=-1, keepdim=True).clamp_min(1e-3), angle)
+    order = torch.arange(0, points.shape[-2], STRIDE, device=points.device)
+    there = (order < count[..., None])[..., None].to(state.dtype)
+    features = torch.cat([local / distance_scale, direction, torch.ones_like(there)], -1) * there
+    return features.flatten(-2), count > 1
+
+
+
+def pick_routes(
+    route: Float[Tensor, "B N G K 2"],
+    count: Int[Tensor, "B N G"],
+    scene: Int[Tensor, " M"],
+    goal: Int[Tensor, "M N"],
+) -> tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]]:
+    """The points of one route per agent and how many of them exist: none where the goal is -1."""
+    _, agents, routes = count.shape
+    if routes == 0:
+        return route.new_zeros(*goal.shape, POINTS, 2), torch.zeros_like(goal)
+    place = torch.arange(agents, device=goal.device)
+    row = ((scene[:, None] * agents + place) * routes + goal.clamp_min(0)).flatten()
+    points = route.flatten(0, 2).index_select(0, row).unflatten(0, goal.shape)
+    exists = count.flatten().index_select(0, row).unflatten(0, goal.shape)
+    return points, torch.where(goal >= 0, exists, 0)

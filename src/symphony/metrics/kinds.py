@@ -1,0 +1,265 @@
+"""What kind of collision: who ran into whom, and from where.
+
+A rate alone doesn't tell a policy that brakes too late from one that is hit by playback vehicles, which can't react.
+
+Metres, radians, seconds. Legend: A agents of the scene, N interactive agents, T simulated steps, T+1 states with the
+first one.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from symphony.geometry import box_gap, rotate, wrap
+
+SAME_WAY = math.radians(45)
+"""Largest angle between the headings of two agents that go the same way."""
+OPPOSITE_WAY = math.radians(135)
+"""Smallest angle between the headings of two agents that go opposite ways."""
+STANDING = 0.5
+"""Speed in m/s up to which an agent counts as standing."""
+_SLACK = 0.01
+
+
+class CollisionKind(IntEnum):
+    """Kinds of collision, from the agent's point of view.
+
+    The headings before contact decide the way. Of two agents that go the same way the sides that met are those whose
+    gap closed last: ends (one ahead of the other) or flanks (one beside the other).
+
+    Attributes:
+        INTO_LEADER: same way, its front met the tail of one ahead.
+        ONCOMING: the other faces the opposite way.
+        CROSSING: the other faces across.
+        SIDESWIPE: same way, flank to flank, as after a lane change.
+        OTHER: same way, end to end, because one backed into the other, which stood or backed too.
+        REAR_ENDED: same way, its tail was met by the front of one behind.
+    """
+
+    INTO_LEADER = 0
+    ONCOMING = 1
+    CROSSING = 2
+    SIDESWIPE = 3
+    OTHER = 4
+    REAR_ENDED = 5
+
+
+class CollisionKinds(NamedTuple):
+    """The first collision of every interactive agent, all `[..., N]`.
+
+    Attributes:
+        kind: int64 :class:`CollisionKind`, -1 for no collision.
+        step: int64 simulated step, from 0, -1 for no collision.
+        other: int64 row of A of the agent it collided with, -1 for no collision.
+        playback: bool, whether that one is no interactive agent.
+    """
+
+    kind: Tensor
+    step: Tensor
+    other: Tensor
+    playback: Tensor
+
+    def first(self) -> tuple[Int[Tensor, "*lead"], Bool[Tensor, "*lead"]]:
+        """Kind (-1 for none) and `playback` of the first collision of each rollout.
+
+        Of collisions at the same step, as when two interactive agents meet, the first of :class:`CollisionKind`
+        counts: the one who ran into the other, not the one who was hit.
+        """
+        number = len(CollisionKind)
+        none = torch.iinfo(torch.int64).max
+        key = 2 * (number * self.step + self.kind) + (~self.playback).long()
+        key = torch.where(self.kind < 0, none, key)
+        key = torch.cat([key, torch.full_like(key[..., :1], none)], -1).amin(-1)
+        happened = key != none
+        return torch.where(happened, key // 2 % number, -1), happened & (key % 2 == 0)
+
+
+class _Poses(NamedTuple):
+    """Position [M, A, 2], heading [M, A], velocity [M, A, 2] and validity [M, A]."""
+
+    position: Tensor
+    heading: Tensor
+    velocity: Tensor
+    valid: Tensor
+
+    def of(self, row: Tensor) -> _Poses:
+        """Of one agent [M] each."""
+        return _Poses(*(value[torch.arange(len(row), device=row.device), row] for value in self))
+
+
+def collision_kinds(
+    collided: Bool[Tensor, "*#lead N T"],
+    state: Float[Tensor, "*#lead N T+1 4"],
+    exists: Bool[Tensor, "*#lead N T+1"],
+    subject: Int[Tensor, "*#lead N"],
+    log_state: Float[Tensor, "*#lead A T+1 5"],
+    log_valid: Bool[Tensor, "*#lead A T+1"],
+    size: Float[Tensor, "*#lead A 2"],
+) -> CollisionKinds:
+    """With whom, when and how each interactive agent collides first. Leading dimensions broadcast.
+
+    The other one is the valid agent whose box reaches deepest into the agent's at that step. The states one step
+    before decide the kind, because at contact fast boxes lie far inside each other; where the other is not valid
+    then, those at contact.
+
+    Args:
+        collided: [..., N, T] whether an agent collides at a step, as :func:`symphony.metrics.collisions` finds it.
+        state: [..., N, T+1, 4] x, y, heading, speed of the interactive agents.
+        exists: [..., N, T+1] whether they are there.
+        subject: [..., N] their rows of A; a negative one stands for no agent.
+        log_state: [..., A, T+1, 5] x, y, heading, velocity x, velocity y of all agents as logged; the rows of the
+            interactive agents are not read.
+        log_valid: [..., A, T+1].
+        size: [..., A, 2] length and width.
+
+    Raises:
+        ValueError: for shapes that do not fit together, or a flagged agent that touches nobody.
+    """
+    lead = _lead(collided, state, exists, subject, log_state, log_valid, size)
+    collided = collided.expand(*lead, *collided.shape[-2:])
+    subject = subject.expand(*lead, subject.shape[-1])
+    hit = collided.any(-1)
+    *where, who = hit.nonzero(as_tuple=True)
+    step = collided.to(torch.uint8).argmax(-1)[hit]
+    rows = subject[tuple(where)]
+    agent = rows.gather(-1, who[:, None])[:, 0]
+    if bool((agent < 0).any()):
+        raise ValueError("collided is True for a subject that stands for no agent")
+
+    def poses(index: Tensor) -> _Poses:
+        at = (*where, index)
+        logged = log_state.expand(*lead, *log_state.shape[-3:]).transpose(-3, -2)[at]
+        valid = log_valid.expand(*lead, *log_valid.shape[-2:]).transpose(-2, -1)[at]
+        driven = state.expand(*lead, *state.shape[-3:]).transpose(-3, -2)[at]
+        there = exists.expand(*lead, *exists.shape[-2:]).transpose(-2, -1)[at]
+        direction = torch.stack([driven[..., 2].cos(), driven[..., 2].sin()], -1)
+        driven = torch.cat([driven[..., :3], driven[..., 3:] * direction], -1).to(logged.dtype)
+        logged, valid = _placed(logged, driven, rows), _placed(valid, there, rows)
+        return _Poses(logged[..., :2], logged[..., 2], logged[..., 3:], valid)
+
+    boxes = size.expand(*lead, *size.shape[-2:])[tuple(where)]
+    contact, before = poses(step + 1), poses(step)
+    other = _deepest(contact, boxes, agent)
+    one, two = before.of(agent), before.of(other)
+    seen = one.valid & two.valid
+    ours, theirs = (boxes[torch.arange(len(row), device=row.device), row] for row in (agent, other))
+    at_contact = contact.of(agent), contact.of(other)
+    kind = _classify(
+        *(_chosen(seen, now, then) for now, then in zip((one, two), at_contact, strict=True)),
+        *at_contact,
+        ours,
+        theirs,
+    )
+
+    def filled(values: Tensor) -> Tensor:
+        return torch.full(hit.shape, -1, device=hit.device).masked_scatter(hit, values)
+
+    playback = ~(other[:, None] == rows).any(-1)
+    return CollisionKinds(filled(kind), filled(step), filled(other), filled(playback.long()) == 1)
+
+
+def _placed(values: Tensor, driven: Tensor, rows: Tensor) -> Tensor:
+    """Values [M, A, ...] with those of the interactive agents [M, N, ...] in their rows."""
+    count = values.shape[1]
+    # Padding goes to a row more, which is dropped.
+    values = torch.cat([values, torch.zeros_like(values[:, :1])], 1)
+    index = torch.where(rows < 0, count, rows)
+    index = index.reshape(index.shape + (1,) * (values.ndim - 2)).expand_as(driven)
+    return values.scatter(1, index, driven)[:, :count]
+
+
+def _deepest(contact: _Poses, boxes: Tensor, agent: Tensor) -> Tensor:
+    me = torch.arange(len(agent), device=agent.device), agent
+    gap = box_gap(
+        contact.position[me][:, None],
+        contact.heading[me][:, None],
+        boxes[me][:, None],
+        contact.position,
+        contact.heading,
+        boxes,
+    )
+    others = contact.valid & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
+    least, other = torch.where(others, gap, torch.inf).min(-1)
+    if bool((least > _SLACK).any()):
+        raise ValueError(
+            f"an agent that is said to collide is {float(least.max()):.2f} m away from all others: "
+            "flags and states do not belong together"
+        )
+    return other
+
+
+def _chosen(condition: Tensor, yes: _Poses, no: _Poses) -> _Poses:
+    return _Poses(
+        *(
+            torch.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+            for a, b in zip(yes, no, strict=True)
+        )
+    )
+
+
+def _classify(
+    one: _Poses, two: _Poses, one_hit: _Poses, two_hit: _Poses, size_one: Tensor, size_two: Tensor
+) -> Tensor:
+    """Kind [M] for poses before and at contact."""
+    turn = wrap(two.heading - one.heading)
+    away, along, across = _separations(one, two, size_one, size_two)
+    _, along_hit, across_hit = _separations(one_hit, two_hit, size_one, size_two)
+    ends = _closing(along, along_hit) >= _closing(across, across_hit)
+    ahead = away > 0
+    axis = one.heading + 0.5 * turn
+    forward, forward_other = (rotate(pose.velocity, -axis)[..., 0] for pose in (one, two))
+    back, front = torch.where(ahead, forward, forward_other), torch.where(ahead, forward_other, forward)
+    backing = (front < -STANDING) & (back < STANDING)
+    kind = torch.where(ahead, int(CollisionKind.INTO_LEADER), int(CollisionKind.REAR_ENDED))
+    kind = torch.where(backing, int(CollisionKind.OTHER), kind)
+    kind = torch.where(ends, kind, int(CollisionKind.SIDESWIPE))
+    kind = torch.where(turn.abs() > SAME_WAY, int(CollisionKind.CROSSING), kind)
+    return torch.where(turn.abs() >= OPPOSITE_WAY, int(CollisionKind.ONCOMING), kind)
+
+
+def _separations(one: _Poses, two: _Poses, size_one: Tensor, size_two: Tensor) -> tuple[Tensor, ...]:
+    """How far two is ahead of one, and the gaps between their boxes along and across their mean heading."""
+    half = 0.5 * wrap(two.heading - one.heading)
+    # The mean heading, not that of either: so the two agents always agree on what they did.
+    delta = rotate(two.position - one.position, -(one.heading + half))
+    reach = 0.5 * (size_one + size_two)
+    cos, sin = half.cos().abs(), half.sin().abs()
+    along = delta[..., 0].abs() - (cos * reach[..., 0] + sin * reach[..., 1])
+    across = delta[..., 1].abs() - (sin * reach[..., 0] + cos * reach[..., 1])
+    return delta[..., 0], along, across
+
+
+def _closing(gap: Tensor, gap_hit: Tensor) -> Tensor:
+    """Share of the step after which a gap is closed; where it was closed before, minus its depth."""
+    return torch.where(gap > 0, gap / (gap - gap_hit).clamp(min=1e-6), gap)
+
+
+def _lead(
+    collided: Tensor,
+    state: Tensor,
+    exists: Tensor,
+    subject: Tensor,
+    log_state: Tensor,
+    log_valid: Tensor,
+    size: Tensor,
+) -> torch.Size:
+    (agents, steps), everyone = collided.shape[-2:], size.shape[-2]
+    expected = {
+        "state": (state, (agents, steps + 1, 4)),
+        "exists": (exists, (agents, steps + 1)),
+        "subject": (subject, (agents,)),
+        "log_state": (log_state, (everyone, steps + 1, 5)),
+        "log_valid": (log_valid, (everyone, steps + 1)),
+        "size": (size, (everyone, 2)),
+    }
+    for name, (value, shape) in expected.items():
+        if value.shape[-len(shape) :] != shape:
+            raise ValueError(f"{name} is {list(value.shape)}, expected {list(shape)} at the end")
+    shapes = [value.shape[: -len(shape)] for value, shape in expected.values()]
+    return torch.broadcast_shapes(collided.shape[:-2], *shapes)

@@ -1,0 +1,123 @@
+"""The discriminator D(s | g): how much a state looks simulated (paper, sections II-C and IV-C)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from symphony.keys import GAP, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
+from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+from symphony.modules.pooling import PoolMode
+
+Features = Literal["paper", "clearance"]
+_GAP, _ROAD = 3, 2 * 5
+
+
+def gap_features(gap: Tensor) -> Tensor:
+    """Signed gaps in metres `[...]` as numbers of order one `[..., 3]`: fine near contact, coarse farther away."""
+    return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
+
+
+def road_features(distance: Tensor) -> Tensor:
+    """Signed distances to the edge of the road in metres `[..., 5]` as numbers of order one `[..., 10]`."""
+    return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
+
+
+class Discriminator(nn.Module):
+    """Max-pool over all objects and map points within a radius, and a head that gives one logit per agent.
+
+    The logit is high for states that look simulated: D = sigmoid(logit) is the probability of that.
+
+    Args:
+        own_features: of the agent itself, its route included where it is given one.
+        object_features: of one object; the first two are its position in the agent's frame.
+        point_features: of one map or light point; likewise.
+        radius: how far it sees, in the units of those positions.
+        hidden: width of the encoders.
+        head: widths of the head's hidden layers.
+        features: ``paper``, or ``clearance``, which adds the signed gap to the box of each object and the signed
+            distances of centre and corners to the edge of the road.
+    """
+
+    def __init__(
+        self,
+        own_features: int,
+        object_features: int,
+        point_features: int,
+        *,
+        radius: float = 1.0,
+        hidden: int = 32,
+        head: Sequence[int] = (64,),
+        features: Features = "clearance",
+        pool: PoolMode = "auto",
+    ) -> None:
+        super().__init__()
+        self.radius, self.clearance = radius, features == "clearance"
+        widths = (own_features, object_features, point_features)
+        if self.clearance:
+            widths = (own_features + _ROAD, object_features + _GAP, point_features)
+        encoder = SceneEncoder(widths[0], widths[1:], hidden=hidden, pool=pool)
+        self.network = SceneNetwork(encoder, 1, head=head)
+
+    def forward(
+        self,
+        own: Tensor,
+        valid: Tensor,
+        objects: Tensor,
+        objects_mask: Tensor,
+        points: Tensor,
+        points_mask: Tensor,
+        gap: Tensor | None = None,
+        road: Tensor | None = None,
+    ) -> Tensor:
+        """Logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, gap `[..., N, O]`, road
+        `[..., N, 5]`.
+        """
+        objects_mask = objects_mask & self._near(objects)
+        points_mask = points_mask & self._near(points)
+        if gap is not None and road is not None and self.clearance:
+            own = torch.cat([own, road_features(road)], -1)
+            objects = torch.cat([objects, gap_features(gap)], -1)
+        logits = self.network(own, valid, objects, objects_mask, points, points_mask).squeeze(-1)
+        return torch.where(valid, logits, 0.0)
+
+    def _near(self, elements: Tensor) -> Tensor:
+        return elements[..., :2].detach().square().sum(-1) <= self.radius**2
+
+
+def discriminator(
+    own_features: int,
+    object_features: int,
+    point_features: int,
+    *,
+    own_keys: Sequence[NestedKey] = (OWN,),
+    valid_key: NestedKey = VALID,
+    out_key: NestedKey = SCORE,
+    radius: float = 1.0,
+    hidden: int = 32,
+    head: Sequence[int] = (64,),
+    features: Features = "clearance",
+    pool: PoolMode = "auto",
+) -> TensorDictModule:
+    """A :class:`Discriminator` that reads an observation and writes its logits `[..., N]`."""
+    network = Discriminator(
+        own_features,
+        object_features,
+        point_features,
+        radius=radius,
+        hidden=hidden,
+        head=head,
+        features=features,
+        pool=pool,
+    )
+    groups = (
+        ElementGroup(OBJECTS, OBJECTS_MASK, object_features),
+        ElementGroup(POINTS, POINTS_MASK, point_features),
+    )
+    more = (GAP, ROAD) if features == "clearance" else ()
+    return scene_module(network, groups, out_key, own_keys=own_keys, valid_key=valid_key, more_keys=more)

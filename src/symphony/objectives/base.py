@@ -1,0 +1,191 @@
+"""What the losses of this package share: settable keys, masks of the entries that count, reductions."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
+from torch import Tensor
+from torch.distributions import Categorical
+from torchrl.objectives.common import LossModule
+
+Reduction = Literal["mean", "sum", "none"]
+
+
+class MaskedLoss(LossModule):
+    """A loss over entries `[...]` (times, agents) of which some are padding.
+
+    A subclass declares its keys, among them `valid`, and lists what it reads in `_read_keys`.
+
+    Args:
+        reduction: `"mean"` (also for None), `"sum"` or `"none"`.
+        use_mask: whether the TensorDict holds a mask under the `valid` key. A mask that is expected but
+            absent is an error: training on padding would go unnoticed.
+    """
+
+    def __init__(self, reduction: Reduction | None, use_mask: bool) -> None:
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        self.reduction: Reduction = "mean" if reduction is None else reduction
+        if self.reduction not in ("mean", "sum", "none"):
+            raise ValueError(f"unknown reduction {reduction!r}, expected 'mean', 'sum' or 'none'")
+        self.use_mask = use_mask
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        pass
+
+    def _read_keys(self) -> list[NestedKey]:
+        """What the loss reads beside the mask."""
+        raise NotImplementedError
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Set the keys; None restores a default. Raises ValueError for an unknown name."""
+        super().set_keys(**kwargs)
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What the loss reads: the network's inputs, the labels and, where used, the mask."""
+        if self._in_keys is None:
+            keys = self._read_keys()
+            if self.use_mask:
+                keys.append(self.tensor_keys.valid)
+            self._in_keys = list(dict.fromkeys(keys))
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    def _entries(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Tensor:
+        """A tensor with one number per entry. Raises KeyError if it is absent, ValueError for another shape."""
+        value = tensordict.get(key, default=None)
+        if value is None:
+            raise KeyError(f"no {what} under {key!r}")
+        if value.shape != shape:
+            raise ValueError(
+                f"{what} {key!r} has shape {tuple(value.shape)}, the network's output {tuple(shape)}"
+            )
+        return value
+
+    def _flags(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Tensor:
+        """Likewise for bools: `~` of an integer would be another integer, silently."""
+        value = self._entries(tensordict, key, what, shape)
+        if value.dtype != torch.bool:
+            raise ValueError(f"{what} {key!r} is {value.dtype}, expected torch.bool")
+        return value
+
+    def _counted(self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device) -> Tensor:
+        """Bool mask of the entries that are valid and that no mask written by TorchRL itself leaves out."""
+        counted = torch.ones(shape, dtype=torch.bool, device=device)
+        if self.use_mask:
+            if tensordict.get(self.tensor_keys.valid, default=None) is None:
+                raise KeyError(
+                    f"no mask under {self.tensor_keys.valid!r}; pass use_mask=False to train without one"
+                )
+            counted = self._flags(tensordict, self.tensor_keys.valid, "mask", shape)
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, default=None)
+            if mask is not None:
+                counted = counted & self._expand_loss_mask(mask, counted)
+        return counted
+
+    def _reduced(self, values: Tensor, counted: Tensor, reduction: Reduction | None = None) -> Tensor:
+        """Mean (0 without entries) or sum over the counted entries, or their values with zeros elsewhere."""
+        reduction = self.reduction if reduction is None else reduction
+        # Selected, not multiplied: what is left out may not be finite.
+        values = torch.where(counted, values, torch.zeros_like(values))
+        if reduction == "none":
+            return values
+        return values.sum() / counted.sum().clamp_min(1) if reduction == "mean" else values.sum()
+
+
+class Fit(NamedTuple):
+    """How well an actor explains the actions of a batch. All `[...]`.
+
+    Attributes:
+        cost: negative log-likelihood after label smoothing.
+        nll: negative log-likelihood, detached.
+        counted: bool, entries that count.
+        entropy: of the actor, detached; None unless it is categorical.
+        hit: 1.0 where the actor's mode is the action; None unless it is categorical.
+    """
+
+    cost: Tensor
+    nll: Tensor
+    counted: Tensor
+    entropy: Tensor | None
+    hit: Tensor | None
+
+
+class ActorLoss(MaskedLoss):
+    """A loss on the likelihood of actions under a stochastic actor.
+
+    Args:
+        actor_network: probabilistic module with a `get_dist`.
+        reduction: see :class:`MaskedLoss`.
+        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
+        use_mask: see :class:`MaskedLoss`.
+    """
+
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
+        reduction: Reduction | None,
+        label_smoothing: float,
+        use_mask: bool,
+    ) -> None:
+        super().__init__(reduction, use_mask)
+        if not 0.0 <= label_smoothing < 1.0:
+            raise ValueError(f"label_smoothing must be in [0, 1), is {label_smoothing}")
+        self.convert_to_functional(actor_network, "actor_network")
+        self.categorical = _is_categorical(actor_network)
+        if label_smoothing and not self.categorical:
+            raise ValueError("label_smoothing needs an actor whose distribution is a torch Categorical")
+        self.label_smoothing = label_smoothing
+
+    def _read_keys(self) -> list[NestedKey]:
+        return [*self.actor_network.in_keys, self.tensor_keys.action]
+
+    def _fit(self, tensordict: TensorDictBase) -> Fit:
+        action = tensordict.get(self.tensor_keys.action, default=None)
+        if action is None:
+            raise KeyError(f"no expert action under {self.tensor_keys.action!r}")
+        with self.actor_network_params.to_module(self.actor_network):
+            dist = self.actor_network.get_dist(tensordict.copy())
+        counted = self._counted(tensordict, dist.batch_shape, action.device)
+        # A padded entry may hold anything, such as an index that is none.
+        fitted = counted.reshape(counted.shape + (1,) * (action.ndim - counted.ndim))
+        action = torch.where(fitted, action, torch.zeros_like(action))
+        cost = -dist.log_prob(action)
+        if not isinstance(dist, Categorical):
+            return Fit(cost, cost.detach(), counted, None, None)
+        nll = cost.detach()
+        if self.label_smoothing:
+            cost = (1.0 - self.label_smoothing) * cost - self.label_smoothing * dist.logits.mean(-1)
+        with torch.no_grad():
+            hit = (dist.logits.argmax(-1) == action).to(dist.logits.dtype)
+            return Fit(cost, nll, counted, dist.entropy(), hit)
+
+    def _statistics(self, fit: Fit, counted: Tensor) -> dict[str, Tensor]:
+        """Entropy and accuracy over some entries, of a categorical actor."""
+        if fit.entropy is None or fit.hit is None:
+            return {}
+        reduction: Reduction = "none" if self.reduction == "none" else "mean"
+        return {
+            "entropy": self._reduced(fit.entropy, counted, reduction),
+            "accuracy": self._reduced(fit.hit, counted, reduction),
+        }
+
+
+def _is_categorical(actor: Any) -> bool:
+    """Whether the actor's distribution is a torch Categorical (over indices)."""
+    heads = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
+    kind = heads[-1].distribution_class if heads else None
+    return isinstance(kind, type) and issubclass(kind, Categorical)

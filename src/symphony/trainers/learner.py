@@ -1,0 +1,238 @@
+"""What one update is: batches, losses and optimizers of all networks (paper, sections IV-A to IV-C)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from symphony import keys
+from symphony.collectors import KeepBest
+from symphony.config import TrainConfig
+from symphony.envs.driving import DrivingEnv
+from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss
+from symphony.streams import fold_in
+from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.networks import Networks, observation_config
+from symphony.trainers.simulate import search
+
+_SEED_STRIDE = 1_000_003
+_POLICY_KEYS = (
+    keys.OWN,
+    keys.OBJECTS,
+    keys.OBJECTS_MASK,
+    keys.POINTS,
+    keys.POINTS_MASK,
+    keys.VALID,
+    keys.ACTION,
+    keys.ROUTE,
+    keys.ROLLOUT,
+    keys.RANK,
+)
+
+
+@dataclass(frozen=True)
+class SearchData:
+    """What one search leaves for the updates that follow it.
+
+    Attributes:
+        env: the environment of the searched scenes.
+        survivors: [B, S, T] state, action and step along the histories of the leaves.
+        rank: [B, S] place of each leaf in its tree.
+        simulated: [B, S, T] states after each step, pruned branches included.
+        logged: [B, T, N, 4] states of the log, fitted to the action space.
+        logged_valid: [B, T, N].
+    """
+
+    env: DrivingEnv
+    survivors: TensorDictBase
+    rank: Tensor
+    simulated: TensorDictBase
+    logged: Tensor
+    logged_valid: Tensor
+
+
+class Learner:
+    """Networks, their losses and optimizers.
+
+    All that is random in an update derives from the configuration's seed and the number of the update.
+
+    Args:
+        config: of the run.
+        networks: what learns.
+        dataset: what it learns from.
+        device: where.
+    """
+
+    def __init__(
+        self, config: TrainConfig, networks: Networks, dataset: SceneDataset, device: torch.device
+    ) -> None:
+        self.config, self.networks, self.dataset, self.device = config, networks, dataset, device
+        self.sees = observation_config(config)
+        judge, search_config = config.discriminator, config.search
+        self.policy_loss = (
+            DistillationLoss(
+                networks.policy, rollout_weight=search_config.weight, survivors=search_config.survivors
+            )
+            if config.searches
+            else BCLoss(networks.policy)
+        )
+        self.goal_loss = self.judge_loss = None
+        if networks.goals is not None:
+            self.goal_loss = GoalLoss(networks.goals)
+            self.goal_loss.set_keys(label=keys.GOAL)
+        if networks.discriminator is not None:
+            self.judge_loss = DiscriminatorLoss(
+                networks.discriminator,
+                gradient_penalty=judge.gradient_penalty,
+                instance_noise=judge.instance_noise,
+                noise_keys=[keys.OWN, keys.OBJECTS] if judge.instance_noise else (),
+            )
+        rates = {"discriminator": judge.learning_rate}
+        self.rates = {name: rates.get(name, config.learning_rate) for name in networks.present()}
+        self.optimizers = {
+            name: torch.optim.Adam(module.parameters(), lr=self.rates[name])
+            for name, module in networks.present().items()
+        }
+        self._found: SearchData | None = None
+
+    def update(self, step: int) -> dict[str, Tensor]:
+        """One update of every network; returns what is worth a record, as tensors without gradient."""
+        config, rng = self.config, torch.Generator().manual_seed(self.config.seed * _SEED_STRIDE + step)
+        items = self.dataset.draw(config.segments, rng)
+        self._set_rates(step)
+        record: dict[str, Tensor] = {}
+        batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
+        if self.judge_loss is not None:
+            if self._found is None or step % config.search.updates == 0:
+                self._found = self._search(step, rng)
+            batch = _joined(batch, self._surviving(self._found, rng))
+            losses = self.judge_loss(self._both_kinds(self._found, rng))
+            record |= self._descend("discriminator", losses, "loss_discriminator")
+        loss = self.policy_loss(batch)
+        record |= self._descend("policy", loss, self.policy_loss.out_keys[0])
+        if self.goal_loss is not None:
+            goals = self.dataset.sample_goals(items, config.goals, self.sees, rng, self.device)
+            losses = self.goal_loss(goals)
+            found = self._descend("goals", losses, "loss_goal")
+            record |= {name if "goal" in name else f"goal_{name}": value for name, value in found.items()}
+        return record
+
+    def _descend(self, name: str, losses: TensorDictBase, key: str) -> dict[str, Tensor]:
+        optimizer, module = self.optimizers[name], self.networks.present()[name]
+        optimizer.zero_grad(set_to_none=True)
+        losses[key].backward()
+        norm = nn.utils.clip_grad_norm_(module.parameters(), self.config.clip)
+        optimizer.step()
+        return {**{k: v.detach() for k, v in losses.items()}, f"gradient_norm_{name}": norm}
+
+    def _set_rates(self, step: int) -> None:
+        """Cosine from the configured rates to a tenth of them."""
+        share = 0.5 * (1 + math.cos(math.pi * step / self.config.steps))
+        for name, optimizer in self.optimizers.items():
+            for group in optimizer.param_groups:
+                group["lr"] = self.rates[name] * (0.1 + 0.9 * share)
+
+    @torch.no_grad()
+    def _search(self, step: int, rng: torch.Generator) -> SearchData:
+        """Search from the first states of fresh scenes with the networks as they are."""
+        settings = self.config.search
+        items = self.dataset.draw(settings.segments, rng)
+        scenes = self.dataset.scenes(items).to(self.device)
+        env = DrivingEnv(scenes, self.dataset.dynamics, self.sees)
+        scene = torch.arange(len(items), device=self.device)[:, None].expand(-1, settings.branches)
+        # The stream of a branch is that of its update too, so that each search draws anew.
+        start = env.start(scene, torch.arange(settings.branches, device=self.device).expand(scene.shape))
+        start.set(keys.STREAM, fold_in(start.get(keys.STREAM), step))
+        if self.networks.goals is not None:
+            start = env.with_goals(start)
+        result = search(
+            env,
+            self.networks.policy,
+            self.networks.discriminator,
+            start,
+            seed=self.config.seed,
+            rule=KeepBest(settings.keep),
+            prune_every=settings.prune_every,
+            keep_tree=True,
+        )
+        assert result.tree is not None  # noqa: S101 - asked for just above
+        carried = start.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL)
+        steps = result.tree.batch_size[-1]
+        carried = carried.unsqueeze(-1).expand(*carried.batch_size, steps)
+        order = result.leaf_totals[..., -1, :].argsort(dim=-1, stable=True)
+        rank = order.argsort(dim=-1, stable=True)
+        survivors = result.trajectories.select(keys.STATE, keys.ACTION, keys.STEP)
+        simulated = result.tree.select(("next", *keys.STATE), keys.STEP)
+        simulated = TensorDict(
+            {keys.STEP: simulated[keys.STEP] + 1, keys.STATE: simulated[("next", *keys.STATE)]},
+            batch_size=simulated.batch_size,
+        )
+        log, log_valid = self.dataset.fitted(items, scenes)
+        return SearchData(
+            env,
+            survivors.update(carried),
+            rank,
+            simulated.update(carried),
+            log,
+            log_valid,
+        )
+
+    def _surviving(self, found: SearchData, rng: torch.Generator) -> TensorDict:
+        """Observations and actions along surviving rollouts, [states, N]."""
+        last = found.env.scenes.last_step[found.survivors.get(keys.SCENE)]
+        rows = (found.survivors.get(keys.STEP) < last).squeeze(-1).nonzero()
+        pick = rows[torch.randint(len(rows), (self.config.search.states,), generator=rng)]
+        chosen = found.survivors[tuple(pick.unbind(-1))]
+        batch = found.env.at(chosen)
+        batch.set(keys.ACTION, chosen.get(keys.ACTION))
+        rank = found.rank[pick[:, 0], pick[:, 1]]
+        batch.set(keys.RANK, rank[:, None].expand(batch.get(keys.VALID).shape))
+        batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
+        return batch
+
+    def _both_kinds(self, found: SearchData, rng: torch.Generator) -> TensorDict:
+        """Simulated and logged states of the same scenes, [2 x states, N]."""
+        amount, env = self.config.discriminator.states, found.env
+        last = env.scenes.last_step[found.simulated.get(keys.SCENE)]
+        rows = (found.simulated.get(keys.STEP) <= last).squeeze(-1).nonzero()
+        pick = rows[torch.randint(len(rows), (amount,), generator=rng)]
+        fake = found.simulated[tuple(pick.unbind(-1))]
+        rows = found.logged_valid[:, 1:].any(-1).nonzero()
+        scene, step = rows[torch.randint(len(rows), (amount,), generator=rng)].unbind(-1)
+        step = step + 1
+        valid = found.logged_valid[scene, step]
+        real = TensorDict(
+            {
+                keys.SCENE: scene[:, None],
+                keys.STEP: step[:, None],
+                keys.STREAM: torch.zeros_like(scene)[:, None],
+                keys.VALID: valid,
+                keys.STATE: found.logged[scene, step],
+                keys.GOAL: env.scenes.route_logged[scene]
+                if self.networks.goals is not None
+                else torch.full_like(valid, -1, dtype=torch.int64),
+            },
+            batch_size=[amount],
+        )
+        batch = env.at(torch.cat([fake.select(*real.keys(True, True)), real]))
+        simulated = torch.zeros_like(batch.get(keys.VALID))
+        simulated[:amount] = True
+        return batch.set(keys.SIMULATED, simulated)
+
+
+def _joined(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
+    """One batch [M, 1] of expert states [K, 1] and rollout states [L, N]."""
+    valid = experts.get(keys.VALID)
+    experts.set(keys.ROLLOUT, torch.zeros_like(valid))
+    experts.set(keys.RANK, torch.zeros_like(valid, dtype=torch.int64))
+    present = [key for key in _POLICY_KEYS if experts.get(key, None) is not None]
+    flat = TensorDict(
+        {key: rollouts.get(key).flatten(0, 1)[:, None] for key in present},
+        batch_size=[rollouts.get(keys.VALID).numel()],
+    )
+    return torch.cat([experts.select(*present), flat])
+

@@ -1,0 +1,392 @@
+"""Laws of the beam search."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, distance, noise, starts
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch.testing import assert_close
+from torchrl.envs import PendulumEnv
+
+from symphony.collectors import (
+    Aggregate,
+    KeepAll,
+    KeepBest,
+    KeyScore,
+    Systematic,
+    beam_search,
+    branch,
+    lineage,
+    max_then_sum,
+    mean_then_sum,
+)
+from symphony.errors import ConfigError
+
+
+@pytest.fixture(autouse=True)
+def no_gradients():
+    with torch.no_grad():
+        yield
+
+
+def search(start, *, env=None, policy=None, score=distance, steps=12, prune_every=4, **kwargs):
+    kwargs.setdefault("slot_keys", [STREAM])
+    return beam_search(
+        env or Walk(), policy or Policy(), score, start, steps=steps, prune_every=prune_every, **kwargs
+    )
+
+
+def assert_same(first, second):
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    for key in first.keys(True, True):
+        assert_close(first.get(key), second.get(key), rtol=0, atol=0, msg=str(key))
+
+
+def test_one_branch_is_a_plain_rollout():
+    env, policy = Walk(), Policy()
+    start = starts(env, 3, branches=1)
+    found = search(start, env=env, policy=policy, steps=11)
+    plain = env.rollout(11, policy, auto_reset=False, tensordict=start.clone(), break_when_any_done=False)
+    assert_same(found.trajectories, plain)
+    assert found.trajectories.names == plain.names
+    assert found.trajectories.get("agents").batch_size == plain.get("agents").batch_size
+
+
+@pytest.mark.parametrize("branches", [1, 4, 5])
+def test_constant_score_prunes_blindly(branches):
+    """With nothing to choose by, the parents are a fixed pattern and every slot goes on with numbers of its own."""
+    start = starts(Walk(), 3, branches=branches)
+    found = search(start, score=lambda td: td.get(X).squeeze(-1) * 0)
+    half = torch.arange(branches) % math.ceil(branches / 2)
+    assert (found.parents == half).all()
+    tree = search(start, score=lambda td: td.get(X).squeeze(-1) * 0, keep_tree=True).tree
+    for step in range(12):
+        here = tree[..., step]
+        assert_close(here.get(STREAM), start.get(STREAM), rtol=0, atol=0)
+        assert_close(here.get(ACTION), -0.2 * here.get(X) + noise(here, 2))
+
+
+@pytest.mark.parametrize("retries", [0, 2])
+def test_leaves_are_true_histories(retries):
+    """Replaying a leaf's actions from its start gives its states, log-probabilities and scores."""
+    env, policy = Walk(), Policy()
+    start = starts(env, 3, branches=8)
+    kwargs = {"retries": retries, "retry_above": 1.0, "reseed": reseed} if retries else {}
+    found = search(start, env=env, policy=policy, steps=14, **kwargs)
+    leaves, now = found.trajectories, start
+    for step in range(14):
+        here = leaves[..., step]
+        assert_close(here.get(X), now.get(X), rtol=0, atol=0)
+        stepped = env.step(now.clone().set(ACTION, here.get(ACTION)))
+        assert_close(policy.log_prob(stepped), here.get(LOG_PROB), rtol=0, atol=0)
+        assert_close(stepped.get(("next", *X)), here.get(("next", *X)), rtol=0, atol=0)
+        now = env.step_mdp(stepped)
+        assert_close(found.scores[..., step, :], distance(now), rtol=0, atol=0)
+
+
+def test_the_better_half_survives():
+    branches, prune_every = 6, 4
+    # Rounded scores make ties, which must go to the lower slot.
+    found = search(
+        starts(Walk(), 4, branches=branches), score=lambda td: distance(td).round(), steps=10, keep_tree=True
+    )
+    ties = 0
+    for row in range(4):
+        for period, first in enumerate(range(0, 10, prune_every)):
+            scores = found.simulated_scores[row, :, first : first + prune_every].tolist()
+            totals = [
+                sum(max(step[agent] for step in branch_scores) for agent in range(2))
+                for branch_scores in scores
+            ]
+            assert found.totals[row, period].tolist() == totals
+            ties += len(set(totals)) < branches
+            ranked = sorted(range(branches), key=lambda slot, t=totals: (t[slot], slot))[:3]
+            assert found.parents[row, period].tolist() == ranked + ranked
+    assert ties > 0
+
+
+def test_the_last_period_may_be_short_and_unpruned():
+    start = starts(Walk(), 2, branches=4)
+    pruned, kept = search(start, steps=10), search(start, steps=10, prune_last=False)
+    assert pruned.totals.shape == (2, 3, 4)
+    assert (kept.parents[:, -1] == torch.arange(4)).all()
+    assert_close(kept.simulated_scores, pruned.simulated_scores)
+    assert_close(
+        pruned.scores, kept.scores.gather(1, pruned.parents[:, -1, :, None, None].expand(2, 4, 10, 2))
+    )
+    assert_close(search(start, steps=3, prune_every=10).totals, search(start, steps=3, prune_every=3).totals)
+
+
+def test_rows_never_meet():
+    start = starts(Walk(), 2, 3, branches=4)
+    whole = search(start, keep_tree=True)
+    flat = search(start.reshape(6, 4))
+    assert_same(whole.trajectories.reshape(6, 4, 12), flat.trajectories)
+    assert_close(whole.slots.reshape(6, 3, 4), flat.slots)
+    for row in range(6):
+        alone = search(start.reshape(6, 4)[row])
+        assert_same(alone.trajectories, flat.trajectories[row])
+        assert_close(alone.scores, flat.scores[row], rtol=0, atol=0)
+
+
+def test_start_is_left_alone():
+    start = starts(Walk(), 2, branches=4)
+    before, versions = start.clone(), {k: v._version for k, v in start.items(True, True)}
+    search(start, retries=1, retry_above=0.5, reseed=reseed)
+    assert_same(start, before)
+    assert versions == {k: v._version for k, v in start.items(True, True)}
+
+
+def test_views_of_one_row_will_do_for_a_start():
+    env = Walk()
+    rows = env.reset(TensorDict({}, [3]))
+    assert_same(search(branch(rows, 4)).trajectories, search(branch(rows, 4).clone()).trajectories)
+
+
+def test_copies_draw_numbers_of_their_slot():
+    start = starts(Walk(), 3, branches=4)
+    apart, together = search(start, prune_last=False), search(start, prune_last=False, slot_keys=())
+
+    def twins(found):
+        x = found.trajectories.get(("next", *X))[:, :, -1]
+        return torch.isclose(x[:, :2], x[:, 2:]).all()
+
+    assert twins(together)
+    assert not twins(apart)
+    assert_close(apart.trajectories.get(STREAM)[:, :, -1], start.get(STREAM))
+
+
+def test_gradient_follows_the_survivors():
+    env, policy = Walk(), Policy()
+    start = starts(env, 3, branches=4)
+    with torch.enable_grad():
+        root = start.get(X).clone().requires_grad_()
+        found = search(start.clone().set(X, root), env=env, policy=policy)
+        loss = found.trajectories.get(("next", *X))[:, :, -1].square().sum() + found.totals.sum()
+        gain, at_root = torch.autograd.grad(
+            found.trajectories.get(("next", *X))[:, :, -1].square().sum(),
+            [policy.gain, root],
+            retain_graph=True,
+        )
+        assert torch.autograd.grad(loss, policy.gain)[0] != gain  # scores carry a gradient, too
+        origin = found.slots[:, 0]
+        x = root.gather(1, origin[..., None, None].expand(3, 4, 2, 1))
+        drawn = noise(found.trajectories, 2)
+        for step in range(12):
+            x = x + policy.gain * x + drawn[:, :, step] + 0.1 * x.sin()
+        by_hand = torch.autograd.grad(x.square().sum(), [policy.gain, root])
+    assert_close((gain, at_root), by_hand)
+    reached = torch.zeros(3, 4, dtype=torch.bool).scatter(1, origin, True)
+    assert not reached.all()
+    assert torch.equal(at_root.ne(0).any(-1).any(-1), reached)
+
+
+def test_lineage_by_hand():
+    parents = torch.tensor([[[2, 0, 2], [1, 1, 0], [2, 1, 0]]])
+    # the last pruning puts slots 2, 1, 0 into the leaves; slot 2 came from 0 and the others from 1; and so on
+    assert lineage(parents).tolist() == [[[2, 0, 0], [0, 1, 1], [2, 1, 0]]]
+
+
+def test_marks_of_the_tree():
+    found = search(starts(Walk(), 3, branches=4), keep_tree=True)
+    assert (found.survived.sum(-1) == 2).all()
+    assert (found.reaches_leaf <= found.survived).all()
+    assert torch.equal(found.reaches_leaf[:, -1], found.survived[:, -1])
+    for row in range(3):
+        for leaf in range(4):
+            for step in range(12):
+                slot = found.slots[row, step // 4, leaf]
+                assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
+    assert_close(found.leaf_totals, max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2)))
+
+
+def test_leaves_are_the_best_and_distinct():
+    start = starts(Walk(), 5, branches=6)
+    whole, best = search(start), search(start, leaves=4)
+    # three survivors, each twice
+    assert (whole.ranking == torch.arange(6)).all()
+    assert_same(best.trajectories, whole.trajectories[:, :4])
+    assert_close(best.slots, whole.slots[..., :4])
+    assert_close(best.scores, whole.scores[:, :4])
+    free, chosen = search(start, rule=KeepAll()), search(start, rule=KeepAll(), leaves=6)
+    order = free.totals[:, -1].argsort(-1)
+    assert torch.equal(free.ranking, order)
+    assert torch.equal(chosen.slots[:, 0], order)
+
+
+def test_groups_stay_apart():
+    start = starts(Walk(), 3, branches=6)
+    groups = torch.tensor([[7, 7, 7, 1, 1, 1], [0, 1, 0, 1, 0, 1], [5, 6, 6, 5, 5, 6]])
+    found = search(start.clone().set("goal", groups[..., None]), group_key="goal", rule=KeepBest(0.3))
+    assert torch.equal(
+        groups[:, None].expand(3, 3, 6).gather(-1, found.parents), groups[:, None].expand(3, 3, 6)
+    )
+    for row in range(3):
+        for group in groups[row].unique():
+            slots = (groups[row] == group).nonzero().squeeze(-1)
+            alone = search(start[row, slots], rule=KeepBest(0.3))
+            assert_same(found.trajectories[row, slots].exclude("goal"), alone.trajectories)
+
+
+def reseed(state, attempt):
+    return state.set(STREAM, state.get(STREAM) + 7919 * attempt)
+
+
+def test_retries_take_the_better_run_of_bad_branches_only():
+    start = starts(Walk(), 4, branches=4)
+    plain = search(start, steps=4, rule=KeepAll())
+    again = search(reseed(start.clone(), 1), steps=4, rule=KeepAll())
+    above = float(plain.totals.median())
+    both = search(start, steps=4, rule=KeepAll(), retries=1, retry_above=above, reseed=reseed)
+    bad = plain.totals > above
+    expected = torch.where(bad, torch.minimum(plain.totals, again.totals), plain.totals)
+    assert_close(both.totals, expected, rtol=0, atol=0)
+    took = (bad & (again.totals < plain.totals))[:, 0]
+    assert took.any()
+    assert not took.all()
+    assert_close(both.scores[took], again.scores[took], rtol=0, atol=0)
+    assert_close(both.scores[~took], plain.scores[~took], rtol=0, atol=0)
+    assert both.simulated_steps == 2 * plain.simulated_steps == 2 * 4 * 4 * 4
+    more = search(start, steps=4, rule=KeepAll(), retries=3, retry_above=above, reseed=reseed)
+    assert (more.totals <= both.totals).all()
+    # nothing is bad enough: nothing is repeated
+    idle = search(start, steps=4, rule=KeepAll(), retries=3, retry_above=1e9, reseed=reseed)
+    assert idle.simulated_steps == plain.simulated_steps
+
+
+def test_retried_branches_go_on_with_the_numbers_of_their_slot():
+    start = starts(Walk(), 4, branches=4)
+    found = search(start, rule=KeepAll(), retries=1, retry_above=0.0, reseed=reseed)
+    streams, own = found.trajectories.get(STREAM), start.get(STREAM)[:, :, None]
+    assert torch.isin(streams - own, torch.tensor([0, 7919])).all()
+    changed = (streams != own).squeeze(-1).unflatten(2, (3, 4))
+    assert changed.any()
+    assert not changed.any(-1).all()
+
+
+def test_only_what_is_kept_comes_back():
+    start = starts(Walk(), 2, branches=4)
+    found = search(start, keep=[("next", *X), ACTION], keep_tree=True)
+    whole = search(start)
+    assert set(found.trajectories.keys(True, True)) == {("next", *X), ACTION}
+    assert_close(found.trajectories.get(ACTION), whole.trajectories.get(ACTION))
+    assert found.tree.get(ACTION).shape == (2, 4, 12, 2, 1)
+    assert whole.tree is None
+    assert search(start, keep=[]).trajectories.is_empty()
+    with pytest.raises(KeyError, match="nowhere"):
+        search(start, keep=["nowhere"])
+
+
+def test_scores_without_agents_and_of_the_reward():
+    start = starts(Walk(), 2, branches=4)
+    one = search(start, score=lambda td: distance(td).sum(-1), aggregate=mean_then_sum)
+    assert one.scores.shape == (2, 4, 12, 1)
+    reward = search(start, score=KeyScore(("agents", "reward"), negate=True))
+    assert_close(reward.scores, search(start).scores)
+    assert ("agents", "reward") not in reward.trajectories.keys(True, True)
+
+
+def test_score_of_a_module_leaves_no_trace():
+    start = starts(Walk(), 2, branches=4)
+    module = TensorDictModule(lambda x: x.abs(), in_keys=[X], out_keys=[("agents", "score")])
+    found = search(start, score=KeyScore(("agents", "score"), module))
+    assert_same(found.trajectories, search(start).trajectories)
+    with pytest.raises(KeyError, match="nothing"):
+        search(start, score=KeyScore("nothing"))
+
+
+def test_padded_agents_do_not_count():
+    td = TensorDict({"score": torch.tensor([[1.0, torch.nan]]), "valid": torch.tensor([[True, False]])}, [1])
+    assert KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]
+    with pytest.raises(KeyError, match="absent"):
+        KeyScore("score", valid_key="absent")(td)
+
+
+def test_aggregates_by_hand():
+    scores = torch.tensor([[[[1.0, 5.0], [3.0, 0.0], [2.0, 1.0]]]])
+    wanted = {("max", "sum"): 8.0, ("mean", "sum"): 4.0, ("sum", "max"): 6.0, ("last", "mean"): 1.5}
+    for (time, agents), total in wanted.items():
+        assert Aggregate(time, agents)(scores).tolist() == [[total]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "positive"),
+        ({"prune_every": 0}, "positive"),
+        ({"leaves": 5}, "leaves"),
+        ({"retries": 1}, "retry_above"),
+        ({"retry_above": 1.0}, "retry_above"),
+        ({"group_key": "goal"}, "goal"),
+        ({"group_key": X}, "one number per branch"),
+        ({"group_key": STREAM}, None),
+        ({"noise": torch.zeros(2, 2)}, "noise"),
+        ({"rule": Systematic(1.0)}, "noise"),
+        ({"rule": lambda totals, noise: totals}, "int64"),
+        ({"rule": lambda totals, noise: totals.argsort(-1) + 1}, "outside"),
+        ({"score": lambda td: td.get(X)}, "scores must be"),
+        ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
+    ],
+)
+def test_contradictions_are_errors(changes, message):
+    start = starts(Walk(), 2, branches=4)
+    if message is None:  # each branch a group of its own: allowed, and nothing competes
+        assert (search(start, **changes).parents == torch.arange(4)).all()
+        return
+    with pytest.raises(ConfigError, match=message):
+        search(start, **changes)
+
+
+@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(2.0)])
+def test_search_beats_independent_rollouts_on_a_pendulum(rule):
+    """Random torques, but the costly futures are dropped: nearly every start ends cheaper than without search."""
+    env, rows, steps = PendulumEnv(seed=0), 24, 60
+    start = branch(env.reset(env.gen_params(batch_size=[rows]), set_state=False), 16)
+
+    def cost(rule):
+        generator = torch.Generator().manual_seed(1)
+
+        def policy(td):
+            return td.set("action", 4 * torch.rand(*td.shape, 1, generator=generator) - 2)
+
+        found = beam_search(
+            env,
+            policy,
+            KeyScore("reward", negate=True),
+            start,
+            steps=steps,
+            prune_every=5,
+            rule=rule,
+            aggregate=mean_then_sum,
+            noise=torch.rand(rows, 12, generator=generator),
+        )
+        assert_close(found.scores, -found.trajectories.get(("next", "reward")))
+        return found.scores.sum((-1, -2)).mean(-1)
+
+    gain = cost(KeepAll()) - cost(rule)
+    error = gain.std() / rows**0.5
+    assert gain.mean() > 4 * error
+    assert (gain > 0).float().mean() > 0.8
+
+
+def test_nothing_about_driving_is_imported():
+    """The example runs, and neither it nor the package loads more of ours than errors."""
+    example = Path(__file__).resolve().parents[1] / "examples" / "beam_search_torchrl.py"
+    code = (
+        f"import runpy, sys; runpy.run_path({str(example)!r}, run_name='__main__');"
+        "print('loaded:', *sorted(m for m in sys.modules if m.startswith('symphony')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *table, loaded = done.stdout.splitlines()
+    assert any("independent" in line for line in table)
+    ours = set(loaded.split()[1:])
+    assert "symphony.collectors" in ours
+    allowed = ("symphony.collectors", "symphony.errors", "symphony._version")
+    assert all(name == "symphony" or name.startswith(allowed) for name in ours), ours

@@ -1,0 +1,310 @@
+"""The collector, by what TorchRL's own tests ask of one."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+import time
+
+import pytest
+import torch
+from helpers_collectors import ACTION, STREAM, Policy, Walk, X, distance, give_streams
+from tensordict import TensorDict
+from torch.testing import assert_close
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torchrl.envs import BatchSizeTransform, Compose, EnvBase, PendulumEnv, StepCounter, TransformedEnv
+
+from symphony.collectors import BeamSearchCollector, KeepAll, KeyScore, Systematic
+from symphony.errors import ConfigError
+
+ROWS, STEPS, FRAMES = 3, 8, 3 * 8
+
+
+def make_env(last: int = 1000, *transforms) -> EnvBase:
+    return TransformedEnv(Walk(last=last), Compose(BatchSizeTransform(batch_size=[ROWS]), *transforms))
+
+
+def make(env=make_env, policy=None, **kwargs) -> BeamSearchCollector:
+    settings = {
+        "score": distance,
+        "branches": 4,
+        "prune_every": 4,
+        "prepare": give_streams,
+        "slot_keys": [STREAM],
+        "frames_per_batch": FRAMES,
+        "total_frames": 3 * FRAMES,
+    }
+    return BeamSearchCollector(env, policy or Policy(), **{**settings, **kwargs})
+
+
+def assert_same(first, second):
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    for key in first.keys(True, True):
+        assert_close(first.get(key), second.get(key), rtol=0, atol=0, equal_nan=True, msg=str(key))
+
+
+EXTRAS = [("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")]
+
+
+def test_one_branch_collects_what_a_plain_collector_does():
+    """Same entries, same values, same names, same counting."""
+    plain = Collector(make_env, Policy(), frames_per_batch=FRAMES, total_frames=72, reset_at_each_iter=True)
+    search = make(branches=1, prepare=None)
+    for collector in (plain, search):
+        collector.set_seed(3)
+    batches = 0
+    for one, other in zip(plain, search, strict=True):
+        assert other.names == one.names == [None, "time"]
+        assert other.shape == (ROWS, STEPS)
+        assert_same(other.exclude(*EXTRAS, ("collector", "traj_ids")), one.exclude(("collector", "traj_ids")))
+        batches += 1
+        for collector in (plain, search):
+            assert collector.stats()["frames"] == batches * FRAMES
+    assert batches == len(search) == 3
+    assert search.next() is None
+
+
+def test_best_leaf_and_its_search():
+    collector = make(leaves=2, frames_per_batch=2 * FRAMES, total_frames=2 * FRAMES)
+    (batch,) = collector
+    assert batch.shape == (ROWS, 2, STEPS)
+    score, total, slot = (batch.get(key) for key in EXTRAS[:3])
+    assert_close(score, batch.get(("next", *X)).squeeze(-1).abs())
+    for first in (0, 4):
+        expected = score[:, :, first : first + 4].amax(2).sum(-1, keepdim=True).expand(ROWS, 2, 4)
+        assert_close(total[:, :, first : first + 4], expected)
+    assert (total[:, 0, -1] <= total[:, 1, -1]).all()
+    # the stream tells the branch that drew the numbers
+    assert_close(batch.get(STREAM).squeeze(-1) % 100, slot)
+    assert (batch.get(("collector", "traj_ids")).flatten(0, 1) == torch.arange(3, 9)[:, None]).all()
+    assert batch.get(("collector", "mask")).all()
+    assert collector.simulated_frames == ROWS * 4 * STEPS == collector.stats()["simulated_frames"]
+
+
+def test_search_lowers_the_score():
+    free, pruned = (
+        make(rule=rule, branches=8, leaves=8, frames_per_batch=8 * FRAMES) for rule in (KeepAll(), None)
+    )
+    free.set_seed(0)
+    pruned.set_seed(0)
+    means = [torch.stack([b.get(EXTRAS[0]).mean() for b in c]).mean() for c in (free, pruned)]
+    assert means[1] < 0.9 * means[0]
+
+
+def test_same_seed_same_data():
+    def data(seed, **kwargs):
+        collector = make(rule=Systematic(0.5), **kwargs)
+        collector.set_seed(seed)
+        return torch.cat([batch.exclude("collector") for batch in collector])
+
+    assert_same(data(0), data(0))
+    assert not torch.equal(data(0).get(ACTION), data(1).get(ACTION))
+    # the numbers of the rule are seeded, too
+    noises = [make() for _ in range(3)]
+    seeds = [collector.set_seed(seed) for collector, seed in zip(noises, (5, 5, 6), strict=True)]
+    drawn = [collector.rule_noise((4,)) for collector in noises]
+    assert seeds[0] == seeds[1] != seeds[2]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+
+
+def test_reloading():
+    """A reloaded collector has nothing left to do where the other had not, and counts on."""
+    first = make(policy=Policy())
+    next(iter(first))
+    state = pickle.loads(pickle.dumps(first.state_dict()))  # noqa: S301
+    changed = Policy()
+    changed.gain.data.fill_(0.5)
+    second = make(policy=changed)
+    second.load_state_dict(state)
+    assert_close(second.policy.gain, first.policy.gain)
+    assert second.simulated_frames == first.simulated_frames > 0
+    ids = [batch.get(("collector", "traj_ids")).unique() for batch in second]
+    assert len(ids) == 2
+    assert min(int(i.min()) for i in ids) >= 2 * ROWS
+    assert second.stats()["frames"] == second.total_frames
+    assert torch.equal(make().rule_noise((3,)).isnan(), torch.zeros(3, dtype=torch.bool))
+    plain = Collector(make_env, Policy(), frames_per_batch=FRAMES, total_frames=72)
+    make().load_state_dict(plain.state_dict())
+
+
+def test_weights_are_shared_and_updated():
+    policy = Policy()
+    collector = make(policy=policy)
+    assert collector.policy is policy
+    before = next(iter(collector))
+    policy.gain.data.fill_(-0.9)
+    collector.update_policy_weights_()
+    after = collector.next()
+    assert after.get(X)[:, -1].abs().mean() < before.get(X)[:, -1].abs().mean()
+    collector.update_policy_weights_(TensorDict.from_module(Policy()))
+    assert_close(policy.gain.detach(), torch.tensor(-0.2))
+
+
+def test_gradients_are_off():
+    assert not any(value.requires_grad for value in next(iter(make())).values(True, True))
+
+
+def test_hooks_and_postproc():
+    calls = []
+    collector = make(
+        pre_collect_hook=lambda: calls.append("pre"),
+        post_collect_hook=lambda batch: calls.append(tuple(batch.shape)),
+        postproc=lambda batch: batch.set("twice", 2 * batch.get(("next", *X))),
+    )
+    for batch in collector:
+        assert_close(batch.get("twice"), 2 * batch.get(("next", *X)))
+    assert calls == ["pre", (ROWS, STEPS)] * 3
+
+
+@pytest.mark.parametrize("leaves", [None, 2])
+@pytest.mark.parametrize(
+    "options", [{}, {"compact_obs": True}, {"keep": [("next", *X), ACTION]}, {"set_truncated": True}]
+)
+def test_fake_batch_looks_like_a_real_one(options, leaves):
+    collector = make(leaves=leaves, frames_per_batch=FRAMES * (leaves or 1), **options)
+    fake, real = collector.fake_tensordict(), next(iter(collector))
+    assert fake.shape == real.shape
+    assert fake.names == real.names
+    assert set(fake.keys(True, True)) == set(real.keys(True, True))
+    for key in real.keys(True, True):
+        assert (fake.get(key).shape, fake.get(key).dtype) == (real.get(key).shape, real.get(key).dtype), key
+    assert bool(real.get(("next", "done"))[..., -1, :].all()) == ("set_truncated" in options)
+    if "compact_obs" in options:
+        assert ("next", *X) not in real.keys(True, True)
+
+
+def test_replay_buffer():
+    """One item per row; flat steps with trajectories."""
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=5)
+    for batch in make(replay_buffer=buffer):
+        assert batch is None
+    assert len(buffer) == 3 * ROWS
+    assert buffer.sample().shape == (5, STEPS)
+
+
+def test_trajectories_are_complete_and_stop_at_their_end():
+    """Episodes of 6 of the 8 steps: what follows the end is masked, and no part of any assembled trajectory."""
+    env = functools.partial(make_env, 6)
+    for batch in make(env):
+        assert batch.get(("collector", "mask")).tolist() == [[True] * 6 + [False] * 2] * ROWS
+    for layout in ("padded", "cat"):
+        for batch in make(env, trajs_per_batch=3, traj_format=layout):
+            assert batch.shape == ((3, 6) if layout == "padded" else (18,))
+            done = batch.get(("next", "done")).flatten().nonzero().flatten()
+            assert done.tolist() == [5, 11, 17]
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(200),
+        sampler=SliceSampler(slice_len=6, end_key=("next", "done")),
+        batch_size=12,
+    )
+    for _ in make(env, replay_buffer=buffer, trajs_per_batch=1):
+        pass
+    assert len(buffer) == 3 * ROWS * 6
+    assert (buffer.sample().get("step").reshape(2, 6) == torch.arange(6)).all()
+    # unfinished episodes are not trajectories, unless they are declared truncated
+    assert not list(make(trajs_per_batch=1))
+    assert len(list(make(trajs_per_batch=1, set_truncated=True))) == 3 * ROWS
+
+
+def test_trajectory_ids_never_repeat():
+    ids = torch.cat([batch.get(("collector", "traj_ids")) for batch in make()])
+    assert (ids == ids[:, :1]).all()
+    assert len(ids[:, 0].unique()) == 3 * ROWS
+    untracked = next(iter(make(track_traj_ids=False)))
+    assert ("collector", "traj_ids") not in untracked.keys(True, True)
+
+
+def test_start_and_shutdown():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=5)
+    collector = make(replay_buffer=buffer, total_frames=-1)
+    collector.start()
+    waited = time.monotonic() + 60
+    while buffer.write_count < 2 * ROWS and time.monotonic() < waited:
+        time.sleep(0.01)
+    collector.async_shutdown()
+    assert buffer.write_count >= 2 * ROWS
+    assert collector.closed
+
+
+def test_an_environment_that_fails_shuts_the_collector_down():
+    class Failing(Walk):
+        def _step(self, tensordict):
+            raise RuntimeError("broken")
+
+    collector = make(lambda: Failing())
+    with pytest.raises(RuntimeError, match="broken"):
+        next(iter(collector))
+    assert collector.closed
+
+
+def test_without_rows_and_with_other_transforms():
+    (batch,) = make(Walk, frames_per_batch=STEPS, total_frames=STEPS)
+    assert batch.shape == (STEPS,)
+    counted = next(iter(make(functools.partial(make_env, 1000, StepCounter(max_steps=5)))))
+    assert (counted.get("step_count").squeeze(-1) == torch.arange(STEPS)).all()
+    assert counted.get(("collector", "mask")).sum(-1).tolist() == [5] * ROWS
+    limited = next(iter(make(max_frames_per_traj=3)))
+    assert limited.get(("collector", "mask")).sum(-1).tolist() == [3] * ROWS
+
+
+@pytest.mark.parametrize("options", [{}, {"init_random_frames": FRAMES}])
+def test_random_actions(options):
+    env = TransformedEnv(PendulumEnv(seed=0), BatchSizeTransform(batch_size=[ROWS]))
+    settings = {"score": KeyScore("reward", negate=True), "branches": 4, "frames_per_batch": FRAMES}
+    policy = (lambda td: td.set("action", torch.full((*td.shape, 1), 9.0))) if options else None
+    collector = BeamSearchCollector(env, policy, total_frames=2 * FRAMES, **settings, **options)
+    first, second = (batch.get("action") for batch in collector)
+    assert first.abs().max() <= 2
+    assert len(first.unique()) > FRAMES / 2
+    assert bool((second == 9).all()) == bool(options)
+
+
+def test_impossible_options_are_errors():
+    for options, message in (
+        ({"leaves": 5}, "leaves"),
+        ({"split_trajs": True}, "split_trajs"),
+        ({"extend_buffer": False}, "extend_buffer"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            make(**options)
+
+    class Locked(Walk):
+        batch_locked = True
+
+    with pytest.raises(ConfigError, match="Locked has a batch size of its own"):
+        make(Locked)
+    with pytest.raises(TypeError, match="unknown"):
+        make(tree=3)
+
+
+def test_in_a_process_of_its_own():
+    """Built by a multi-process collector from the class with its arguments bound, as Ray does with kwargs."""
+    bound = functools.partial(
+        BeamSearchCollector,
+        score=distance,
+        branches=4,
+        prune_every=4,
+        prepare=give_streams,
+        slot_keys=[STREAM],
+    )
+    collector = MultiSyncCollector(
+        [make_env],
+        Policy(),
+        collector_class=bound,
+        frames_per_batch=FRAMES,
+        total_frames=2 * FRAMES,
+        use_buffers=False,
+        cat_results=0,
+    )
+    try:
+        collector.set_seed(3)
+        batches = [batch.clone() for batch in collector]
+    finally:
+        collector.shutdown()
+    local = make(total_frames=2 * FRAMES)
+    local.set_seed(3)
+    for one, other in zip(batches, local, strict=True):
+        assert_same(one.exclude("collector"), other.exclude("collector"))
+        assert set(EXTRAS) <= set(one.keys(True, True))

@@ -1,0 +1,119 @@
+"""Laws of the pruning rules."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from symphony.collectors import Aggregate, KeepAll, KeepBest, Systematic
+from symphony.collectors.rules import group_members, prune
+from symphony.errors import ConfigError
+
+NUMBERS = st.floats(-1e3, 1e3, width=32)
+ODD = NUMBERS | st.sampled_from([math.inf, -math.inf, math.nan, 0.0])
+FRACTIONS = st.floats(0.01, 1.0)
+NOISE = st.floats(0, 1, exclude_max=True)
+
+
+@st.composite
+def grouped(draw):
+    """Groups of one size in random order, and totals."""
+    number, size = draw(st.integers(1, 4)), draw(st.integers(1, 4))
+    ids = draw(st.lists(st.integers(-9, 9), min_size=number, max_size=number, unique=True))
+    groups = draw(st.permutations([i for i in ids for _ in range(size)]))
+    totals = draw(st.lists(NUMBERS, min_size=number * size, max_size=number * size))
+    return torch.tensor([groups]), torch.tensor([totals])
+
+
+@given(st.lists(ODD, min_size=1, max_size=17), FRACTIONS)
+def test_keep_best_keeps_the_lowest(totals, fraction):
+    """Against sorting in Python: NaN last, ties by slot; copies differ by one at most."""
+    parents = KeepBest(fraction)(torch.tensor([totals]))[0].tolist()
+    ranked = sorted(range(len(totals)), key=lambda i: (math.isnan(totals[i]), totals[i], i))
+    kept = ranked[: KeepBest(fraction).survivors(len(totals))]
+    assert parents == [kept[i % len(kept)] for i in range(len(totals))]
+    counts = [parents.count(i) for i in kept]
+    assert max(counts) - min(counts) <= 1
+
+
+@given(st.integers(1, 200), st.integers(1, 200))
+def test_survivors_are_the_share_rounded_up(kept, branches):
+    if kept <= branches:
+        assert KeepBest(kept / branches).survivors(branches) == kept
+        assert KeepBest(0.999 * kept / branches).survivors(branches) in (kept, kept - 1)
+    assert KeepBest(0.5).survivors(branches) == branches - branches // 2
+    assert KeepBest(1e-9).survivors(branches) == 1
+
+
+@given(st.lists(ODD, min_size=1, max_size=17), NOISE, st.floats(0.01, 100))
+def test_systematic_copies_are_proportional(totals, noise, temperature):
+    rule = Systematic(temperature)
+    given_totals = torch.tensor([totals])
+    parents = rule(given_totals, torch.tensor([noise]))
+    assert torch.equal(parents, rule(given_totals, torch.tensor([noise])))
+    counts = torch.bincount(parents[0], minlength=len(totals))
+    assert len(counts) == len(totals)
+    if all(map(math.isfinite, totals)):
+        expected = len(totals) * torch.softmax(-given_totals[0].double() / temperature, 0)
+        assert (counts >= (expected - 1e-6).floor()).all()
+        assert (counts <= (expected + 1e-6).ceil()).all()
+    finite = [i for i, total in enumerate(totals) if total < math.inf]
+    if finite:
+        assert set(parents[0].tolist()) <= set(finite)
+
+
+def test_systematic_is_fair():
+    """Averaged over the noise a branch has S w copies."""
+    totals = torch.tensor([0.3, 2.0, 0.1, 0.9, 0.3])
+    noise = (torch.arange(2000) + 0.5) / 2000
+    parents = Systematic(0.7)(totals.expand(2000, 5), noise)
+    average = torch.bincount(parents.flatten(), minlength=5) / 2000
+    assert_close(average, 5 * torch.softmax(-totals / 0.7, 0), atol=2e-3, rtol=0)
+
+
+def test_systematic_of_equals_keeps_all():
+    everything = torch.arange(6).expand(3, 6)
+    for value in (0.0, math.inf, math.nan):
+        assert torch.equal(
+            Systematic()(torch.full((3, 6), value), torch.tensor([0.001, 0.5, 0.999])), everything
+        )
+    assert torch.equal(KeepAll()(torch.rand(3, 6)), everything)
+
+
+@settings(deadline=None)
+@given(grouped(), FRACTIONS, NOISE)
+def test_groups_are_pruned_as_if_alone(groups_and_totals, fraction, noise):
+    groups, totals = groups_and_totals
+    members = group_members(groups)
+    for rule in (KeepBest(fraction), Systematic(10.0)):
+        parents = prune(rule, totals, torch.tensor([noise]), members)
+        assert torch.equal(groups.gather(1, parents), groups)
+        for group in groups.unique():
+            slots = (groups[0] == group).nonzero().squeeze(-1)
+            alone = slots[rule(totals[:, slots], torch.tensor([noise]))]
+            assert torch.equal(parents[:, slots], alone)
+
+
+@pytest.mark.parametrize(
+    "groups", [[[0, 0, 1]], [[0, 0, 0, 1]], [[0, 0, 1, 1], [0, 1, 2, 3]], [[0, 1, 1, 2]]]
+)
+def test_unequal_groups_are_errors(groups):
+    with pytest.raises(ConfigError, match="equally many groups"):
+        group_members(torch.tensor(groups))
+
+
+def test_bad_parameters_are_errors():
+    for fraction in (0.0, 1.1, math.nan):
+        with pytest.raises(ConfigError, match="fraction"):
+            KeepBest(fraction)
+    with pytest.raises(ConfigError, match="temperature"):
+        Systematic(0.0)
+    with pytest.raises(ConfigError, match="time is one of max, mean, sum, last"):
+        Aggregate("median")
+    with pytest.raises(ConfigError, match="agents is one of"):
+        Aggregate("max", "last")

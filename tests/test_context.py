@@ -1,0 +1,261 @@
+"""What two vehicles are to each other, on hand-made paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
+from symphony.data.context import CONFLICT_GAP, Context, relations
+from symphony.data.segment import RunSegment
+from symphony.data.selection import choices, interactive_agents, interactive_choice
+
+STEPS, DT = 51, 0.2
+TIME = np.arange(STEPS) * DT
+Paths = list[tuple[Any, Any]]
+
+ARC = np.linspace(0, np.pi / 2, 20)
+NORTH = np.asarray([[0.0, -200], [0, 200]])
+EAST = np.asarray([[-200.0, 0], [200, 0]])
+BESIDE = NORTH + np.asarray([3.5, 0])
+"""The next lane to the right of NORTH."""
+ONCOMING = NORTH[::-1] + np.asarray([-3.5, 0])
+TURN_RIGHT_INTO_NORTH = np.concatenate(
+    [[[-100.0, 10]], np.stack([-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(ARC)], -1), [[0, 200]]]
+)
+"""From the west into NORTH, which it reaches at y = 20, 100.7 m on."""
+TURN_LEFT_OFF_NORTH = np.concatenate(
+    [[[0.0, -200]], np.stack([-10 + 10 * np.cos(ARC), -20 + 10 * np.sin(ARC)], -1), [[-200, -10]]]
+)
+CHANGE_LANE = np.asarray([[3.5, -200], [3.5, -30], [0, 0], [0, 200]])
+
+
+def scene(paths: Paths, **changes: Any) -> RunSegment:
+    """Vehicles on polylines; (polyline, metres from its start at each step), the ego first."""
+    placed = [along(np.asarray(path, float), np.broadcast_to(driven, STEPS)) for path, driven in paths]
+    position = np.stack([each[0] for each in placed])
+    heading = np.stack([each[1] for each in placed])
+    velocity = np.gradient(position, DT, axis=1)
+    return make_segment(make_road([NORTH]), position, heading, velocity, DT, **changes)
+
+
+def north(y: float, speed: float = 8.0) -> Any:
+    """Metres driven on NORTH and what is parallel to it, from y."""
+    return 200 + y + speed * TIME
+
+
+CASES: dict[str, tuple[Context, Paths]] = {
+    # Each has the partner second; what follows is nearer, at first, and has less to do with the ego.
+    "turns in before": (
+        Context.MERGE,
+        [(NORTH, north(-30)), (TURN_RIGHT_INTO_NORTH, 100.7 - 34 + 8 * TIME), (BESIDE, north(-28))],
+    ),
+    "turns in after": (
+        Context.MERGE,
+        [(NORTH, north(-10)), (TURN_RIGHT_INTO_NORTH, 100.7 - 50 + 8 * TIME), (NORTH, north(-25))],
+    ),
+    "changes lane ahead": (
+        Context.MERGE,
+        [(NORTH, north(-60, 10)), (CHANGE_LANE, north(-42, 10)), (NORTH, north(-75, 10))],
+    ),
+    "ego changes lane": (
+        Context.MERGE,
+        [(CHANGE_LANE, north(-42, 10)), (NORTH, north(-60, 10)), (BESIDE, north(-57, 10))],
+    ),
+    "crosses": (
+        Context.CROSSING,
+        [(NORTH, north(-40)), (EAST, 200 - 60 + 8 * TIME), (NORTH, north(-55)), (ONCOMING, 220 + 8 * TIME)],
+    ),
+    "crosses from a stop": (
+        Context.CROSSING,
+        [(NORTH, north(-20)), (EAST, 200 - 9 + np.maximum(TIME - 3, 0) ** 2), (NORTH, north(-35))],
+    ),
+    "leads": (Context.LEADER, [(NORTH, north(-60)), (NORTH, north(-44)), (BESIDE, north(-58))]),
+    "leads and turns off": (
+        Context.LEADER,
+        [(NORTH, north(-60)), (TURN_LEFT_OFF_NORTH, north(-44, 6)), (BESIDE, north(-58))],
+    ),
+    "leads around a corner": (
+        Context.LEADER,
+        [
+            (TURN_LEFT_OFF_NORTH, north(-45)),
+            (TURN_LEFT_OFF_NORTH, north(-25)),
+            (BESIDE, north(-43)),
+        ],
+    ),
+    "leads in a queue": (
+        Context.LEADER,
+        [
+            (NORTH, north(-20, 0) + np.minimum(0.5 * TIME, 4)),
+            (NORTH, north(-12, 0) + np.minimum(0.5 * TIME, 3)),
+            (BESIDE, north(-19, 0) + 0.5 * TIME),
+        ],
+    ),
+    "follows": (Context.FOLLOWER, [(NORTH, north(-40)), (NORTH, north(-56)), (BESIDE, north(-42))]),
+    "follows closer than the leader leads": (
+        Context.FOLLOWER,
+        [(NORTH, north(-40)), (NORTH, north(-52)), (NORTH, north(-20))],
+    ),
+    "next lane": (Context.NEAREST, [(NORTH, north(-40)), (BESIDE, north(-30)), (NORTH, north(40))]),
+    "head on": (Context.NEAREST, [(NORTH, north(-40)), (NORTH[::-1], 200 + 8 * TIME)]),
+    "oncoming": (Context.NEAREST, [(NORTH, north(-40)), (ONCOMING, 200 + 8 * TIME)]),
+    "crosses long before": (
+        Context.NEAREST,
+        [(NORTH, north(-60)), (EAST, 200 - 8 + 8 * TIME)],
+    ),
+    "far ahead": (Context.NEAREST, [(NORTH, north(-60, 8)), (NORTH, north(-20, 8))]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_context_is_what_happens(case: str) -> None:
+    context, paths = CASES[case]
+    choice = interactive_choice(scene(paths), 2)
+    assert choice.context == context
+    assert choice.agents.tolist() == [0, 1]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from(sorted(CASES)),
+    st.floats(-np.pi, np.pi),
+    st.tuples(st.floats(-500, 500), st.floats(-500, 500)),
+    st.randoms(use_true_random=False),
+)
+def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, random: Any) -> None:
+    context, paths = CASES[case]
+    segment = scene(paths)
+    order = random.sample(range(len(paths)), len(paths))
+    turn = np.asarray([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    moved = scene(paths).position.copy()
+    moved[..., :2] = moved[..., :2] @ turn + shift
+    again = segment.replace(
+        ego=order.index(0),
+        agent_id=segment.agent_id[order],
+        position=moved[order].astype(np.float32),
+        heading=(segment.heading + np.float32(angle))[order],
+        velocity=(segment.velocity @ turn).astype(np.float32)[order],
+    )
+    choice = interactive_choice(again, 2)
+    assert choice.context == context
+    assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.floats(3, 25),
+    st.floats(3, 25),
+    st.floats(np.deg2rad(40), np.deg2rad(140)),
+    st.booleans(),
+    st.floats(-8, 8).filter(lambda gap: abs(abs(gap) - CONFLICT_GAP) > 0.7),
+)
+def test_crossing_is_a_matter_of_time(
+    speed: float, other_speed: float, angle: float, right: bool, gap: float
+) -> None:
+    """Whatever the speeds and the angle, two that pass one place within the limit cross."""
+    # Both pass the place within the window, the first of them after a second.
+    arrival, other_arrival = 1 + max(0.0, -gap), 1 + max(0.0, gap)
+    heading = np.pi / 2 + (-angle if right else angle)
+    way = np.asarray([np.cos(heading), np.sin(heading)])
+    path = np.stack([-400 * way, 400 * way])
+    long_north = NORTH * 2
+    segment = scene(
+        [
+            (long_north, 400 + speed * (TIME - arrival)),
+            (path, 400 + other_speed * (TIME - other_arrival)),
+        ]
+    )
+    expected = Context.CROSSING if abs(gap) <= CONFLICT_GAP else Context.NEAREST
+    assert interactive_choice(segment, 2).context == expected
+    found = relations(segment, np.asarray([1])).crossing[0]
+    if expected == Context.CROSSING:
+        assert found <= abs(gap) + DT
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([crossing, straight_road]))
+def test_relations_are_mutual(seed: int, make: Any) -> None:
+    """Leading is following seen from the other; crossing has no sides."""
+    segment = make(num_agents=5, seed=seed)
+    for other in range(1, 5):
+        here = relations(segment, np.asarray([other]))
+        there = relations(segment.replace(ego=other), np.asarray([0]))
+        assert np.isfinite(here.leader[0]) == np.isfinite(there.follower[0])
+        assert np.isfinite(here.follower[0]) == np.isfinite(there.leader[0])
+        assert np.isfinite(here.crossing[0]) == np.isfinite(there.crossing[0])
+
+
+def test_one_vehicle_at_a_time_gives_the_same() -> None:
+    segment = crossing(num_agents=9, seed=3)
+    others = np.arange(1, 9)
+    together = relations(segment, others)
+    for k, other in enumerate(others):
+        alone = relations(segment, np.asarray([other]))
+        for name in ("merge", "crossing", "leader", "follower"):
+            assert getattr(alone, name)[0] == getattr(together, name)[k]
+
+
+def test_contexts_come_in_their_order() -> None:
+    merge, cross, lead = (CASES[name][1][1] for name in ("turns in before", "crosses", "leads"))
+    ego = (NORTH, north(-40))
+    lead = (NORTH, north(-24))
+    found = []
+    present = [ego, merge, cross, lead, (BESIDE, north(-39))]
+    while len(present) > 1:
+        choice = interactive_choice(scene(present), 2)
+        found.append(str(choice.context))
+        del present[choice.agents[1]]
+    assert found == ["merge", "crossing", "leader", "nearest"]
+
+
+def test_marks_of_the_source_come_before_geometry() -> None:
+    segment = scene(CASES["crosses"][1])
+    two, three = np.asarray([2], np.int32), np.asarray([3], np.int32)
+    both = interactive_choice(segment.replace(interest=two, predict=three), 2)
+    assert (both.context, both.agents.tolist()) == (Context.INTEREST, [0, 2])
+    only = interactive_choice(segment.replace(predict=three), 2)
+    assert (only.context, only.agents.tolist()) == (Context.PREDICT, [0, 3])
+
+
+def test_a_partner_that_is_seen_throughout_goes_first() -> None:
+    context, paths = CASES["crosses"]
+    segment = hide(scene(paths), 1, slice(STEPS - 1, STEPS))
+    choice = interactive_choice(segment, 2)
+    assert (choice.context, choice.agents.tolist()) == (Context.FOLLOWER, [0, 2])
+    alone = hide(scene(paths[:2]), 1, slice(STEPS - 1, STEPS))
+    assert interactive_choice(alone, 2).context == context
+
+
+def test_the_rest_are_the_nearest_and_none_comes_twice() -> None:
+    segment = scene(CASES["crosses"][1])
+    choice = interactive_choice(segment, 4)
+    first = np.linalg.norm(segment.position[:, 0, :2] - segment.position[0, 0, :2], axis=1)
+    assert choice.agents.tolist() == [0, 1, *sorted([2, 3], key=lambda k: first[k])]
+    assert interactive_agents(segment, 4).tolist() == choice.agents.tolist()
+
+
+def test_an_ego_alone_has_no_context() -> None:
+    choice = interactive_choice(scene(CASES["leads"][1]), 1)
+    assert (choice.context, choice.agents.tolist()) == (None, [0])
+
+
+def test_a_gap_in_the_track_and_no_map_do_no_harm() -> None:
+    context, paths = CASES["turns in before"]
+    segment = scene(paths[:2]).replace(road=make_road([NORTH[:1]]))
+    for agent in (0, 1):
+        assert interactive_choice(hide(segment, agent, slice(10, 13)), 2).context == context
+
+
+def test_choices_are_counted_and_named() -> None:
+    segments = [scene(paths, segment_id=name) for name, (_, paths) in CASES.items()]
+    found = choices([*segments, scene([(NORTH, north(0))], segment_id="alone")], 2)
+    assert found["count"] == 2
+    assert found["too_few"] == 1
+    assert sum(found["contexts"].values()) == len(found["segments"]) == len(CASES)
+    assert list(found["contexts"]) == ["merge", "crossing", "leader", "follower", "nearest"]
+    for name, (context, _) in CASES.items():
+        assert found["segments"][name] == {"context": context, "agents": [7, 8]}

@@ -1,0 +1,404 @@
+"""The discriminator's loss and the rank statistic it reports."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torch.nn import functional
+
+from helpers_objectives import check_contract
+from symphony.modules import SceneEncoder, SceneNetwork
+from symphony.objectives import DiscriminatorLoss, auc
+
+OBSERVATION, SCORE = ("agents", "observation"), ("agents", "score")
+SIMULATED, VALID = ("agents", "simulated"), ("agents", "valid")
+PENALTY = {"gradient_penalty": 0.3}
+
+
+class Judge(nn.Module):
+    def __init__(self, dtype=torch.float32):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1)).to(dtype)
+
+    def forward(self, x):
+        return self.net(x).squeeze(-1)
+
+
+def discriminator(dtype=torch.float32):
+    torch.manual_seed(0)
+    return TensorDictModule(Judge(dtype), in_keys=[OBSERVATION], out_keys=[SCORE])
+
+
+def batch(*shape, agents=3):
+    torch.manual_seed(1)
+    td = TensorDict(batch_size=shape)
+    td[OBSERVATION] = torch.randn(*shape, agents, 4)
+    td[SIMULATED] = (torch.rand(*shape, 1) < 0.8).expand(*shape, agents).clone()
+    td[VALID] = torch.rand(*shape, agents) < 0.7
+    return td
+
+
+def fixed(score, simulated, **arguments):
+    """A loss on given logits."""
+    network = TensorDictModule(nn.Identity(), in_keys=["x"], out_keys=["score"])
+    loss = DiscriminatorLoss(network, use_mask=False, **arguments)
+    loss.set_keys(score="score", simulated="simulated")
+    return loss(TensorDict(x=score, simulated=simulated, batch_size=[]))
+
+
+def test_by_hand():
+    """Four simulated states, two logged ones."""
+    probability = torch.tensor([0.5, 0.8, 0.9, 0.2, 0.1, 0.6])
+    simulated = torch.tensor([True, True, True, True, False, False])
+    out = fixed(probability.logit(), simulated)
+    fake = torch.tensor([0.5, 0.8, 0.9, 0.2]).log().mean()
+    real = torch.tensor([0.9, 0.4]).log().mean()
+    torch.testing.assert_close(out["loss_discriminator"], -(fake + real) / 2)
+    assert out["accuracy_simulated"] == 0.5
+    assert out["accuracy_data"] == 0.5
+    torch.testing.assert_close(out["score_simulated"], probability[:4].logit().mean())
+    torch.testing.assert_close(out["score_data"], probability[4:].logit().mean())
+    # Of the eight pairs, 0.5 and 0.2 lose against 0.6.
+    assert out["auc"] == 0.75
+
+
+@pytest.mark.parametrize("shape", [(40,), (8, 5)])
+@pytest.mark.parametrize("smoothing", [0.0, 0.2])
+@pytest.mark.parametrize("reduction", [None, "sum", "none"])
+def test_it_is_cross_entropy_with_a_mean_per_kind(shape, smoothing, reduction):
+    td = batch(*shape)
+    out = DiscriminatorLoss(discriminator(), reduction=reduction, label_smoothing=smoothing)(td)
+    logit = discriminator()(td.clone())[SCORE]
+    # Two classes, so that torch smooths the labels.
+    classes = torch.stack([torch.zeros_like(logit), logit], -1).flatten(0, -2)
+    entropy = functional.cross_entropy(
+        classes, td[SIMULATED].long().flatten(), label_smoothing=smoothing, reduction="none"
+    ).reshape(logit.shape)
+    fake, real = td[VALID] & td[SIMULATED], td[VALID] & ~td[SIMULATED]
+    assert 0 < real.sum() < fake.sum() / 2
+    expected = {
+        None: (entropy[fake].mean() + entropy[real].mean()) / 2,
+        "sum": entropy[td[VALID]].sum(),
+        "none": torch.where(td[VALID], entropy, 0.0),
+    }[reduction]
+    torch.testing.assert_close(out["loss_discriminator"], expected)
+    assert all(out[key].ndim == 0 for key in ("auc", "accuracy_data", "score_simulated"))
+
+
+def test_unequal_amounts_weigh_equally():
+    td = batch(20)
+    simulated = td[td[SIMULATED][:, 0]]
+    many = torch.cat([td, simulated, simulated])
+    loss = DiscriminatorLoss(discriminator(), **PENALTY)
+    one, other = loss(td), loss(many)
+    for key in loss.out_keys:
+        torch.testing.assert_close(one[key], other[key])
+
+
+@pytest.mark.parametrize("penalty_on", ["data", "simulated"])
+def test_a_kind_that_is_absent_adds_nothing(penalty_on):
+    td = batch(10)
+    td[SIMULATED] = torch.ones_like(td[SIMULATED])
+    network = discriminator()
+    out = DiscriminatorLoss(network, penalty_on=penalty_on, **PENALTY)(td)
+    logit = network(td.clone())[SCORE][td[VALID]]
+    entropy = -functional.logsigmoid(logit).mean() / 2
+    torch.testing.assert_close(out["loss_discriminator"], entropy + 0.3 * out["gradient_penalty"])
+    assert (out["gradient_penalty"] == 0) == (penalty_on == "data")
+    assert all(out[key].isnan() for key in ("accuracy_data", "score_data", "auc"))
+    assert out["accuracy_simulated"].isfinite()
+    td[VALID] = torch.zeros_like(td[VALID])
+    network = discriminator()
+    loss = DiscriminatorLoss(network, penalty_on=penalty_on, **PENALTY)(td)["loss_discriminator"]
+    assert loss == 0
+    loss.backward()
+    assert all((p.grad == 0).all() for p in network.parameters())
+
+
+@pytest.mark.parametrize("penalty_on", ["data", "simulated", "both"])
+def test_padding_changes_nothing(penalty_on):
+    td = batch(30)
+    dirty = torch.cat([td, td[:5]])
+    dirty[VALID][30:] = False
+    dirty[SIMULATED] = dirty[SIMULATED] ^ ~dirty[VALID]
+    dirty[OBSERVATION] = torch.where(dirty[VALID][..., None], dirty[OBSERVATION], 1e3)
+    results = []
+    for data in (td, dirty):
+        network = discriminator()
+        out = DiscriminatorLoss(network, penalty_on=penalty_on, **PENALTY)(data)
+        out["loss_discriminator"].backward()
+        results.append([*(v.detach() for v in out.values()), *(p.grad for p in network.parameters())])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_trained_it_scores_simulated_states_higher():
+    td = batch(200)
+    td[OBSERVATION][..., 0] += 4.0 * td[SIMULATED]
+    loss = DiscriminatorLoss(discriminator(), gradient_penalty=0.01)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.03)
+    for _ in range(60):
+        optimizer.zero_grad()
+        out = loss(td)
+        out["loss_discriminator"].backward()
+        optimizer.step()
+    assert out["score_simulated"] > 0 > out["score_data"]
+    assert min(out["auc"], out["accuracy_simulated"], out["accuracy_data"]) > 0.9
+    logit = loss.get_stateful_net("discriminator")(td.clone())[SCORE]
+    assert (logit[td[SIMULATED] & td[VALID]] > 0).float().mean() > 0.9
+
+
+def test_only_the_discriminator_receives_a_gradient():
+    td = batch(20)
+    td[OBSERVATION] = td[OBSERVATION].requires_grad_()
+    out = DiscriminatorLoss(discriminator(), **PENALTY)(td)
+    out["loss_discriminator"].backward()
+    assert td[OBSERVATION].grad is None
+
+
+@pytest.mark.parametrize("arguments", [{}, PENALTY, {**PENALTY, "penalty_on": "both", "reduction": "none"}])
+def test_it_keeps_the_contract_of_torchrl(arguments):
+    check_contract(
+        lambda: DiscriminatorLoss(discriminator(), **arguments),
+        batch(20),
+        "loss_discriminator",
+        parameters=4,
+    )
+
+
+def test_the_key_of_the_score_can_be_set():
+    network = TensorDictModule(Judge(), in_keys=[OBSERVATION], out_keys=["score"])
+    loss = DiscriminatorLoss(network)
+    with pytest.raises(KeyError, match="writes no score"):
+        loss(batch(3))
+    loss.set_keys(score="score")
+    assert loss(batch(3))["loss_discriminator"] > 0
+
+
+@pytest.mark.parametrize("penalty_on", ["data", "simulated", "both"])
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_the_penalty_of_a_linear_judge_is_its_weight(penalty_on, reduction):
+    """The gradient of w . x is w wherever x is."""
+    td = batch(20)
+    net = nn.Linear(4, 1)
+    network = TensorDictSequential(
+        TensorDictModule(net, in_keys=[OBSERVATION], out_keys=["logit"]),
+        TensorDictModule(lambda x: x.squeeze(-1), in_keys=["logit"], out_keys=[SCORE]),
+    )
+    arguments = {"penalty_on": penalty_on, "reduction": reduction}
+    out = DiscriminatorLoss(network, gradient_penalty=0.5, **arguments)(td)
+    plain = DiscriminatorLoss(network, **arguments)(td)
+    squared = net.weight.square().sum()
+    torch.testing.assert_close(out["gradient_penalty"], squared.detach())
+    where = td[VALID] & {"data": ~td[SIMULATED], "simulated": td[SIMULATED], "both": td[VALID]}[penalty_on]
+    added = {"mean": 1.0, "sum": where.sum(), "none": where.float()}[reduction] * 0.5 * squared
+    difference = out["loss_discriminator"] - plain["loss_discriminator"]
+    torch.testing.assert_close(difference, added)
+    # d (0.5 * |w|^2) / dw = w
+    (gradient,) = torch.autograd.grad(difference.sum(), net.weight)
+    share = {"mean": 1.0, "sum": where.sum(), "none": where.sum()}[reduction]
+    torch.testing.assert_close(gradient, share * net.weight)
+
+
+def test_gradients_of_the_penalised_loss_by_differences():
+    td = batch(4)
+    td[OBSERVATION] = td[OBSERVATION].double()
+    loss = DiscriminatorLoss(discriminator(torch.float64), gradient_penalty=2.0, penalty_on="both")
+    parameters = list(loss.parameters())
+
+    def value(*_):
+        return loss(td)["loss_discriminator"]
+
+    assert torch.autograd.gradcheck(value, parameters)
+
+
+class Squeeze(nn.Module):
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, *inputs):
+        return self.network(*inputs).squeeze(-1)
+
+
+def scenes(count, elements):
+    torch.manual_seed(2)
+    td = batch(count).exclude(OBSERVATION)
+    td["agents", "own"] = torch.randn(count, 3, 5, dtype=torch.float64)
+    td["agents", "objects"] = torch.randn(count, 3, elements, 6, dtype=torch.float64)
+    td["agents", "objects_mask"] = torch.rand(count, 3, elements) < 0.5
+    return td
+
+
+def scene_judge(pool):
+    torch.manual_seed(3)
+    network = SceneNetwork(SceneEncoder(5, [6], hidden=8, pool=pool), 1, head=(8,))
+    keys = [("agents", "own"), VALID, ("agents", "objects"), ("agents", "objects_mask")]
+    return TensorDictModule(Squeeze(network), in_keys=keys, out_keys=[SCORE]).double()
+
+
+@pytest.mark.parametrize("pool", ["dense", "winner", "auto"])
+def test_the_penalty_reaches_the_encoders_through_every_pool(pool):
+    td = scenes(12, 50)
+    assert (td[VALID] & ~td[SIMULATED]).any()
+    reference, network = scene_judge("dense"), scene_judge(pool)
+    for one in (reference, network):
+        out = DiscriminatorLoss(one, gradient_penalty=5.0, penalty_on="both")(td)
+        out["loss_discriminator"].backward()
+    for (name, a), b in zip(reference.named_parameters(), network.parameters(), strict=True):
+        assert a.grad.norm() > 0, name
+        torch.testing.assert_close(a.grad, b.grad)
+    loss = DiscriminatorLoss(network, gradient_penalty=5.0, penalty_on="both")
+    weights = [p for name, p in loss.named_parameters() if "groups" in name and p.shape[-1] == 6]
+    assert len(weights) == 1
+    assert torch.autograd.gradcheck(
+        lambda *_: loss(td)["loss_discriminator"], weights, eps=1e-7, fast_mode=True
+    )
+
+
+def test_the_penalty_is_that_of_each_agent_by_itself():
+    td = scenes(12, 7)
+    loss = DiscriminatorLoss(
+        scene_judge("winner"), gradient_penalty=1.0, penalty_keys=[("agents", "objects")]
+    )
+    rows = []
+    for i, j in (td[VALID] & ~td[SIMULATED]).nonzero().tolist():
+        one = td[i : i + 1].clone()
+        leaf = one["agents", "objects"].requires_grad_()
+        one["agents", "objects"] = leaf
+        (gradient,) = torch.autograd.grad(scene_judge("dense")(one)[SCORE][0, j], leaf)
+        rows.append(gradient.square().sum())
+    assert len(rows) > 1
+    torch.testing.assert_close(loss(td)["gradient_penalty"], torch.stack(rows).mean())
+
+
+def test_an_input_without_influence_has_no_gradient():
+    td = batch(5)
+    td["agents", "more"] = torch.randn(5, 3, 2)
+    judge = Judge()
+    network = TensorDictModule(
+        lambda x, more: judge(x), in_keys=[OBSERVATION, ("agents", "more")], out_keys=[SCORE]
+    )
+    arguments = {"penalty_on": "both", **PENALTY}
+    all_inputs = DiscriminatorLoss(network, **arguments)(td)
+    named = DiscriminatorLoss(network, penalty_keys=[OBSERVATION], **arguments)(td)
+    other = DiscriminatorLoss(network, penalty_keys=[("agents", "more")], **arguments)(td)
+    assert all_inputs["gradient_penalty"] == named["gradient_penalty"] > 0 == other["gradient_penalty"]
+
+
+def test_noise_is_for_training_and_follows_its_generator():
+    td = batch(20)
+    before = td.clone()
+
+    def make(seed):
+        return DiscriminatorLoss(
+            discriminator(),
+            instance_noise=0.5,
+            noise_keys=[OBSERVATION],
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    plain = DiscriminatorLoss(discriminator())(td)["loss_discriminator"].detach()
+    loss = make(0)
+    clone = copy.deepcopy(loss)
+    state = torch.get_rng_state()
+    first, second = (loss(td)["loss_discriminator"].detach() for _ in range(2))
+    other = make(1)(td)["loss_discriminator"].detach()
+    assert torch.equal(torch.get_rng_state(), state)
+    assert (td == before).all()
+    assert len({float(v) for v in (plain, first, second, other)}) == 4
+    assert make(0)(td)["loss_discriminator"] == first == clone(td)["loss_discriminator"]
+    loss.eval()
+    assert loss(td)["loss_discriminator"] == plain
+    # A linear judge sees noise of the stated spread.
+    wide = TensorDict(x=torch.zeros(20000), simulated=torch.ones(20000, dtype=torch.bool), batch_size=[])
+    network = TensorDictModule(lambda x: x.square(), in_keys=["x"], out_keys=["score"])
+    loss = DiscriminatorLoss(network, instance_noise=0.5, noise_keys=["x"], use_mask=False)
+    loss.set_keys(score="score", simulated="simulated")
+    torch.manual_seed(0)
+    assert loss(wide)["score_simulated"] == pytest.approx(0.25, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"gradient_penalty": -1.0}, "gradient_penalty must be"),
+        ({"instance_noise": float("inf"), "noise_keys": [OBSERVATION]}, "instance_noise must be"),
+        ({"instance_noise": 0.1}, "needs noise_keys"),
+        ({"noise_keys": ["x"]}, r"noise_keys: the discriminator does not read \['x'\]"),
+        ({"penalty_keys": [SCORE]}, "penalty_keys: the discriminator does not read"),
+        ({"penalty_on": "all"}, "unknown penalty_on"),
+        ({"label_smoothing": 1.0}, "label_smoothing must be in"),
+        ({"reduction": "median"}, "unknown reduction"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DiscriminatorLoss(discriminator(), **arguments)
+
+
+def test_bad_inputs_are_refused():
+    td = batch(5)
+    loss = DiscriminatorLoss(discriminator())
+    with pytest.raises(KeyError, match="no flag under"):
+        loss(td.exclude(SIMULATED))
+    with pytest.raises(KeyError, match="use_mask=False"):
+        loss(td.exclude(VALID))
+    wrong = td.clone()
+    wrong[SIMULATED] = wrong[SIMULATED].float()
+    with pytest.raises(ValueError, match=r"flag .* is torch.float32"):
+        loss(wrong)
+    wrong[SIMULATED] = td[SIMULATED][..., None]
+    with pytest.raises(ValueError, match=r"flag .* has shape \(5, 3, 1\).*\(5, 3\)"):
+        loss(wrong)
+    shared = TensorDictModule(
+        lambda x, y: x.sum(-1) + y.sum(), in_keys=[OBSERVATION, "shared"], out_keys=[SCORE]
+    )
+    td["shared"] = torch.randn(5, 2)
+    with pytest.raises(ValueError, match=r"penalised input has shape \(5, 2\), expected \(5, 3\) in front"):
+        DiscriminatorLoss(shared, gradient_penalty=1.0)(td)
+    td["shared"] = torch.ones(5, 2, dtype=torch.int64)
+    with pytest.raises(ValueError, match="expected floating point"):
+        DiscriminatorLoss(shared, gradient_penalty=1.0, penalty_keys=["shared"])(td)
+
+
+scores = st.sampled_from([-torch.inf, -2.0, -0.0, 0.0, 0.5, 1.0, torch.inf]) | st.floats(-3, 3, width=32)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.tuples(scores, st.booleans(), st.booleans()), max_size=30))
+def test_auc_counts_pairs(entries):
+    score = torch.tensor([s for s, _, _ in entries], dtype=torch.float32)
+    positive, valid = (torch.tensor([e[k] for e in entries], dtype=torch.bool) for k in (1, 2))
+    a, b = score[positive & valid][:, None], score[~positive & valid]
+    found = auc(score, positive, valid)
+    if a.numel() and b.numel():
+        assert float(found) == pytest.approx(float(((a > b).double() + 0.5 * (a == b)).mean()), abs=1e-6)
+    else:
+        assert found.isnan()
+
+
+def test_auc_of_many_scores():
+    torch.manual_seed(0)
+    score, positive = torch.randn(40, 50).round(decimals=1), torch.rand(40, 50) < 0.3
+    a, b = score[positive][:, None], score[~positive]
+    assert float(auc(score, positive)) == pytest.approx(float(((a > b).double() + 0.5 * (a == b)).mean()))
+    assert float(auc(score, positive) + auc(-score, positive)) == pytest.approx(1)
+    assert float(auc(score.exp(), positive)) == float(auc(score, positive))
+
+
+def test_auc_of_strange_scores():
+    positive = torch.tensor([True, False, True])
+    assert auc(torch.tensor([1.0, 0.0, torch.nan]), positive).isnan()
+    assert auc(torch.tensor([1.0, 0.0, torch.nan]), positive, torch.tensor([True, True, False])) == 1
+    with pytest.raises(ValueError, match=r"positive is torch\.int64"):
+        auc(torch.rand(3), positive.long())
+    with pytest.raises(ValueError, match=r"valid is torch.bool \(1, 3\)"):
+        auc(torch.rand(3), positive, positive[None])

@@ -1,0 +1,199 @@
+"""The likelihood of goals."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import nn
+from torch.distributions import Categorical
+from torch.nn import functional
+
+from helpers_objectives import check_contract
+from symphony.objectives import GoalLoss
+
+ROUTES, LOGITS = ("agents", "routes"), ("agents", "goal_logits")
+MASK, LABEL, VALID = ("agents", "routes_mask"), ("agents", "route"), ("agents", "valid")
+
+
+class Choice(nn.Module):
+    """A score for each route, whatever their number."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(4, 16), nn.ReLU(), nn.Linear(16, 1, bias=False))
+
+    def forward(self, routes):
+        return self.net(routes).squeeze(-1)
+
+
+def goal_network():
+    torch.manual_seed(0)
+    return TensorDictModule(Choice(), in_keys=[ROUTES], out_keys=[LOGITS])
+
+
+def batch(*shape, agents=3, goals=6):
+    torch.manual_seed(1)
+    td = TensorDict(batch_size=shape)
+    td[ROUTES] = torch.randn(*shape, agents, goals, 4)
+    td[MASK] = torch.rand(*shape, agents, goals) < 0.6
+    feasible = td[MASK].float() + 1e-9 * ~td[MASK].any(-1, keepdim=True)
+    label = torch.multinomial(feasible.reshape(-1, goals), 1).reshape(*shape, agents)
+    td[LABEL] = torch.where(td[MASK].any(-1) & (torch.rand(*shape, agents) < 0.9), label, -1)
+    td[VALID] = torch.rand(*shape, agents) < 0.8
+    return td
+
+
+def counted(td):
+    return td[VALID] & (td[LABEL] >= 0)
+
+
+def fixed(logits):
+    """A loss on given logits [..., N, G]."""
+    network = TensorDictModule(nn.Identity(), in_keys=[LOGITS], out_keys=[LOGITS])
+    td = TensorDict(batch_size=[])
+    td[LOGITS] = logits
+    return GoalLoss(network, use_mask=False), td
+
+
+@pytest.mark.parametrize("shape", [(40,), (8, 5)])
+@pytest.mark.parametrize("reduction", [None, "mean", "sum", "none"])
+def test_it_is_cross_entropy_over_the_feasible_goals(shape, reduction):
+    td = batch(*shape)
+    loss = GoalLoss(goal_network(), reduction=reduction)
+    out = loss(td)
+    logits = goal_network()(td.clone())[LOGITS]
+    rows = [
+        functional.cross_entropy(logits[tuple(i)][td[MASK][tuple(i)]], rank)
+        for i in counted(td).nonzero()
+        for rank in [td[MASK][tuple(i)][: td[LABEL][tuple(i)]].sum()]
+    ]
+    values = torch.stack(rows)
+    assert len(values) > 20
+    if reduction == "none":
+        assert {value.shape for value in out.values()} == {td[VALID].shape}
+        torch.testing.assert_close(out["loss_goal"][counted(td)], values)
+        assert (out["loss_goal"][~counted(td)] == 0).all()
+    else:
+        torch.testing.assert_close(out["loss_goal"], values.sum() if reduction == "sum" else values.mean())
+
+
+def test_by_hand():
+    """Three agents: probabilities 1/2, 1/4, 1/4 over three of four goals; one goal; four goals of five."""
+    logits = torch.full((3, 5), 9.0)
+    logits[0, :4] = torch.tensor([0.25, 0.25, 9e9, 0.5]).log()
+    logits[2] = torch.tensor([0.4, 0.3, 0.2, 0.1, 9e9]).log()
+    mask = torch.tensor([[1, 1, 0, 1, 0], [0, 1, 0, 0, 0], [1, 1, 1, 1, 0]]).bool()
+    loss, td = fixed(logits)
+    td[MASK], td[LABEL] = mask, torch.tensor([3, 1, 3])
+    out = loss(td)
+    probability = torch.tensor([0.5, 1.0, 0.1])
+    torch.testing.assert_close(out["loss_goal"], -probability.log().mean())
+    torch.testing.assert_close(out["accuracy"], torch.tensor(2 / 3))
+    torch.testing.assert_close(out["accuracy_top3"], torch.tensor(2 / 3))
+    p, q = torch.tensor([0.5, 0.25, 0.25]), torch.tensor([0.4, 0.3, 0.2, 0.1])
+    torch.testing.assert_close(out["entropy"], -((p * p.log()).sum() + (q * q.log()).sum()) / 3)
+
+
+def test_what_does_not_count_has_no_influence():
+    td = batch(30)
+    dirty = torch.cat([td, td[:4]])
+    dirty[VALID][30:] = False
+    dirty[LABEL] = torch.where(dirty[VALID], dirty[LABEL], 99)
+    used = dirty[MASK] & counted(dirty)[..., None]
+    dirty[ROUTES] = dirty[ROUTES].masked_fill(~used[..., None], 1e3)
+    # Two more goals, feasible for nobody.
+    dirty[MASK] = torch.cat([dirty[MASK], torch.zeros(34, 3, 2, dtype=torch.bool)], -1)
+    dirty[ROUTES] = torch.cat([dirty[ROUTES], dirty[ROUTES][..., :2, :]], -2)
+    results = []
+    for data in (td, dirty):
+        network = goal_network()
+        out = GoalLoss(network)(data)
+        out["loss_goal"].backward()
+        results.append([*(v.detach() for v in out.values()), *(p.grad for p in network.parameters())])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("why", ["no goal is known", "none is feasible", "all are padding", "there are none"])
+def test_where_nothing_counts_it_is_zero_with_zero_gradient(why):
+    td = batch(5)
+    if why == "no goal is known":
+        td[LABEL] = torch.full_like(td[LABEL], -1)
+    elif why == "none is feasible":
+        td[MASK] = torch.zeros_like(td[MASK])
+    elif why == "all are padding":
+        td[VALID] = torch.zeros_like(td[VALID])
+    else:
+        td[MASK], td[ROUTES] = td[MASK][..., :0], td[ROUTES][..., :0, :]
+    network = goal_network()
+    out = GoalLoss(network)(td)
+    assert all(value == 0 for value in out.values())
+    out["loss_goal"].backward()
+    assert all((p.grad == 0).all() for p in network.parameters())
+
+
+def test_a_probabilistic_network_is_not_sampled_from():
+    td = batch(20)
+    head = ProbabilisticTensorDictModule(
+        in_keys={"logits": LOGITS},
+        out_keys=[LABEL],
+        distribution_class=Categorical,
+        default_interaction_type=InteractionType.RANDOM,
+    )
+    loss = GoalLoss(ProbabilisticTensorDictSequential(goal_network(), head))
+    state = torch.get_rng_state()
+    out = loss(td)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.testing.assert_close(out["loss_goal"], GoalLoss(goal_network())(td)["loss_goal"])
+
+
+def test_training_it_learns_which_goal_is_taken():
+    td = batch(200)
+    best = td[ROUTES][..., 0].masked_fill(~td[MASK], -torch.inf).argmax(-1)
+    td[LABEL] = torch.where(td[MASK].any(-1), best, -1)
+    loss = GoalLoss(goal_network())
+    before = loss(td)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.03)
+    for _ in range(100):
+        optimizer.zero_grad()
+        out = loss(td)
+        out["loss_goal"].backward()
+        optimizer.step()
+    assert out["accuracy"] > 0.95 > before["accuracy"]
+    assert out["accuracy"] <= out["accuracy_top3"] <= 1
+    assert out["entropy"] < before["entropy"]
+
+
+def test_it_keeps_the_contract_of_torchrl():
+    check_contract(lambda: GoalLoss(goal_network()), batch(20), "loss_goal", parameters=3)
+
+
+def test_the_key_of_the_logits_can_be_set():
+    network = TensorDictModule(Choice(), in_keys=[ROUTES], out_keys=["logits"])
+    loss = GoalLoss(network)
+    with pytest.raises(KeyError, match="writes no logits"):
+        loss(batch(3))
+    loss.set_keys(logits="logits")
+    assert loss(batch(3))["loss_goal"] > 0
+
+
+def test_bad_inputs_are_refused():
+    with pytest.raises(ValueError, match="unknown reduction"):
+        GoalLoss(goal_network(), reduction="median")
+    loss = GoalLoss(goal_network())
+    td = batch(5)
+    td[VALID][2, 1], td[MASK][2, 1, 3], td[MASK][2, 1, 0] = True, False, True
+    for label in (3, 6):
+        td[LABEL][2, 1] = label
+        with pytest.raises(ValueError, match=r"at \[2, 1\] is not one of the feasible"):
+            loss(td)
+    td[MASK] = td[MASK][..., :4]
+    with pytest.raises(ValueError, match=r"mask of goals .* has shape \(5, 3, 4\).*\(5, 3, 6\)"):
+        loss(td)
