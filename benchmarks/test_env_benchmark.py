@@ -5,28 +5,29 @@ python -m pytest benchmarks/test_env_benchmark.py --benchmark-group-by=func
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from symphony.config import AgentConfig
+from symphony.config import AgentConfig, TrainConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
 from symphony.objectives import BCLoss
-from symphony.trainers.agents import build_policy, observation_config
 from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.networks import build_networks, observation_config
 
 POINTS = pytest.mark.parametrize("points", [200, 1000])
 
 
-def parts(points: int) -> tuple[SceneDataset, DrivingEnv, Any, AgentConfig]:
+def parts(points: int) -> tuple[SceneDataset, DrivingEnv, Any, TrainConfig]:
     torch.set_num_threads(1)
-    agent = AgentConfig(num_points=points)
+    config = TrainConfig("bc", Path(), Path(), agent=AgentConfig(num_points=points))
     dataset = SceneDataset(SegmentStore(builtin_store("train")))
-    env = DrivingEnv(dataset.scenes(range(16)), Bicycle(), observation_config(agent))
-    return dataset, env, build_policy(agent, Bicycle()), agent
+    env = DrivingEnv(dataset.scenes(range(16)), Bicycle(), observation_config(config))
+    return dataset, env, build_networks(config, Bicycle()).policy, config
 
 
 @POINTS
@@ -46,14 +47,16 @@ def test_policy(benchmark: Any, points: int) -> None:
 
 
 def test_sampling_of_a_training_batch(benchmark: Any) -> None:
-    dataset, _, _, agent = parts(200)
+    dataset, _, _, config = parts(200)
     rng = torch.Generator().manual_seed(0)
-    benchmark(dataset.sample_states, 16, 1024, observation_config(agent), rng)
+    benchmark(dataset.sample_states, range(16), 1024, observation_config(config), rng)
 
 
 def test_update(benchmark: Any) -> None:
-    dataset, _, policy, agent = parts(200)
-    batch = dataset.sample_states(16, 1024, observation_config(agent), torch.Generator().manual_seed(0))
+    dataset, _, policy, config = parts(200)
+    batch = dataset.sample_states(
+        range(16), 1024, observation_config(config), torch.Generator().manual_seed(0)
+    )
     loss = BCLoss(policy)
 
     def update() -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, distance, noise, starts
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 from torchrl.envs import PendulumEnv
 
+from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, distance, noise, starts
 from symphony.collectors import (
     Aggregate,
     KeepAll,

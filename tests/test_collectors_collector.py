@@ -8,21 +8,24 @@ import time
 
 import pytest
 import torch
-from helpers_collectors import ACTION, STREAM, Policy, Walk, X, distance, give_streams
 from tensordict import TensorDict
 from torch.testing import assert_close
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
-from torchrl.envs import BatchSizeTransform, Compose, EnvBase, PendulumEnv, StepCounter, TransformedEnv
+from torchrl.envs import EnvBase, PendulumEnv, StepCounter
 
-from symphony.collectors import BeamSearchCollector, KeepAll, KeyScore, Systematic
+from helpers_collectors import ACTION, STREAM, Policy, Walk, X, distance, give_streams
+from symphony.collectors import BeamSearchCollector, KeepAll, KeepBest, KeyScore, Systematic, with_rows
 from symphony.errors import ConfigError
 
 ROWS, STEPS, FRAMES = 3, 8, 3 * 8
 
 
 def make_env(last: int = 1000, *transforms) -> EnvBase:
-    return TransformedEnv(Walk(last=last), Compose(BatchSizeTransform(batch_size=[ROWS]), *transforms))
+    env = with_rows(Walk(last=last), [ROWS])
+    for transform in transforms:
+        env.append_transform(transform)
+    return env
 
 
 def make(env=make_env, policy=None, **kwargs) -> BeamSearchCollector:
@@ -33,9 +36,14 @@ def make(env=make_env, policy=None, **kwargs) -> BeamSearchCollector:
         "prepare": give_streams,
         "slot_keys": [STREAM],
         "frames_per_batch": FRAMES,
-        "total_frames": 3 * FRAMES,
     }
+    settings["total_frames"] = 3 * kwargs.get("frames_per_batch", FRAMES)
     return BeamSearchCollector(env, policy or Policy(), **{**settings, **kwargs})
+
+
+def plain_collector(**kwargs) -> Collector:
+    settings = {"frames_per_batch": FRAMES, "total_frames": 3 * FRAMES}
+    return Collector(make_env, Policy(), auto_register_policy_transforms=False, **settings, **kwargs)
 
 
 def assert_same(first, second):
@@ -49,7 +57,7 @@ EXTRAS = [("collector", name) for name in ("beam_score", "beam_total", "beam_slo
 
 def test_one_branch_collects_what_a_plain_collector_does():
     """Same entries, same values, same names, same counting."""
-    plain = Collector(make_env, Policy(), frames_per_batch=FRAMES, total_frames=72, reset_at_each_iter=True)
+    plain = plain_collector(reset_at_each_iter=True)
     search = make(branches=1, prepare=None)
     for collector in (plain, search):
         collector.set_seed(3)
@@ -84,7 +92,7 @@ def test_best_leaf_and_its_search():
 
 def test_search_lowers_the_score():
     free, pruned = (
-        make(rule=rule, branches=8, leaves=8, frames_per_batch=8 * FRAMES) for rule in (KeepAll(), None)
+        make(rule=rule, branches=8, leaves=8, frames_per_batch=8 * FRAMES) for rule in (KeepAll(), KeepBest())
     )
     free.set_seed(0)
     pruned.set_seed(0)
@@ -125,7 +133,7 @@ def test_reloading():
     assert min(int(i.min()) for i in ids) >= 2 * ROWS
     assert second.stats()["frames"] == second.total_frames
     assert torch.equal(make().rule_noise((3,)).isnan(), torch.zeros(3, dtype=torch.bool))
-    plain = Collector(make_env, Policy(), frames_per_batch=FRAMES, total_frames=72)
+    plain = plain_collector()
     make().load_state_dict(plain.state_dict())
 
 
@@ -204,8 +212,9 @@ def test_trajectories_are_complete_and_stop_at_their_end():
     assert len(buffer) == 3 * ROWS * 6
     assert (buffer.sample().get("step").reshape(2, 6) == torch.arange(6)).all()
     # unfinished episodes are not trajectories, unless they are declared truncated
-    assert not list(make(trajs_per_batch=1))
-    assert len(list(make(trajs_per_batch=1, set_truncated=True))) == 3 * ROWS
+    one = {"trajs_per_batch": 1, "traj_format": "cat"}
+    assert not list(make(**one))
+    assert len(list(make(set_truncated=True, **one))) == 3 * ROWS
 
 
 def test_trajectory_ids_never_repeat():
@@ -233,12 +242,13 @@ def test_an_environment_that_fails_shuts_the_collector_down():
         def _step(self, tensordict):
             raise RuntimeError("broken")
 
-    collector = make(lambda: Failing())
+    collector = make(Failing)
     with pytest.raises(RuntimeError, match="broken"):
         next(iter(collector))
     assert collector.closed
 
 
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
 def test_without_rows_and_with_other_transforms():
     (batch,) = make(Walk, frames_per_batch=STEPS, total_frames=STEPS)
     assert batch.shape == (STEPS,)
@@ -251,7 +261,7 @@ def test_without_rows_and_with_other_transforms():
 
 @pytest.mark.parametrize("options", [{}, {"init_random_frames": FRAMES}])
 def test_random_actions(options):
-    env = TransformedEnv(PendulumEnv(seed=0), BatchSizeTransform(batch_size=[ROWS]))
+    env = with_rows(PendulumEnv(seed=0), [ROWS])
     settings = {"score": KeyScore("reward", negate=True), "branches": 4, "frames_per_batch": FRAMES}
     policy = (lambda td: td.set("action", torch.full((*td.shape, 1), 9.0))) if options else None
     collector = BeamSearchCollector(env, policy, total_frames=2 * FRAMES, **settings, **options)
@@ -259,6 +269,17 @@ def test_random_actions(options):
     assert first.abs().max() <= 2
     assert len(first.unique()) > FRAMES / 2
     assert bool((second == 9).all()) == bool(options)
+
+
+def test_rows_start_apart_and_are_reset_apart():
+    env = with_rows(Walk(), [ROWS])
+    start = env.reset()
+    assert start.shape == (ROWS,)
+    assert len(start.get(X).unique()) == ROWS * 2
+    rows = torch.tensor([[True], [False], [True]])
+    again = env.reset(start.clone().set("_reset", rows), select_reset_only=False, set_state=False)
+    assert again.shape == (ROWS,)
+    env.rollout(3, break_when_any_done=False)
 
 
 def test_impossible_options_are_errors():
@@ -279,6 +300,7 @@ def test_impossible_options_are_errors():
         make(tree=3)
 
 
+@pytest.mark.slow
 def test_in_a_process_of_its_own():
     """Built by a multi-process collector from the class with its arguments bound, as Ray does with kwargs."""
     bound = functools.partial(
@@ -296,7 +318,8 @@ def test_in_a_process_of_its_own():
         frames_per_batch=FRAMES,
         total_frames=2 * FRAMES,
         use_buffers=False,
-        cat_results=0,
+        auto_register_policy_transforms=False,
+        cat_results="stack",
     )
     try:
         collector.set_seed(3)
@@ -305,6 +328,8 @@ def test_in_a_process_of_its_own():
         collector.shutdown()
     local = make(total_frames=2 * FRAMES)
     local.set_seed(3)
+    local.reset()  # as the multi-process collector does after seeding
     for one, other in zip(batches, local, strict=True):
-        assert_same(one.exclude("collector"), other.exclude("collector"))
+        assert one.shape == (1, ROWS, STEPS)
+        assert_same(one[0].exclude("collector"), other.exclude("collector"))
         assert set(EXTRAS) <= set(one.keys(True, True))

@@ -10,42 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers_segments import crossing, hide, straight_road
+from helpers_convert import FakeReader, scene
+from helpers_segments import hide
 from symphony.data.convert import Report, convert, expand, info
 from symphony.data.resample import resample, smooth
 from symphony.data.segment import RunSegment, content_hash
 from symphony.data.selection import usable
-from symphony.data.sources.base import Item, Reader
+from symphony.data.sources.base import Item
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-
-
-class FakeReader(Reader):
-    """Each line of a file names a scene: ``straight 3``, ``crossing 5``, ``lonely 1``, ``broken``, ``stop``."""
-
-    name = "fake"
-    patterns = ("*.scene", "*.scene-*-of-*")
-
-    def _read(self, path: Path) -> Iterator[Item]:
-        for line in path.read_text().splitlines():
-            kind, _, seed = line.partition(" ")
-            if kind == "broken":
-                yield DataError("13 is not 7", segment=f"bad-{seed}", field="tracks")
-            elif kind == "stop":
-                raise DataError("checksum of record 4 does not match")
-            elif kind == "interrupt":
-                raise KeyboardInterrupt
-            else:
-                yield scene(kind, int(seed)).replace(file=path.name)
-
-
-def scene(kind: str, seed: int) -> RunSegment:
-    if kind == "crossing":
-        return crossing(seed=seed, dt=0.1, steps=91, source="other")
-    return straight_road(
-        1 if kind == "lonely" else 3, seed=seed, dt=0.1, steps=91, segment_id=f"{kind}-{seed}"
-    )
-
 
 Write = Callable[..., Path]
 
@@ -142,15 +115,26 @@ def test_nothing_usable_is_an_error_and_leaves_nothing(logs: Write, out: Path, p
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_an_interrupted_conversion_leaves_nothing(logs: Write, out: Path, before: bool) -> None:
+def test_an_interrupted_conversion_goes_on_where_it_stopped(logs: Write, out: Path, before: bool) -> None:
     if before:
         out.mkdir(parents=True)
+    files = [
+        logs("a.scene", "straight 1", "broken 7"),
+        logs("b.scene", "straight 2", "interrupt", "straight 3"),
+    ]
     with pytest.raises(KeyboardInterrupt):
-        convert(FakeReader(), [logs("a.scene", "straight 1", "interrupt")], out)
-    assert left(out) == (["store"] if before else [])
+        convert(FakeReader(), files, out)
+    assert left(out) == ["store"] * before + ["store.partial"]
     assert not out.exists() or not list(out.iterdir())
-    convert(FakeReader(), [logs("a.scene", "straight 1")], out)
-    assert len(SegmentStore(out)) == 1
+    with pytest.raises(DataError, match="unfinished conversion"):
+        SegmentStore(out)
+    reader = FakeReader()
+    reader.stops = False
+    report = convert(reader, files, out)
+    assert left(out) == ["store"]
+    assert SegmentStore(out).ids == ["straight-1", "straight-2", "straight-3"]
+    assert (report.converted, report.present, report.files) == (3, 0, 2)
+    assert [skip.message for skip in report.skipped] == ["13 is not 7"]
 
 
 def test_appending_skips_what_is_there(logs: Write, out: Path) -> None:
@@ -169,12 +153,24 @@ def test_appending_skips_what_is_there(logs: Write, out: Path) -> None:
 
 def test_appending_keeps_the_store_whatever_happens(logs: Write, out: Path) -> None:
     convert(FakeReader(), [logs("a.scene", "straight 1")], out)
+    first = SegmentStore(out).report
     with pytest.raises(DataError, match="none of 1 records"):
         convert(FakeReader(), [logs("b.scene", "broken 1")], out, append=True)
+    assert left(out) == ["store"]
+    path = logs("c.scene", "straight 1", "straight 2", "broken 3", "interrupt", "straight 4")
     with pytest.raises(KeyboardInterrupt):
-        convert(FakeReader(), [logs("c.scene", "straight 2", "broken 3", "interrupt")], out, append=True)
-    assert SegmentStore(out).ids == ["straight-1", "straight-2"]
-    assert info(out)["skipped"] == 2
+        convert(FakeReader(), [path], out, append=True)
+    assert SegmentStore(out).ids == ["straight-1"]
+    assert SegmentStore(out).report == first
+    assert info(out)["unfinished"] == {"files": 0, "of": 1}
+    reader = FakeReader()
+    reader.stops = False
+    with pytest.raises(DataError, match="append to it"):
+        convert(reader, [path], out)
+    report = convert(reader, [path], out, append=True)
+    assert (report.converted, report.present, len(report.skipped)) == (2, 1, 1)
+    assert SegmentStore(out).ids == ["straight-1", "straight-2", "straight-4"]
+    assert (info(out)["skipped"], info(out)["files"], info(out)["unfinished"]) == (1, 2, None)
     with pytest.raises(DataError, match="field rate: holds segments at 5 steps per second, not 10"):
         convert(FakeReader(), [logs("c.scene", "straight 3")], out, rate=10, append=True)
 

@@ -14,7 +14,11 @@ from typing import Any
 
 import pytest
 
+from helpers_convert import FakeReader
+from symphony.data import parts
+from symphony.data.convert import convert
 from symphony.data.engine import ordered_map
+from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 
 
@@ -118,7 +122,7 @@ def test_leaving_early_abandons_what_is_under_way(tmp_path: Path) -> None:
     names = ("quick", "a", "b", "c", "d")
     results = ordered_map(mark_unless_stopped, [tmp_path / name for name in names], workers=2)
     assert next(results).exists()
-    results.close()  # type: ignore[attr-defined]
+    results.close()
     assert not multiprocessing.active_children()
     assert [p.name for p in tmp_path.iterdir()] == ["quick"]
 
@@ -192,3 +196,16 @@ def test_ray_gives_the_same() -> None:
         list(ordered_map(fail_at_three, range(10), workers=2, engine="ray"))
     with pytest.raises(SymphonyError, match="a Ray worker failed"):
         list(ordered_map(die_at_three, range(10), workers=2, engine="ray"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray")
+def test_ray_makes_the_same_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "PART_FILES", 1)
+    (tmp_path / "logs").mkdir()
+    for k in range(4):
+        (tmp_path / "logs" / f"{k}.scene").write_text(f"straight {k}\nbroken 1\ncrossing {k}")
+    convert(FakeReader(), [tmp_path / "logs"], tmp_path / "here")
+    convert(FakeReader(), [tmp_path / "logs"], tmp_path / "there", workers=2, engine="ray")
+    here, there = SegmentStore(tmp_path / "here"), SegmentStore(tmp_path / "there")
+    assert (here.ids, here.checksum(), here.report) == (there.ids, there.checksum(), there.report)

@@ -31,7 +31,7 @@ def refuse(path: Path, scenario: womd_pb2.Scenario) -> DataError:
 
 
 def test_readers_are_found_by_name() -> None:
-    assert readers() == ("commonroad", "womd")
+    assert readers() == ("argoverse2", "commonroad", "womd")
     for name in readers():
         assert get_reader(name).name == name
     with pytest.raises(ConfigError, match="did you mean 'womd'"):

@@ -53,8 +53,9 @@ class AgentConfig:
 class DiscriminatorConfig:
     """The network that judges realism, and how it learns."""
 
-    features: Literal["clearance", "paper"] = "clearance"
-    """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge."""
+    features: Literal["clearance", "paper", "foresight"] = "clearance"
+    """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge;
+    `foresight`: also the gaps within the next 2 s, were everyone to keep speed and course."""
     radius: float = 20.0
     """Metres around an agent that it sees."""
     hidden: int = 32
@@ -134,7 +135,7 @@ class TrainConfig:
     """Run segments per update."""
     states: int = 1024
     """Expert states per update, drawn from those segments."""
-    goals: int = 256
+    goals: int = 128
     """Expert routes per update of the goal policy (methods with H)."""
     learning_rate: float = 1e-3
     """Of Adam, falling to a tenth along a cosine."""

@@ -51,6 +51,8 @@ ROUTE: Key = ("agents", "observation", "route")
 """[..., N, Fr] float: the agent's route as it sees it."""
 GAP: Key = ("agents", "observation", "gap")
 """[..., N, O] float: signed gap to the box of each object, metres."""
+GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")
+"""[..., N, O, H] float: the same at some times ahead, were everyone to keep speed and course."""
 ROAD: Key = ("agents", "observation", "road")
 """[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
 

@@ -1,4 +1,4 @@
-"""Convert logs into a store of run segments, look into it, draw from it."""
+"""Convert or generate run segments into a store, look into it, draw from it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from symphony.cli.generate import Generate, Quality
 from symphony.errors import ConfigError
 
 app = tyro.extras.SubcommandApp()
+app.command(name="generate")(Generate)
+app.command(name="quality")(Quality)
 
 
 @app.command(name="convert")

@@ -16,6 +16,16 @@ COLUMNS = (
     ("curvature_jsd", "curvature\nJSD nats", 3),
 )
 
+KINDS = (
+    ("into_leader", "into a leader"),
+    ("rear_ended", "rear-ended"),
+    ("crossing", "crossing"),
+    ("oncoming", "oncoming"),
+    ("sideswipe", "sideswipe"),
+    ("other", "other"),
+)
+"""Kinds of first collision (see :class:`symphony.metrics.CollisionKind`) and their words."""
+
 
 def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     """Print results of agents as one table, standard errors beside the numbers."""
@@ -36,6 +46,10 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     console = Console()
     console.print(table)
     first = rows[0]
+    for row in rows:
+        if row["collision_rate"] > 0 and "collision_into_leader" in row:
+            parts = ", ".join(f"{row[f'collision_{kind}']:.1f} {text}" for kind, text in KINDS)
+            console.print(f"{escape(str(row['agent']))}: collisions, % of rollouts: {parts}", style="dim")
     most = max(row["rollouts"] for row in rows)
     console.print(
         f"{first['segments']} run segments, {first['interactive']} interactive agents each, up to {most} "

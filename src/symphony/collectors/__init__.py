@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from symphony.collectors.beam_search import beam_search, branch
-from symphony.collectors.collector import BeamSearchCollector
+from symphony.collectors.collector import BeamSearchCollector, with_rows
 from symphony.collectors.result import BeamSearchResult, lineage
 from symphony.collectors.rules import KeepAll, KeepBest, PruningRule, Systematic
 from symphony.collectors.scores import Aggregate, KeyScore, max_then_sum, mean_then_sum
@@ -22,4 +22,5 @@ __all__ = [
     "lineage",
     "max_then_sum",
     "mean_then_sum",
+    "with_rows",
 ]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import BatchSizeTransform, Compose, EnvBase, TransformedEnv
@@ -39,9 +40,8 @@ class BeamSearchCollector(Collector):
     many.
 
     Args:
-        create_env_fn: environment that keeps its state in the TensorDict and accepts any batch shape. For more
-            than one row wrap it in ``TransformedEnv(env, BatchSizeTransform(batch_size=[B]))``; other transforms
-            are applied to the branches as well.
+        create_env_fn: environment that keeps its state in the TensorDict and accepts any batch shape; for more
+            than one row ``with_rows(env, [B])``. Other transforms are applied to the branches as well.
         policy: as for :class:`Collector`; random actions by default.
         score: of the state after a step, see :func:`beam_search`.
         branches: S.
@@ -86,6 +86,9 @@ class BeamSearchCollector(Collector):
             raise ConfigError("extend_buffer=False: a search has no single steps to write before it ends")
         # Multi-process collectors pass their own choice; here the batch is made anew each time.
         kwargs["use_buffers"] = False
+        if kwargs.get("auto_register_policy_transforms") is None:
+            # What TorchRL 0.14 does when left unset, minus its warning about any policy that is a module.
+            kwargs["auto_register_policy_transforms"] = False
         super().__init__(create_env_fn, policy, **kwargs)
         self.branches = branches
         self.leaves = leaves
@@ -93,18 +96,20 @@ class BeamSearchCollector(Collector):
         self.prepare = prepare
         self.simulated_frames = 0
         self._score = score
-        self._search = {
-            "prune_every": prune_every,
-            "rule": rule,
-            "aggregate": aggregate,
-            "prune_last": prune_last,
-            "slot_keys": slot_keys,
-            "group_key": group_key,
-            "retries": retries,
-            "retry_above": retry_above,
-            "reseed": reseed,
-            "leaves": leaves or 1,
-        }
+        self._aggregate = aggregate
+        self._search = functools.partial(
+            beam_search,
+            prune_every=prune_every,
+            rule=rule,
+            aggregate=aggregate,
+            prune_last=prune_last,
+            slot_keys=slot_keys,
+            group_key=group_key,
+            retries=retries,
+            retry_above=retry_above,
+            reseed=reseed,
+            leaves=leaves or 1,
+        )
         self._rng = torch.Generator().manual_seed(torch.initial_seed() % (1 << 63))
         self._branched_env = branched_env(self.env)
         done = [("next", key) if isinstance(key, str) else ("next", *key) for key in self.env.done_keys]
@@ -122,7 +127,7 @@ class BeamSearchCollector(Collector):
         if self.prepare is not None:
             start = self.prepare(start.copy())
         periods = -(-self.frames_per_batch // self.prune_every)
-        found = beam_search(
+        found = self._search(
             self._branched_env,
             self._act,
             self._score,
@@ -131,7 +136,6 @@ class BeamSearchCollector(Collector):
             noise=self.rule_noise((*start.shape[:-1], periods)),
             keep=self._keep,
             exploration_type=self.exploration_type,
-            **self._search,
         )
         self.simulated_frames += found.simulated_steps
         steps = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
@@ -207,7 +211,7 @@ class BeamSearchCollector(Collector):
         start = branch(self._carrier.exclude("collector"), self.branches)
         first.update(start if self.prepare is None else self.prepare(start.copy()))
         score = score_state(self._branched_env, self._score, first, first.exclude("next"))
-        total = self._search["aggregate"](score.unsqueeze(-2))
+        total = self._aggregate(score.unsqueeze(-2))
         if self.leaves is not None:
             plain = plain.unsqueeze(-2).expand(*plain.shape[:-1], self.leaves, plain.shape[-1]).clone()
         if self._keep is not None:
@@ -241,6 +245,23 @@ class BeamSearchCollector(Collector):
         return True
 
 
+def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
+    """Give an environment that accepts any batch shape a fixed one, each row with a start of its own.
+
+    A bare ``BatchSizeTransform(batch_size=...)`` resets once and starts all rows from the same state.
+    """
+    transform = BatchSizeTransform(batch_size=torch.Size(batch_size), reset_func=_reset_rows, env_kwarg=True)
+    return TransformedEnv(env, transform)
+
+
+def _reset_rows(
+    tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase, env: TransformedEnv
+) -> TensorDictBase:
+    if tensordict_reset.batch_size == env.batch_size:  # rows were named, or only some are reset
+        return tensordict_reset
+    return env.base_env.reset(TensorDict({}, env.batch_size, device=env.device))
+
+
 def branched_env(env: EnvBase) -> EnvBase:
     """The environment without a fixed batch size, for any number of branches.
 
@@ -255,8 +276,8 @@ def branched_env(env: EnvBase) -> EnvBase:
         found = TransformedEnv(found, Compose(*others)) if others else found
     if found.batch_locked or found.batch_size:
         raise ConfigError(
-            f"{type(getattr(env, 'base_env', env)).__name__} has a batch size of its own ({list(found.batch_size)}) and can't be "
-            "stepped with branches; it needs batch_locked = False and an empty batch size, and gets its rows from "
-            "BatchSizeTransform(batch_size=[B])"
+            f"{type(found).__name__} has a batch size of its own ({list(found.batch_size)}) and can't be stepped "
+            "with branches; it needs batch_locked = False and an empty batch size, and gets its rows from "
+            "with_rows(env, [B])"
         )
     return found

@@ -2,99 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
+import json
 import math
-import os
-import re
 import shutil
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import closing
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from symphony.data import resample as resampling
 from symphony.data import store_format
-from symphony.data.segment import RunSegment
-from symphony.data.selection import usable
+from symphony.data.engine import Engine
+from symphony.data.parts import Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip
+from symphony.data.report import Report, Skip
 from symphony.data.sources import Reader, get_reader
 from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.unfinished import STORE, Draft, Job, folder_of, read_journal
 from symphony.errors import ConfigError, DataError
+
+__all__ = ["Progress", "Report", "Skip", "convert", "expand", "info"]
 
 REASONS_SHOWN = 5
 """Reasons an error lists when nothing could be converted."""
-
-
-@dataclass(frozen=True)
-class Skip:
-    """A record or file that was left out."""
-
-    message: str
-    file: str = ""
-    segment: str = ""
-    field: str = ""
-
-    @property
-    def reason(self) -> str:
-        """The message with numbers blanked, so that like cases are counted together."""
-        text = re.sub(r"-?\d+(\.\d+)?", "#", self.message)
-        return f"{self.field}: {text}" if self.field else text
-
-    def __str__(self) -> str:
-        return str(
-            DataError(
-                self.message,
-                file=self.file or None,
-                segment=self.segment or None,
-                field=self.field or None,
-            )
-        )
-
-
-@dataclass
-class Report:
-    """What a conversion did.
-
-    Attributes:
-        converted: segments added.
-        present: segments that the store held before.
-        files: files read.
-        skipped: what was left out.
-        settings: arguments of the conversion.
-    """
-
-    converted: int = 0
-    present: int = 0
-    files: int = 0
-    skipped: list[Skip] = field(default_factory=list)
-    settings: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def reasons(self) -> dict[str, int]:
-        """How often something was skipped for each reason, most frequent first."""
-        return dict(Counter(skip.reason for skip in self.skipped).most_common())
-
-    def to_json(self) -> dict[str, Any]:
-        """As kept with the store."""
-        return {**asdict(self), "reasons": self.reasons}
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Report:
-        """The reverse of :meth:`to_json`; an empty mapping gives an empty report."""
-        known = {key: value[key] for key in ("converted", "present", "files", "settings") if key in value}
-        try:
-            return cls(**known, skipped=[Skip(**skip) for skip in value.get("skipped", ())])
-        except TypeError as error:
-            raise DataError(f"not a conversion report: {error}", field="skipped") from error
-
-    def after(self, earlier: Report) -> Report:
-        """This report joined to the one of an earlier conversion into the same store."""
-        skipped = list(dict.fromkeys([*earlier.skipped, *self.skipped]))
-        return Report(
-            earlier.converted + self.converted, 0, earlier.files + self.files, skipped, self.settings
-        )
-
+CHECKPOINT = 2.0
+"""Seconds after which files that are done are put on record."""
 
 Progress = Callable[[int, int, Report], None]
 """Called with the files done, the files in all, and the report so far, after each record and file."""
@@ -110,12 +42,17 @@ def convert(
     smooth: float = 0.0,
     append: bool = False,
     reader_options: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    engine: Engine = "local",
     progress: Progress | None = None,
 ) -> Report:
     """Convert logs into a segment store.
 
-    A new store appears under its name once it is complete; a conversion that fails leaves nothing behind.
-    A record or file that can't be used is counted, reported and skipped.
+    A new store appears under its name once it is complete, and a store that is added to changes once everything
+    is converted; until then the work lies in ``OUT.partial``. A conversion that is interrupted, however rudely,
+    goes on there when it is called again with the same arguments, and gives the same store and report as one that
+    was not; it converts no file again that was done ``CHECKPOINT`` seconds before. One that fails leaves nothing
+    behind. A record or file that can't be used is counted, reported and skipped.
 
     Args:
         reader: name of the format, or a reader.
@@ -126,142 +63,153 @@ def convert(
         smooth: sigma in seconds of the smoothing of tracks before they are resampled; 0 for none.
         append: add to the store if there is one, skipping the segments it holds.
         reader_options: arguments of the reader.
+        workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
+            depend on it.
+        engine: where they are; with Ray on several machines, ``files`` and ``out`` must be on a file system that
+            all of them share.
         progress: told how far it is.
 
     Returns:
         The report, which is kept with the store as well (joined to the earlier ones).
 
     Raises:
-        ConfigError: an argument out of range, or an unknown format or reader option.
+        ConfigError: an argument out of range, an unknown format or reader option, or another argument than an
+            unfinished conversion to the same place was begun with.
         DataError: ``out`` exists already, or not one segment could be converted.
+        SymphonyError: a worker process died; what is done stays, as after an interrupt.
     """
-    _check_arguments(rate, interactive, smooth)
+    _check_arguments(rate, interactive, smooth, workers)
     out = Path(out).absolute()
     options = dict(reader_options or {})
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
-    settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth}
-    report = Report(settings=settings | options)
-    run = _Run(report, reader, 1 / rate, smooth, interactive, progress)
+    settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     paths = expand(files, reader.patterns)
-    existing = _existing(out, append, 1 / rate)
-    if existing is not None:
-        with StoreWriter(out, append=True) as writer:
-            earlier = Report.from_json(existing.report)
-            try:
-                run(paths, writer, frozenset(existing.ids))
-            finally:  # what was added before an interruption stays, and so does the reason for each gap
-                writer.write_report(report.after(earlier).to_json())
-        _refuse_nothing(report)
-        return report
-    with _replacing(out) as draft:
-        with StoreWriter(draft) as writer:
-            run(paths, writer, frozenset())
-            writer.write_report(report.to_json())
-        _refuse_nothing(report)
-    return report
+    draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
+    with closing(draft):
+        report = draft.report
+        try:
+            if not draft.finished:
+                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before)
+                _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
+            if report.converted or report.present:
+                draft.finish(report)
+                return report
+        except (ConfigError, DataError):
+            if not report.files:
+                draft.discard()
+            raise
+        draft.discard()
+    raise _nothing(report)
 
 
-def _check_arguments(rate: float, interactive: int, smooth: float) -> None:
+def _check_arguments(rate: float, interactive: int, smooth: float, workers: int) -> None:
     if not 0 < rate < math.inf:
         raise ConfigError(f"rate must be positive, is {rate}")
     if not 0 <= smooth < math.inf:
         raise ConfigError(f"smooth must not be negative, is {smooth}")
     if interactive < 1:
         raise ConfigError(f"interactive must be at least 1, is {interactive}")
+    if workers < 1:
+        raise ConfigError(f"workers must be at least 1, is {workers}")
 
 
-def _existing(out: Path, append: bool, dt: float) -> SegmentStore | None:
-    """The store to append to, if there is one."""
+def _job(settings: Mapping[str, Any], paths: list[Path], out: Path, append: bool, dt: float) -> Job:
+    """What there is to do, after a look at what is there already."""
+    settings = json.loads(json.dumps(settings, default=str))  # as it is read back
+    files = [(str(path.absolute()), path.stat().st_size) for path in paths]
+    folder = folder_of(out)
+    begun = read_journal(folder)
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return None
+        if begun is not None and begun.job.before is not None:
+            raise DataError(f"is gone, and {folder} holds an unfinished conversion that adds to it", file=out)
+        return Job(settings, files)
     if not (out / store_format.HEADER).is_file():
         raise DataError("exists and is not a segment store: refusing to write there", file=out)
+    if begun is not None and begun.job.before is None:
+        if begun.report.files < len(begun.job.files) or (folder / STORE).exists():
+            message = f"exists, and {folder} holds an unfinished conversion to that name: delete one of them"
+            raise DataError(message, file=out)
+        return Job(settings, files)  # died between giving the store its name and tidying up
     if not append:
         raise DataError("is a segment store already: append to it, or choose another name", file=out)
+    if begun is not None:
+        return Job(settings, files, begun.job.before, begun.job.earlier)
     store = SegmentStore(out)
     if len(store) and abs(store[0].dt - dt) > 1e-6:
         message = f"holds segments at {1 / store[0].dt:g} steps per second, not {1 / dt:g}"
         raise DataError(message, file=out, field="rate")
-    return store
+    return Job(settings, files, len(store), store.report)
 
 
-@contextlib.contextmanager
-def _replacing(out: Path) -> Iterator[Path]:
-    """A new directory that takes the name ``out`` at the end, and is removed if that is not reached."""
-    made = [folder for folder in out.parents if not folder.exists()]
-    draft = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        draft.mkdir(parents=True)
-        yield draft
-        if out.exists():
-            out.rmdir()
-        draft.rename(out)
-    except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            for folder in made:
-                folder.rmdir()
-        raise
-
-
-def _refuse_nothing(report: Report) -> None:
-    if report.converted or report.present:
-        return
+def _nothing(report: Report) -> DataError:
     lines = [f"none of {len(report.skipped)} records could be converted"]
     lines += [f"  {skip}" for skip in report.skipped[:REASONS_SHOWN]]
     more = len(report.skipped) - REASONS_SHOWN
-    raise DataError("\n".join([*lines, f"  and {more} more"] if more > 0 else lines))
+    return DataError("\n".join([*lines, f"  and {more} more"] if more > 0 else lines))
 
 
-@dataclass
 class _Run:
-    """The loop over files and records."""
+    """Collects what the files give, in their order, whoever converts them."""
 
-    report: Report
-    reader: Reader
-    dt: float
-    sigma: float
-    interactive: int
-    progress: Progress | None
+    def __init__(self, draft: Draft, paths: list[str], recipe: Recipe, progress: Progress | None) -> None:
+        self.draft, self.report, self.progress, self.total = draft, draft.report, progress, len(paths)
+        parts = divide([size for _, size in draft.job.files])
+        tasks = [Task(recipe, tuple(paths[p.start : p.stop]), p.start, draft.parts) for p in parts]
+        self.tasks = [task for task in tasks if task.stop > self.report.files]
+        self._used: list[Path] = []
+        self._last = time.monotonic()
 
-    def __call__(self, paths: list[Path], writer: StoreWriter, before: frozenset[str]) -> None:
-        for path in paths:
-            for record in self.reader.read(path):
-                self._record(path, record, writer, before)
-                self._tell(len(paths))
-            self.report.files += 1
-            self._tell(len(paths))
+    def __call__(self, workers: int, engine: Engine) -> None:
+        if self.draft.resumed:
+            self._tell()
+        with closing(self._results(workers, engine)) as results, self.draft.writer() as writer:
+            for task, found in zip(self.tasks, results, strict=True):
+                undone = self.report.files - task.start  # past 0 where an earlier process stopped in between
+                for path, outcomes in list(zip(task.files, found, strict=True))[undone:]:
+                    for outcome in outcomes:
+                        self._add(outcome, path, writer)
+                        self._tell()
+                    self.report.files += 1
+                    self._tell()
+                    self._checkpoint(writer)
+                self._used.append(task.path)
+            self._checkpoint(writer, at_once=True)
 
-    def _record(
-        self, path: Path, record: RunSegment | DataError, writer: StoreWriter, before: frozenset[str]
-    ) -> None:
-        if isinstance(record, DataError):
-            self._skip(record, path)
-        elif record.segment_id in before:
+    def _results(self, workers: int, engine: Engine) -> Generator[list[Iterator[Outcome]], None, None]:
+        if workers == 1 and engine == "local":
+            yield from map(here, self.tasks)
+        else:
+            yield from elsewhere(self.tasks, workers, engine)
+
+    def _add(self, outcome: Outcome, path: str, writer: StoreWriter) -> None:
+        if outcome is None:
             self.report.present += 1
+        elif isinstance(outcome, Skip):
+            self.report.skipped.append(outcome)
         else:
             try:
-                writer.append(self._prepared(record))
+                if isinstance(outcome, Stored):
+                    writer.copy(outcome.store, outcome.index)
+                else:
+                    writer.append(outcome)
                 self.report.converted += 1
             except DataError as error:
-                self._skip(error, path, record.segment_id)
+                self.report.skipped.append(skip(error, path, outcome.segment_id))
 
-    def _prepared(self, segment: RunSegment) -> RunSegment:
-        if self.sigma > 0:
-            segment = resampling.smooth(segment, self.sigma)
-        segment = resampling.resample(segment, self.dt)
-        usable(segment, self.interactive)
-        return segment
-
-    def _skip(self, error: DataError, path: Path, segment: str | None = None) -> None:
-        name = error.segment or segment or ""
-        self.report.skipped.append(Skip(error.message, str(path), name, error.field or ""))
-
-    def _tell(self, total: int) -> None:
+    def _tell(self) -> None:
         if self.progress is not None:
-            self.progress(self.report.files, total, self.report)
+            self.progress(self.report.files, self.total, self.report)
+
+    def _checkpoint(self, writer: StoreWriter, at_once: bool = False) -> None:
+        """Not after every file: small ones are converted faster than the disk confirms."""
+        if not at_once and time.monotonic() - self._last < CHECKPOINT:
+            return
+        self.draft.checkpoint(self.report, writer)
+        for part in self._used:
+            shutil.rmtree(part, ignore_errors=True)
+        self._used.clear()
+        self._last = time.monotonic()
 
 
 def expand(files: Iterable[str | Path], patterns: tuple[str, ...]) -> list[Path]:
@@ -292,7 +240,9 @@ def info(path: str | Path) -> dict[str, Any]:
 
     Returns:
         Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each) and
-        ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases).
+        ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions``
+        (how many of these under each of the paper's), and ``unfinished`` (None, or how far a conversion is that
+        will add to the store).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -308,6 +258,13 @@ def info(path: str | Path) -> dict[str, Any]:
         "files": report.files,
         "settings": report.settings,
         "skipped": len(report.skipped),
+        "exclusions": report.exclusions,
         "reasons": report.reasons,
-        "skipped_details": [asdict(skip) for skip in report.skipped],
+        "skipped_details": [skip.to_json() for skip in report.skipped],
+        "unfinished": _unfinished(store.path),
     }
+
+
+def _unfinished(path: Path) -> dict[str, int] | None:
+    begun = read_journal(folder_of(path))
+    return None if begun is None else {"files": begun.report.files, "of": len(begun.job.files)}

@@ -5,12 +5,13 @@ from __future__ import annotations
 import _thread
 import contextlib
 import itertools
+import logging
 import multiprocessing
 import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
@@ -31,7 +32,7 @@ WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 
 def ordered_map(
     function: Callable[[T], R], tasks: Iterable[T], *, workers: int = 1, engine: Engine = "local"
-) -> Iterator[R]:
+) -> Generator[R, None, None]:
     """Apply a function to every task; results come in the order of the tasks, whoever is done first.
 
     Lazy: tasks are taken from the iterable as results are asked for, at most ``2 * workers`` ahead. One local
@@ -46,7 +47,7 @@ def ordered_map(
             one ``ray.init`` was called for, else one on this machine.
 
     Returns:
-        An iterator over the results.
+        An iterator over the results; its ``close`` abandons the rest.
 
     Raises:
         ConfigError: ``workers`` or ``engine`` can't be used, or Ray is not installed.
@@ -58,7 +59,7 @@ def ordered_map(
         return _ray_map(_ray(workers), function, iter(tasks), IN_FLIGHT * workers)
     if engine != "local":
         raise ConfigError(f"unknown engine {engine!r} (known: local, ray)")
-    return map(function, tasks) if workers == 1 else _local_map(function, iter(tasks), workers)
+    return (function(task) for task in tasks) if workers == 1 else _local_map(function, iter(tasks), workers)
 
 
 def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterator[deque[Any]]:
@@ -70,13 +71,16 @@ def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterat
         pending.extend(map(submit, itertools.islice(tasks, 1)))
 
 
-def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:
+def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Generator[R, None, None]:
     spawn = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads without their state
     lifeline, stop = spawn.Pipe(duplex=False)
     pool = ProcessPoolExecutor(workers, spawn, _begin_worker, (lifeline,))
 
     def submit(task: T) -> Any:
-        with _environment(WORKER_ENVIRONMENT):  # processes are started here, as there is work for them
+        with (
+            _environment(WORKER_ENVIRONMENT),
+            _no_interrupts(),
+        ):  # processes are started here, as they are needed
             return pool.submit(_interruptible, function, task)
 
     try:
@@ -100,6 +104,7 @@ _stopped = threading.Event()  # in a worker: the parent wants no more results
 def _begin_worker(lifeline: Connection) -> None:
     """Stop when the parent closes its end of the pipe, and end when it ends, in whatever way."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # outside of tasks: a result half sent would hang the parent
+    _mask(signal.SIG_UNBLOCK)
 
     def wait() -> None:
         with contextlib.suppress(EOFError, OSError):
@@ -128,6 +133,21 @@ def _interruptible(function: Callable[[T], R], task: T) -> R:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _mask(how: int) -> None:
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(how, {signal.SIGINT})
+
+
+@contextlib.contextmanager
+def _no_interrupts() -> Iterator[None]:
+    """Put off interrupts; processes started inside put them off too, and do not complain while they start."""
+    _mask(signal.SIG_BLOCK)
+    try:
+        yield
+    finally:
+        _mask(signal.SIG_UNBLOCK)
+
+
 @contextlib.contextmanager
 def _environment(changes: dict[str, str]) -> Iterator[None]:
     before = {name: os.environ.get(name) for name in changes}
@@ -151,15 +171,17 @@ def _ray(workers: int) -> Any:
         raise ConfigError(message) from error
     if not ray.is_initialized():
         address = os.environ.get("RAY_ADDRESS")
-        size = {} if address else {"num_cpus": workers, "include_dashboard": False}
+        size: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
         try:
-            ray.init(address=address, log_to_driver=False, logging_level="warning", **size)
+            ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **size)
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise ConfigError(f"no Ray cluster at RAY_ADDRESS={address}: {error}") from error
     return ray
 
 
-def _ray_map(ray: Any, function: Callable[[T], R], tasks: Iterator[T], count: int) -> Iterator[R]:
+def _ray_map(
+    ray: Any, function: Callable[[T], R], tasks: Iterator[T], count: int
+) -> Generator[R, None, None]:
     remote = ray.remote(num_cpus=1, runtime_env={"env_vars": WORKER_ENVIRONMENT})(function)
     pending: deque[Any] = deque()
     try:

@@ -182,7 +182,7 @@ def _spans(s: RunSegment) -> tuple[Doubles, Doubles]:
     means = np.cumsum((velocity[:, 1:] + velocity[:, :-1]) / 2, axis=1)
     means = np.pad(means, ((0, 0), (1, 0), (0, 0)))
     seen = np.pad(np.cumsum(s.valid, axis=1), ((0, 0), (1, 0)))
-    throughout = seen[:, lag + 1 :] - seen[:, : -lag - 1] == lag + 1
+    throughout: NDArray[np.bool_] = seen[:, lag + 1 :] - seen[:, : -lag - 1] == lag + 1
     covered = (s.position[:, lag:, :2].astype(np.float64) - s.position[:, :-lag, :2]) / (lag * s.dt)
     return covered[throughout], ((means[:, lag:] - means[:, :-lag]) / lag)[throughout]
 

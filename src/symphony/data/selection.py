@@ -16,6 +16,12 @@ from symphony.errors import DataError
 
 MAX_PLAYBACK_AGENTS = 256
 MAX_ROAD_POINTS = 10_000
+EXCLUSIONS = {
+    "playback_agents": f"more than {MAX_PLAYBACK_AGENTS} playback agents",
+    "roadgraph_points": f"more than {MAX_ROAD_POINTS} roadgraph points",
+    "interactive_agents": "fewer interactive agents at the first step than asked for",
+}
+"""The paper's exclusions, in words."""
 POINT_SPACING = 2.0
 """Metres between the roadgraph points that are counted."""
 MOVING = 2.0
@@ -165,26 +171,40 @@ def _resampled_points(lines: Polylines) -> int:
     return int((np.ceil(length / POINT_SPACING) + 1).sum())
 
 
-def usable(segment: RunSegment, count: int) -> None:
-    """Apply the paper's exclusions.
+def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
+    """Whether the paper leaves a segment out.
 
     Args:
         segment: the segment.
         count: interactive agents it must have at its first step.
 
-    Raises:
-        DataError: more than 256 playback agents (those seen at some step), more than 10 000 roadgraph points
-            (see :func:`road_points`), or too few interactive agents.
+    Returns:
+        None, or the first of :data:`EXCLUSIONS` that applies and an error that says why: more than 256 playback
+        agents (those seen at some step), more than 10 000 roadgraph points (see :func:`road_points`), or too few
+        interactive agents.
     """
     where = {"file": segment.file or None, "segment": segment.segment_id}
     playback = int(segment.valid.any(1).sum()) - count
     if playback > MAX_PLAYBACK_AGENTS:
-        raise DataError(
-            f"{playback} playback agents, at most {MAX_PLAYBACK_AGENTS} allowed", **where, field="agents"
-        )
+        message = f"{playback} playback agents, at most {MAX_PLAYBACK_AGENTS} allowed"
+        return "playback_agents", DataError(message, **where, field="agents")
     points = road_points(segment)
     if points > MAX_ROAD_POINTS:
-        raise DataError(
-            f"{points} roadgraph points, at most {MAX_ROAD_POINTS} allowed", **where, field="road"
-        )
-    interactive_agents(segment, count)
+        message = f"{points} roadgraph points, at most {MAX_ROAD_POINTS} allowed"
+        return "roadgraph_points", DataError(message, **where, field="road")
+    try:
+        interactive_agents(segment, count)
+    except DataError as error:
+        return "interactive_agents", error
+    return None
+
+
+def usable(segment: RunSegment, count: int) -> None:
+    """Apply the paper's exclusions (see :func:`exclusion`).
+
+    Raises:
+        DataError: one of them applies.
+    """
+    found = exclusion(segment, count)
+    if found is not None:
+        raise found[1]

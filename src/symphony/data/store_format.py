@@ -28,9 +28,16 @@ from numpy.typing import NDArray
 
 from symphony.errors import DataError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 FORMAT = "symphony segment store"
 VERSION = 1
 HEADER, LOCK, REPORT, COLUMNS = "store.json", "store.lock", "report.json", "columns"
+PARTIAL = ".partial"
+"""What a store's name is followed by while a conversion into it is not finished."""
 
 
 @dataclass(frozen=True)
@@ -155,11 +162,17 @@ def check_header(folder: Path) -> None:
     Raises:
         DataError: the folder is missing, not a store, or of another version.
     """
-    if not folder.is_dir():
-        raise DataError("no such directory" if not folder.exists() else "not a directory", file=folder)
     path = folder / HEADER
     if not path.is_file():
-        raise DataError(f"not a segment store: it has no {HEADER}", file=folder)
+        if not folder.is_dir():
+            message = "no such directory" if not folder.exists() else "not a directory"
+        else:
+            message = f"not a segment store: it has no {HEADER}"
+        if folder.with_name(folder.name + PARTIAL).is_dir():
+            message += (
+                "; there is an unfinished conversion to that name: the command that began it goes on with it"
+            )
+        raise DataError(message, file=folder)
     found = read_json(path)
     if found.get("format") != FORMAT:
         raise DataError(f"not a segment store: format is {found.get('format')!r}", file=path, field="format")
@@ -336,12 +349,33 @@ class TableWriter:
             rows = int(end[self.table.axes[column.axis]])
             self._files[column.name].truncate(rows * column.row_bytes)
 
-    def close(self) -> None:
+    def sync(self) -> None:
         """Bring everything to the disk, columns before the index."""
-        self.trim()
         for file in (*self._files.values(), self._index):
             os.fsync(file.fileno())
+
+    def close(self) -> None:
+        """Bring everything to the disk, and write no more."""
+        self.trim()
+        self.sync()
+        for file in (*self._files.values(), self._index):
             file.close()
+
+
+def lock(folder: Path) -> BinaryIO:
+    """Keep other writers out of a folder until the file that is returned is closed.
+
+    Raises:
+        DataError: another process is in there.
+    """
+    file = (folder / LOCK).open("ab")
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            raise DataError("is being written by another process", file=folder) from error
+    return file
 
 
 def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:

@@ -31,9 +31,9 @@ class DrivingEnv(EnvBase):
     """A batch of logged scenes in which N agents are driven by actions (paper, section III).
 
     All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity
-    (``stream``), the state of the interactive agents and the routes they follow. The environment holds only constants, so forking a
-    branch is an index and one instance serves every batch shape. An episode ends (``truncated``) at the last
-    logged step.
+    (``stream``), the state of the interactive agents and the routes they follow. The environment holds only
+    constants, so forking a branch is an index and one instance serves every batch shape. An episode ends
+    (``truncated``) at the last logged step.
 
     Args:
         scenes: static data of B segments, all with the same number of interactive agents.
@@ -98,6 +98,8 @@ class DrivingEnv(EnvBase):
             seen["route"] = floats(n, ROUTE_FEATURES)
         if config.clearance:
             seen["gap"], seen["road"] = floats(n, config.num_objects), floats(n, 5)
+            if config.foresight:
+                seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
 
         def goals() -> Unbounded:
             return Unbounded(shape=(n,), dtype=torch.int64, device=device)

@@ -125,7 +125,10 @@ def route_choices(
     count: Int[Tensor, "M N G"],
     distance_scale: float,
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
-    """Every feasible route as features in the agent's frame, and which of them exist (see :data:`CHOICE_FEATURES`)."""
+    """Every feasible route as features in the agent's frame, and which of them exist.
+
+    A feature vector is position, direction and existence of every :data:`STRIDE`-th point.
+    """
     kept = points[..., ::STRIDE, :]
     angle = -state[..., None, None, 2]
     local = rotate(kept - state[..., None, None, :2], angle)
@@ -135,7 +138,6 @@ def route_choices(
     there = (order < count[..., None])[..., None].to(state.dtype)
     features = torch.cat([local / distance_scale, direction, torch.ones_like(there)], -1) * there
     return features.flatten(-2), count > 1
-
 
 
 def pick_routes(

@@ -149,7 +149,9 @@ def scene(
         "edge_valid": np.ones(len(start), bool),
         "stream": np.array(stream_of(segment.segment_id)),
         **_points(segment),
-        **_routes([] if graph is None else [route_table(segment, graph, int(a)) for a in chosen], len(chosen)),
+        **_routes(
+            [] if graph is None else [route_table(segment, graph, int(a)) for a in chosen], len(chosen)
+        ),
     }
     return SceneBatch(
         **{name: torch.from_numpy(np.array(value))[None] for name, value in fields.items()}, batch_size=[1]

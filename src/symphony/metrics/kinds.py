@@ -75,7 +75,7 @@ class CollisionKinds(NamedTuple):
         none = torch.iinfo(torch.int64).max
         key = 2 * (number * self.step + self.kind) + (~self.playback).long()
         key = torch.where(self.kind < 0, none, key)
-        key = torch.cat([key, torch.full_like(key[..., :1], none)], -1).amin(-1)
+        key = torch.cat([key, key.new_full((*key.shape[:-1], 1), none)], -1).amin(-1)
         happened = key != none
         return torch.where(happened, key // 2 % number, -1), happened & (key % 2 == 0)
 
@@ -121,7 +121,8 @@ def collision_kinds(
     Raises:
         ValueError: for shapes that do not fit together, or a flagged agent that touches nobody.
     """
-    lead = _lead(collided, state, exists, subject, log_state, log_valid, size)
+    # One leading dimension more, so that there always is one.
+    lead = (1, *_lead(collided, state, exists, subject, log_state, log_valid, size))
     collided = collided.expand(*lead, *collided.shape[-2:])
     subject = subject.expand(*lead, subject.shape[-1])
     hit = collided.any(-1)
@@ -146,21 +147,17 @@ def collision_kinds(
     boxes = size.expand(*lead, *size.shape[-2:])[tuple(where)]
     contact, before = poses(step + 1), poses(step)
     other = _deepest(contact, boxes, agent)
-    one, two = before.of(agent), before.of(other)
-    seen = one.valid & two.valid
     ours, theirs = (boxes[torch.arange(len(row), device=row.device), row] for row in (agent, other))
-    at_contact = contact.of(agent), contact.of(other)
-    kind = _classify(
-        *(_chosen(seen, now, then) for now, then in zip((one, two), at_contact, strict=True)),
-        *at_contact,
-        ours,
-        theirs,
-    )
+    one, two = before.of(agent), before.of(other)
+    one_hit, two_hit = contact.of(agent), contact.of(other)
+    seen = one.valid & two.valid
+    one, two = _chosen(seen, one, one_hit), _chosen(seen, two, two_hit)
+    kind = _classify(one, two, one_hit, two_hit, ours, theirs)
+    playback = ~(other[:, None] == rows).any(-1)
 
     def filled(values: Tensor) -> Tensor:
-        return torch.full(hit.shape, -1, device=hit.device).masked_scatter(hit, values)
+        return torch.full(hit.shape, -1, device=hit.device).masked_scatter(hit, values)[0]
 
-    playback = ~(other[:, None] == rows).any(-1)
     return CollisionKinds(filled(kind), filled(step), filled(other), filled(playback.long()) == 1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from symphony.modules.discriminator import Discriminator, discriminator
+from symphony.modules.discriminator import FORESIGHT, Discriminator, discriminator
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
 from symphony.modules.policy import NoiseSampler, discrete_policy
@@ -11,6 +11,7 @@ from symphony.modules.rows import in_blocks, mlp
 from symphony.modules.sampling import inverse_cdf
 
 __all__ = [
+    "FORESIGHT",
     "Discriminator",
     "ElementGroup",
     "NoiseSampler",

@@ -10,11 +10,13 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from symphony.keys import GAP, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
+from symphony.keys import GAP, GAP_AHEAD, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.pooling import PoolMode
 
-Features = Literal["paper", "clearance"]
+Features = Literal["paper", "clearance", "foresight"]
+FORESIGHT = (0.5, 1.0, 2.0)
+"""Seconds ahead at which ``foresight`` looks."""
 _GAP, _ROAD = 3, 2 * 5
 
 
@@ -40,8 +42,9 @@ class Discriminator(nn.Module):
         radius: how far it sees, in the units of those positions.
         hidden: width of the encoders.
         head: widths of the head's hidden layers.
-        features: ``paper``, or ``clearance``, which adds the signed gap to the box of each object and the signed
-            distances of centre and corners to the edge of the road.
+        features: ``paper``; ``clearance``, which adds the signed gap to the box of each object and the signed
+            distances of centre and corners to the edge of the road; or ``foresight``, which adds to these the gaps at
+            :data:`FORESIGHT`, were everyone to keep speed and course.
     """
 
     def __init__(
@@ -57,10 +60,11 @@ class Discriminator(nn.Module):
         pool: PoolMode = "auto",
     ) -> None:
         super().__init__()
-        self.radius, self.clearance = radius, features == "clearance"
+        self.radius, self.clearance = radius, features != "paper"
         widths = (own_features, object_features, point_features)
         if self.clearance:
-            widths = (own_features + _ROAD, object_features + _GAP, point_features)
+            gaps = 1 + len(FORESIGHT) if features == "foresight" else 1
+            widths = (own_features + _ROAD, object_features + _GAP * gaps, point_features)
         encoder = SceneEncoder(widths[0], widths[1:], hidden=hidden, pool=pool)
         self.network = SceneNetwork(encoder, 1, head=head)
 
@@ -72,17 +76,18 @@ class Discriminator(nn.Module):
         objects_mask: Tensor,
         points: Tensor,
         points_mask: Tensor,
-        gap: Tensor | None = None,
         road: Tensor | None = None,
+        *gaps: Tensor,
     ) -> Tensor:
-        """Logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, gap `[..., N, O]`, road
-        `[..., N, 5]`.
+        """Logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, road `[..., N, 5]`, gaps
+        `[..., N, O]` and with foresight `[..., N, O, H]`.
         """
         objects_mask = objects_mask & self._near(objects)
         points_mask = points_mask & self._near(points)
-        if gap is not None and road is not None and self.clearance:
+        if road is not None and self.clearance:
             own = torch.cat([own, road_features(road)], -1)
-            objects = torch.cat([objects, gap_features(gap)], -1)
+            known = [gap_features(gap).flatten(objects.ndim - 1) for gap in gaps]
+            objects = torch.cat([objects, *known], -1)
         logits = self.network(own, valid, objects, objects_mask, points, points_mask).squeeze(-1)
         return torch.where(valid, logits, 0.0)
 
@@ -119,5 +124,5 @@ def discriminator(
         ElementGroup(OBJECTS, OBJECTS_MASK, object_features),
         ElementGroup(POINTS, POINTS_MASK, point_features),
     )
-    more = (GAP, ROAD) if features == "clearance" else ()
+    more = {"paper": (), "clearance": (ROAD, GAP), "foresight": (ROAD, GAP, GAP_AHEAD)}[features]
     return scene_module(network, groups, out_key, own_keys=own_keys, valid_key=valid_key, more_keys=more)

@@ -94,9 +94,10 @@ def discrete_policy(
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).
 
-    Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys`. Reads each group's keys, the own features and the agents' mask; writes
-    logits `[..., N, actions]` and actions `[..., N]` int64, sampled according to TorchRL's exploration type
-    (RANDOM unless set; see :class:`NoiseSampler`). It does not depend on the number of agents or elements.
+    Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys`. Reads each group's keys,
+    the own features and the agents' mask; writes logits `[..., N, actions]` and actions `[..., N]` int64, sampled
+    according to TorchRL's exploration type (RANDOM unless set; see :class:`NoiseSampler`). It does not depend on
+    the number of agents or elements.
     """
     encoder = SceneEncoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
     network = SceneNetwork(encoder, actions, head=head)

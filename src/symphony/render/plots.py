@@ -75,8 +75,8 @@ def plot_segment(
     entries = draw_roads(axes, segment.road, view) + draw_signals(axes, segment, step, view)
     others = np.setdiff1d(np.arange(segment.num_agents), chosen)
     draw_trails(axes, position[others], valid[others], PLAYBACK, step=step, width=0.9, strength=0.6, zorder=7)
-    _draw_playback(axes, segment, step, others)
-    for agent, color in zip(chosen, _colors(segment, chosen), strict=True):
+    draw_playback(axes, segment, step, others)
+    for agent, color in zip(chosen, colors_of(segment, chosen), strict=True):
         one = [agent]
         draw_trails(
             axes, position[one], valid[one], color, step=step, width=2.2, zorder=8, gid=f"trail-{agent}"
@@ -91,9 +91,9 @@ def plot_segment(
                 gid=f"box-{agent}",
             )
     seconds = step * segment.dt
-    frame(axes, view, title or segment.segment_id, f"{_describe(segment)}   ·   shown at {seconds:.1f} s")
+    frame(axes, view, title or segment.segment_id, f"{describe(segment)}   ·   shown at {seconds:.1f} s")
     if legend:
-        add_legend(axes, [*_agent_entries(segment, chosen), _playback_entry(), *entries], trails)
+        add_legend(axes, [*agent_entries(segment, chosen), playback_entry(), *entries], trails)
     if path is not None:
         save(axes.figure, path)
     return axes
@@ -146,19 +146,19 @@ def plot_rollout(
     axes, path = open_target(target, view)
 
     entries = draw_roads(axes, segment.road, view) + draw_signals(axes, segment, last, view)
-    _draw_playback(axes, segment, last, np.setdiff1d(np.arange(segment.num_agents), runs.agents))
-    for rank, (agent, color) in enumerate(zip(runs.agents, _colors(segment, runs.agents), strict=True)):
+    draw_playback(axes, segment, last, np.setdiff1d(np.arange(segment.num_agents), runs.agents))
+    for rank, (agent, color) in enumerate(zip(runs.agents, colors_of(segment, runs.agents), strict=True)):
         shown = np.where(logged[rank, :, None], log[rank], np.nan)
         axes.plot(*shown.T, color=INK, linestyle=LOG_DASHES, linewidth=1.4, zorder=9, gid=f"log-{agent}")
         _draw_agent(axes, runs, rank, segment.size[agent], color)
     marks = [_draw_events(axes, runs, *event) for event in EVENTS]
     rollouts = f"{len(runs.position)} rollout{'s' if len(runs.position) > 1 else ''}"
-    subtitle = f"{_describe(segment)}   ·   {rollouts} of {(steps - 1) * segment.dt:.1f} s"
+    subtitle = f"{describe(segment)}   ·   {rollouts} of {(steps - 1) * segment.dt:.1f} s"
     frame(axes, view, title or segment.segment_id, subtitle)
     if legend:
         logline = Line2D([], [], color=INK, linestyle=LOG_DASHES, linewidth=1.4, label="log")
-        playback = _playback_entry("playback, at the end")
-        explained = [*_agent_entries(segment, runs.agents), logline, playback, *filter(None, marks), *entries]
+        playback = playback_entry("playback, at the end")
+        explained = [*agent_entries(segment, runs.agents), logline, playback, *filter(None, marks), *entries]
         add_legend(axes, explained, trails)
     if path is not None:
         save(axes.figure, path)
@@ -280,7 +280,7 @@ def _draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str)
     return Line2D([], [], linestyle="none", marker=marker, color=INK, markersize=6.5, label=label)
 
 
-def _draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[Any]) -> None:
+def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[Any]) -> None:
     shown = agents[segment.valid[agents, step]]
     if len(shown):
         place = segment.position[shown, step, :2], segment.heading[shown, step], segment.size[shown]
@@ -295,27 +295,27 @@ def _highlighted(segment: RunSegment, interactive: Sequence[int]) -> list[int]:
     return chosen
 
 
-def _colors(segment: RunSegment, agents: Any) -> list[str]:
+def colors_of(segment: RunSegment, agents: Any) -> list[str]:
     """One for each agent: the ego's is the same in every picture."""
     others = [int(agent) for agent in agents if agent != segment.ego]
     return [agent_color(0 if agent == segment.ego else 1 + others.index(int(agent))) for agent in agents]
 
 
-def _describe(segment: RunSegment) -> str:
+def describe(segment: RunSegment) -> str:
     duration = (segment.num_steps - 1) * segment.dt
     return (
         f"{segment.source}   ·   {duration:.1f} s at {1 / segment.dt:g} Hz   ·   {segment.num_agents} agents"
     )
 
 
-def _agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
+def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
     def label(agent: int) -> str:
         role = "ego" if agent == segment.ego else "interactive"
         return f"{role} {AgentType(segment.agent_type[agent]).name.lower()} {segment.agent_id[agent]}"
 
-    colors = _colors(segment, agents)
+    colors = colors_of(segment, agents)
     return [Patch(color=color, label=label(int(agent))) for agent, color in zip(agents, colors, strict=True)]
 
 
-def _playback_entry(label: str = "playback") -> Patch:
+def playback_entry(label: str = "playback") -> Patch:
     return Patch(color=PLAYBACK, label=label)

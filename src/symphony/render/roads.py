@@ -44,7 +44,7 @@ def draw_roads(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
     surface = surface.buffer(SLIT, quad_segs=2).buffer(-SLIT, quad_segs=2)
     for polygon in () if surface.is_empty else shapely.get_parts(surface):
         axes.add_patch(
-            PathPatch(_outline(polygon), facecolor=ROAD, edgecolor="none", zorder=1, gid="surface")
+            PathPatch(outline(polygon), facecolor=ROAD, edgecolor="none", zorder=1, gid="surface")
         )
     entries = _draw_marks(axes, road, view)
     lanes = [road.lanes[k][:, :2] for k in _visible(road.lanes, view)]
@@ -156,7 +156,7 @@ def lane_arrows(line: NDArray[Any], spacing: float = ARROW_SPACING) -> NDArray[A
     return tip[:, None] + ARROW[:, :1] * direction[:, None] + ARROW[:, 1:] * left[:, None]
 
 
-def _outline(polygon: Any) -> Outline:
+def outline(polygon: Any) -> Outline:
     """A polygon with its holes as one path."""
     rings = [polygon.exterior, *polygon.interiors]
     return Outline.make_compound_path(

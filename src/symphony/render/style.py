@@ -108,10 +108,10 @@ def frame(axes: Axes, view: View, title: str, subtitle: str) -> None:
     for spine in axes.spines.values():
         spine.set_color("#C8C4BC")
     title_style: dict[str, Any] = {"fontweight": "bold", "color": INK, "parse_math": False}
-    axes.set_title(title, loc="left", fontsize=_font(axes, 11, title), pad=20, **title_style)
+    axes.set_title(title, loc="left", fontsize=font(axes, 11, title), pad=20, **title_style)
     place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
     caption = axes.annotate(
-        subtitle, (0, 1), (0, 6), fontsize=_font(axes, 8.5, subtitle), color="#5B616B", **place
+        subtitle, (0, 1), (0, 6), fontsize=font(axes, 8.5, subtitle), color="#5B616B", **place
     )
     # The title's padding has made its room; its width must not squeeze the picture.
     caption.set_in_layout(False)
@@ -124,7 +124,7 @@ def _width(axes: Axes) -> float:
     return axes.get_position(original=True).width * figure.get_figwidth() if figure else 8.0
 
 
-def _font(axes: Axes, size: float, text: str = "") -> float:
+def font(axes: Axes, size: float, text: str = "") -> float:
     """A font size in points for these axes, smaller on narrow ones and such that the text fits."""
     room = 72 * _width(axes) / max(0.62 * len(text), 1)
     return max(3.0, min(size * float(np.clip(_width(axes) / 5, 0.6, 1)), room))
@@ -151,7 +151,7 @@ def add_scale_bar(axes: Axes, view: View) -> None:
         frameon=True,
         size_vertical=max(view[1] - view[0], view[3] - view[2]) / 250,
         color=INK,
-        fontproperties=FontProperties(size=_font(axes, 8.5)),
+        fontproperties=FontProperties(size=font(axes, 8.5)),
     )
     bar.patch.set(alpha=0.85, edgecolor="none")
     bar.set_zorder(20)
@@ -163,7 +163,7 @@ def add_legend(axes: Axes, handles: Sequence[Line2D | Any], points: NDArray[Any]
     legend = axes.legend(
         handles=list(handles),
         loc=free_corner(points, (*axes.get_xlim(), *axes.get_ylim())),
-        fontsize=_font(axes, 8.5),
+        fontsize=font(axes, 8.5),
         framealpha=0.9,
         edgecolor="#C8C4BC",
         handlelength=1.8,

@@ -213,7 +213,8 @@ class SceneDataset:
             TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK`` and ``GOAL``
             (-1 for vehicles on no lane).
         """
-        found = [(i, self.experts(item), k) for i, item in enumerate(items) for k in range(len(self.experts(item).agent))]
+        each = [self.experts(item) for item in items]
+        found = [(i, expert, k) for i, expert in enumerate(each) for k in range(len(expert.agent))]
         pick = torch.randint(len(found), (count,), generator=rng).tolist()
         chosen = [found[k] for k in pick]
         when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
@@ -222,7 +223,9 @@ class SceneDataset:
         points, counts = np.zeros((count, most, POINTS, 2), np.float32), np.zeros((count, most), np.int64)
         for row, table in enumerate(tables):
             points[row, : len(table.count)], counts[row, : len(table.count)] = table.points, table.count
-        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(device)
+        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
+            device
+        )
         batch = expert_batch(
             self.scenes(items).to(device),
             torch.tensor([i for i, _, _ in chosen], device=device),

@@ -18,7 +18,7 @@ from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
-from symphony.metrics import RolloutMetrics, collisions, offroad
+from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds, collisions, offroad
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.trainers.agents import Agent, load_agent
 from symphony.trainers.dataset import SceneDataset, logged
@@ -34,12 +34,14 @@ class Evaluation:
         metrics: accumulated over all run segments.
         config: how it was judged.
         interactive: agents per segment that acted.
+        search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
     """
 
     agent: str
     metrics: RolloutMetrics
     config: EvaluateConfig
     interactive: int
+    search: str
 
     def numbers(self) -> dict[str, float | int | str]:
         """The table row: rates in percent, distances in metres, divergence in nats, standard errors beside them."""
@@ -47,6 +49,8 @@ class Evaluation:
             "agent": self.agent,
             **self.metrics.compute(),
             "interactive": self.interactive,
+            "search": self.search,
+            "trees": self.config.trees if self.search in ("tree", "oracle") else 0,
             "seed": self.config.seed,
         }
 
@@ -74,14 +78,17 @@ def evaluate(
     if len(store) == 0:
         raise DataError("the store holds no run segments", file=store.path)
     interactive = config.interactive or agent.interactive
-    dataset = SceneDataset(store, interactive, agent.dynamics, routes=agent.goals is not None, keep=config.batch)
+    dataset = SceneDataset(
+        store, interactive, agent.dynamics, routes=agent.goals is not None, keep=config.batch
+    )
     metrics = RolloutMetrics()
     for first in range(0, len(dataset), config.batch):
         items = list(range(first, min(first + config.batch, len(dataset))))
         _evaluate_batch(agent, dataset, items, config, metrics)
         if progress is not None:
             progress(items[-1] + 1, len(dataset))
-    return Evaluation(agent.name, metrics, config, interactive)
+    kind = "log" if agent.policy is None else _kind(agent, config)
+    return Evaluation(agent.name, metrics, config, interactive, kind)
 
 
 def _evaluate_batch(
@@ -92,6 +99,7 @@ def _evaluate_batch(
     playing = agent.policy is None
     rollouts = playback(scenes) if playing else simulated(agent, scenes, config)
     segments = [dataset.segment(i).segment_id for i in items]
+    kinds = _kinds(scenes, rollouts, log_valid if playing else None)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     driven, judged, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
     regions, regions_log = [], []
@@ -108,6 +116,26 @@ def _evaluate_batch(
         logged=log_valid[:, 1:].transpose(1, 2),
         curvature=regions,
         curvature_log=regions_log,
+        kinds=kinds,
+    )
+
+
+def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> CollisionKinds:
+    """Who ran into whom, in the first collision of each agent."""
+    steps = rollouts.state.shape[-3]
+    if log_valid is None:
+        exists = scenes.interactive_valid[:, None, :, None].expand(-1, rollouts.state.shape[1], -1, steps)
+    else:
+        exists = log_valid.transpose(1, 2)[:, None]
+    subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None]
+    return collision_kinds(
+        (rollouts.collision & rollouts.counted).transpose(2, 3),
+        rollouts.state.transpose(2, 3),
+        exists,
+        subject,
+        scenes.log_state[:, None, :steps].transpose(2, 3),
+        scenes.log_valid[:, None, :steps].transpose(2, 3),
+        scenes.box_size[:, None],
     )
 
 
@@ -154,7 +182,9 @@ def _kind(agent: Agent, config: EvaluateConfig) -> str:
     if config.search == "agent":
         return "none" if agent.discriminator is None else "tree"
     if config.search in ("tree", "best") and agent.discriminator is None:
-        raise ConfigError(f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none")
+        raise ConfigError(
+            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none"
+        )
     return config.search
 
 
@@ -168,7 +198,9 @@ def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
         return config.rollouts, branches, 1
     taken = config.rollouts // config.trees
     if taken > branches:
-        raise ConfigError(f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts")
+        raise ConfigError(
+            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
+        )
     return config.trees, branches, taken
 
 

@@ -10,10 +10,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from symphony import keys
-from symphony.collectors import KeepBest
+from symphony.collectors import BeamSearchResult, KeepBest
 from symphony.config import TrainConfig
 from symphony.envs.driving import DrivingEnv
-from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss
+from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, auc
 from symphony.streams import fold_in
 from symphony.trainers.dataset import SceneDataset
 from symphony.trainers.networks import Networks, observation_config
@@ -45,6 +45,7 @@ class SearchData:
         simulated: [B, S, T] states after each step, pruned branches included.
         logged: [B, T, N, 4] states of the log, fitted to the action space.
         logged_valid: [B, T, N].
+        record: how well the scores told bad states from good ones, and what the pruning made of it.
     """
 
     env: DrivingEnv
@@ -53,6 +54,7 @@ class SearchData:
     simulated: TensorDictBase
     logged: Tensor
     logged_valid: Tensor
+    record: dict[str, Tensor]
 
 
 class Learner:
@@ -109,6 +111,7 @@ class Learner:
         if self.judge_loss is not None:
             if self._found is None or step % config.search.updates == 0:
                 self._found = self._search(step, rng)
+            record |= self._found.record
             batch = _joined(batch, self._surviving(self._found, rng))
             losses = self.judge_loss(self._both_kinds(self._found, rng))
             record |= self._descend("discriminator", losses, "loss_discriminator")
@@ -179,6 +182,7 @@ class Learner:
             simulated.update(carried),
             log,
             log_valid,
+            _quality(result, carried.get(keys.VALID)),
         )
 
     def _surviving(self, found: SearchData, rng: torch.Generator) -> TensorDict:
@@ -224,6 +228,21 @@ class Learner:
         return batch.set(keys.SIMULATED, simulated)
 
 
+def _quality(result: BeamSearchResult, valid: Tensor) -> dict[str, Tensor]:
+    """What matters to the search: whether scores rank colliding and off-road states last (AUC; NaN without any),
+    and the share of agent-steps that collide or are off the road before and after pruning.
+    """
+    assert result.tree is not None  # noqa: S101 - the search keeps it
+    record = {}
+    for name, key in (("collision", keys.COLLISION), ("offroad", keys.OFFROAD)):
+        bad = result.tree.get(("next", *key)).squeeze(-1) & valid
+        left = result.trajectories.get(("next", *key)).squeeze(-1) & valid
+        record[f"search_auc_{name}"] = auc(result.simulated_scores, bad, valid)
+        record[f"search_{name}_all"] = bad.sum() / valid.sum()
+        record[f"search_{name}_kept"] = left.sum() / valid.sum()
+    return record
+
+
 def _joined(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
     """One batch [M, 1] of expert states [K, 1] and rollout states [L, N]."""
     valid = experts.get(keys.VALID)
@@ -235,4 +254,3 @@ def _joined(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
         batch_size=[rollouts.get(keys.VALID).numel()],
     )
     return torch.cat([experts.select(*present), flat])
-

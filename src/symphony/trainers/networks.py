@@ -12,7 +12,7 @@ from symphony.config import TrainConfig
 from symphony.envs.dynamics import Bicycle
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
-from symphony.modules import ElementGroup, discrete_policy, discriminator, goal_policy
+from symphony.modules import FORESIGHT, ElementGroup, discrete_policy, discriminator, goal_policy
 
 
 @dataclass
@@ -37,11 +37,13 @@ class Networks:
 
 def observation_config(config: TrainConfig) -> ObservationConfig:
     """What the networks need to see."""
+    features = config.discriminator.features if config.searches else "paper"
     return ObservationConfig(
         num_objects=config.agent.num_objects,
         num_points=config.agent.num_points,
         route=config.hierarchical,
-        clearance=config.searches and config.discriminator.features == "clearance",
+        clearance=features != "paper",
+        foresight=FORESIGHT if features == "foresight" else (),
     )
 
 

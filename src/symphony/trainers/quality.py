@@ -141,7 +141,10 @@ def _add(sums: _Sums, segment: RunSegment, rows: NDArray[np.int64], graph: LaneG
 def _collide(segment: RunSegment, rows: NDArray[np.int64]) -> bool:
     """Whether one of the agents overlaps any other agent after the first step."""
     position = torch.from_numpy(segment.position[:, 1:, :2].copy())
-    heading, size = torch.from_numpy(segment.heading[:, 1:].copy()), torch.from_numpy(segment.size[:, :2].copy())
+    heading, size = (
+        torch.from_numpy(segment.heading[:, 1:].copy()),
+        torch.from_numpy(segment.size[:, :2].copy()),
+    )
     valid, mine = torch.from_numpy(segment.valid[:, 1:].copy()), torch.from_numpy(rows)
     hit = boxes_overlap(
         position[mine][:, None],
@@ -166,7 +169,9 @@ def _distance_off(segment: RunSegment, points: NDArray[np.float64]) -> NDArray[n
     return signed_distance(where, start, end, valid, before, after)[0].double().numpy()
 
 
-def _lateral(graph: LaneGraph, points: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lateral(
+    graph: LaneGraph, points: NDArray[np.float64], heading: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Metres to the left of the nearest straight lane's centre, of the points [K, 2] that are in one."""
     near = graph.index.near(points, IN_LANE)
     lane = graph.usable_lanes[near.line]
@@ -182,7 +187,9 @@ def _lateral(graph: LaneGraph, points: NDArray[np.float64], heading: NDArray[np.
     return np.array(sign) * near.distance[keep][order][first]
 
 
-def _side(line: NDArray[np.float64], arc: NDArray[np.float64], along: float, point: NDArray[np.float64]) -> float:
+def _side(
+    line: NDArray[np.float64], arc: NDArray[np.float64], along: float, point: NDArray[np.float64]
+) -> float:
     k = int(np.clip(np.searchsorted(arc, along, side="right") - 1, 0, len(line) - 2))
     ahead, away = line[k + 1] - line[k], point - line[k]
     return math.copysign(1.0, ahead[0] * away[1] - ahead[1] * away[0])

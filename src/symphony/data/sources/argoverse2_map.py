@@ -272,7 +272,7 @@ def _points(value: Any, field: str) -> Doubles:
     """[P, 2] the x and y of a list of points."""
     if not isinstance(value, list):
         raise DataError(f"expected a list of points, is {type(value).__name__}", field=field)
-    numbers = [point.get(axis) for point in value if isinstance(point, dict) for axis in ("x", "y")]
+    numbers: list[Any] = [point.get(axis) for point in value if isinstance(point, dict) for axis in "xy"]
     if len(numbers) != 2 * len(value) or not all(type(number) in {int, float} for number in numbers):
         raise DataError("a point without the numbers x and y", field=field)
     # Integers beyond the range of a double can't be converted at all.

@@ -49,7 +49,7 @@ def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple
 
 
 def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
-    """What remains of a closed ring [P, 2] when only some of its P - 1 edges are kept: lines in the same direction."""
+    """What remains of a closed ring [P, 2] when only some of its P - 1 edges are kept, in the same direction."""
     if keep.all():
         return [ring]
     if not keep.any():

@@ -116,7 +116,5 @@ def generate_run(
             network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane, straight=straight
         )
         traffic = simulate_traffic(file, network, demand, drive_rng, end, warm_up, sublane=sublane)
-    segments, reasons = cut_segments(
-        f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule
-    )
+    segments, reasons = cut_segments(f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule)
     return Generated(segments, reasons)

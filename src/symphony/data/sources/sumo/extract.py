@@ -191,10 +191,9 @@ def _cut(
         return "no moving ego with a moving partner"
     if (valid[:, 0] & (travel > MOVING)).sum() < rule.interactive:
         return "too few moving vehicles at the first step"
-    if (tracks.unphysical[agents, window] & valid).any():
-        return "unphysical motion"
-    if _overlap(position, heading, size, valid):
-        return "overlap"
+    wild = bool((tracks.unphysical[agents, window] & valid).any())
+    if wild or _overlap(position, heading, size, valid):
+        return "unphysical motion" if wild else "overlap"
     if not shapely.contains_xy(crop.drivable, *position[valid].T).all():
         return "off the road"
     ego = int(rng.choice(len(agents), p=weight / weight.sum()))

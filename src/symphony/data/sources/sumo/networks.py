@@ -224,9 +224,7 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
     return _build(rng, folder, nodes, links, width)
 
 
-def _build(
-    rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Link], width: float
-) -> Path:
+def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Link], width: float) -> Path:
     """Compile two-way streets with junctions of mixed control and roundabouts where they meet."""
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
@@ -381,14 +379,14 @@ def _grown(rng: np.random.Generator, folder: Path) -> tuple[Point, list[tuple[in
     }
     pairs = sorted(streets)
     while True:
-        arms = Counter(end for pair in pairs for end in pair)
-        kept = [pair for pair in pairs if min(arms[end] for end in pair) > 1]
+        meeting = Counter(end for pair in pairs for end in pair)
+        kept = [pair for pair in pairs if min(meeting[end] for end in pair) > 1]
         if len(kept) == len(pairs):
             break
         pairs = kept
     if len(pairs) < _FEWEST_STREETS:
         raise DataError(f"a random network came out with {len(pairs)} streets only")
-    names = sorted(arms)
+    names = sorted(meeting)
     return np.array([places[name] for name in names]), [(names.index(a), names.index(b)) for a, b in pairs]
 
 

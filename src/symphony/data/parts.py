@@ -1,0 +1,194 @@
+"""From the records of log files to segments ready for a store, here or in a worker process.
+
+A worker converts a *part*, some consecutive files, into a small store of its own, record by record: what
+passes between processes is a path, and no process holds more than one record in memory.
+"""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from symphony.data import resample as resampling
+from symphony.data.engine import Engine, ordered_map
+from symphony.data.report import Skip
+from symphony.data.segment import RunSegment
+from symphony.data.selection import exclusion
+from symphony.data.sources import Reader
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import DataError
+
+PART_BYTES, PART_FILES = 8 << 20, 64
+"""Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""
+PRESENT = "present"
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A segment that a worker left in a part."""
+
+    store: SegmentStore
+    index: int
+
+    @property
+    def segment_id(self) -> str:
+        """Its id."""
+        return self.store.ids[self.index]
+
+
+Outcome = RunSegment | Stored | Skip | None
+"""What became of a record; None where the store held the segment before."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the records of a file become segments.
+
+    Attributes:
+        reader: of the format.
+        dt: seconds per step.
+        sigma: of the smoothing in seconds, 0 for none.
+        interactive: interactive agents a segment must have (N_I).
+        before: path of the store that is added to, and the segments it held; their ids are passed over.
+    """
+
+    reader: Reader
+    dt: float
+    sigma: float
+    interactive: int
+    before: tuple[str, int] | None = None
+
+    def outcomes(self, path: str) -> Iterator[Outcome]:
+        """One for each record of a file, in its order."""
+        before = frozenset[str]() if self.before is None else _ids(*self.before)
+        for record in self.reader.read(path):
+            if isinstance(record, DataError):
+                yield skip(record, path)
+            elif record.segment_id in before:
+                yield None
+            else:
+                yield self._prepared(record, path)
+
+    def _prepared(self, segment: RunSegment, path: str) -> RunSegment | Skip:
+        try:
+            if self.sigma > 0:
+                segment = resampling.smooth(segment, self.sigma)
+            segment = resampling.resample(segment, self.dt)
+        except DataError as error:
+            return skip(error, path, segment.segment_id)
+        excluded = exclusion(segment, self.interactive)
+        if excluded is not None:
+            return skip(excluded[1], path, segment.segment_id, excluded[0])
+        return segment
+
+
+def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:
+    """What the report says of a record that failed."""
+    return Skip(error.message, path, error.segment or segment, error.field or "", exclusion)
+
+
+@functools.lru_cache(maxsize=1)
+def _ids(path: str, count: int) -> frozenset[str]:
+    return frozenset(SegmentStore(path).ids[:count])
+
+
+def divide(sizes: list[int]) -> list[range]:
+    """Consecutive files, by number, that are converted in one go; depends on nothing but their sizes in bytes."""
+    parts: list[range] = []
+    begin, total = 0, 0
+    for k, size in enumerate(sizes):
+        if k > begin and (total + size > PART_BYTES or k - begin == PART_FILES):
+            parts.append(range(begin, k))
+            begin, total = k, 0
+        total += size
+    return [*parts, range(begin, len(sizes))] if sizes else parts
+
+
+@dataclass(frozen=True)
+class Task:
+    """A part to make.
+
+    Attributes:
+        recipe: how.
+        files: paths of its files.
+        start: number of the first of them among all files.
+        folder: where parts lie.
+    """
+
+    recipe: Recipe
+    files: tuple[str, ...]
+    start: int
+    folder: Path
+
+    @property
+    def stop(self) -> int:
+        """Number of the file after the last."""
+        return self.start + len(self.files)
+
+    @property
+    def path(self) -> Path:
+        """Where the finished part lies."""
+        return self.folder / f"{self.start:08d}"
+
+
+def make_part(task: Task) -> Path:
+    """Convert the files of a task, unless that was done before; the part appears once it is complete."""
+    if task.path.exists():
+        return task.path
+    draft = Path(tempfile.mkdtemp(prefix=f"{task.path.name}.", dir=task.folder))
+    with StoreWriter(draft) as writer:
+        entries = [
+            [_entry(outcome, writer, file) for outcome in task.recipe.outcomes(file)] for file in task.files
+        ]
+        writer.write_report({"entries": entries})
+    try:
+        draft.rename(task.path)
+    except OSError:
+        if not task.path.exists():
+            raise
+        shutil.rmtree(draft)  # another worker was first
+    return task.path
+
+
+def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
+    if isinstance(outcome, RunSegment):
+        # Of a name that comes twice the first is kept; whoever takes them out of the part sees it twice.
+        if writer.has(outcome.segment_id):
+            return writer.index_of(outcome.segment_id)
+        try:
+            return writer.append(outcome)
+        except DataError as error:
+            outcome = skip(error, file, outcome.segment_id)
+    return outcome.to_json() if isinstance(outcome, Skip) else PRESENT
+
+
+def open_part(path: Path) -> list[Iterator[Outcome]]:
+    """For each file of a part, what :meth:`Recipe.outcomes` gave."""
+    store = SegmentStore(path)
+
+    def outcome(entry: Any) -> Outcome:
+        if isinstance(entry, int):
+            return Stored(store, entry)
+        return None if entry == PRESENT else Skip(**entry)
+
+    return [map(outcome, entries) for entries in store.report["entries"]]
+
+
+def here(task: Task) -> list[Iterator[Outcome]]:
+    """The same in this process, from one record to the next; from a part only if there is one already."""
+    if task.path.exists():
+        return open_part(task.path)
+    return [task.recipe.outcomes(file) for file in task.files]
+
+
+def elsewhere(tasks: list[Task], workers: int, engine: Engine) -> Iterator[list[Iterator[Outcome]]]:
+    """The same for many tasks, made by worker processes."""
+    with closing(ordered_map(make_part, tasks, workers=workers, engine=engine)) as made:
+        for path in made:
+            yield open_part(path)

@@ -1,0 +1,114 @@
+"""What a conversion did, and what it left out for which reason."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from symphony.data.selection import EXCLUSIONS
+from symphony.errors import DataError
+
+
+@dataclass(frozen=True)
+class Skip:
+    """A record or file that was left out.
+
+    Attributes:
+        message: why.
+        file: path of the file.
+        segment: id of the segment, where known.
+        field: field of the segment or of the format, where known.
+        exclusion: the paper's exclusion it fell under (see :data:`symphony.data.selection.EXCLUSIONS`); empty
+            for what can't be used.
+    """
+
+    message: str
+    file: str = ""
+    segment: str = ""
+    field: str = ""
+    exclusion: str = ""
+
+    @property
+    def reason(self) -> str:
+        """The message with numbers blanked, so that like cases are counted together."""
+        text = re.sub(r"-?\d+(\.\d+)?", "#", self.message)
+        return f"{self.field}: {text}" if self.field else text
+
+    def to_json(self) -> dict[str, str]:
+        """Without ``exclusion`` where there is none."""
+        found = asdict(self)
+        return found if self.exclusion else {k: v for k, v in found.items() if k != "exclusion"}
+
+    def __str__(self) -> str:
+        return str(
+            DataError(
+                self.message,
+                file=self.file or None,
+                segment=self.segment or None,
+                field=self.field or None,
+            )
+        )
+
+
+@dataclass
+class Report:
+    """What a conversion did.
+
+    Attributes:
+        converted: segments added.
+        present: segments that the store held before.
+        files: files read.
+        skipped: what was left out, the paper's exclusions included.
+        settings: arguments of the conversion.
+    """
+
+    converted: int = 0
+    present: int = 0
+    files: int = 0
+    skipped: list[Skip] = field(default_factory=list)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """How often something was skipped for each reason, most frequent first."""
+        return _count(self.skipped)
+
+    @property
+    def problems(self) -> dict[str, int]:
+        """Likewise, without the paper's exclusions."""
+        return _count([skip for skip in self.skipped if not skip.exclusion])
+
+    @property
+    def exclusions(self) -> dict[str, int]:
+        """Sound segments left out under each of the paper's exclusions, all of which are listed."""
+        found = Counter(skip.exclusion for skip in self.skipped)
+        return {name: found[name] for name in EXCLUSIONS}
+
+    def to_json(self) -> dict[str, Any]:
+        """As kept with the store."""
+        skipped = [skip.to_json() for skip in self.skipped]
+        counts = {"exclusions": self.exclusions, "reasons": self.reasons}
+        return {**vars(self), "skipped": skipped, **counts}
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Report:
+        """The reverse of :meth:`to_json`; an empty mapping gives an empty report."""
+        known = {key: value[key] for key in ("converted", "present", "files", "settings") if key in value}
+        try:
+            return cls(**known, skipped=[Skip(**skip) for skip in value.get("skipped", ())])
+        except TypeError as error:
+            raise DataError(f"not a conversion report: {error}", field="skipped") from error
+
+    def after(self, earlier: Report) -> Report:
+        """This report joined to the one of an earlier conversion into the same store."""
+        skipped = list(dict.fromkeys([*earlier.skipped, *self.skipped]))
+        return Report(
+            earlier.converted + self.converted, 0, earlier.files + self.files, skipped, self.settings
+        )
+
+
+def _count(skipped: list[Skip]) -> dict[str, int]:
+    return dict(Counter(skip.reason for skip in skipped).most_common())

@@ -1,0 +1,287 @@
+"""Conversions that die, are taken up again, or are shared among workers: always the same store and report."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers_convert import FakeReader
+from symphony.data import convert as converting
+from symphony.data import parts, store_format, unfinished
+from symphony.data.convert import convert
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError, DataError, SymphonyError
+
+LOGS = {
+    "a.scene": ["straight 1", "broken 5", "crossing 2"],
+    "b.scene": ["straight 1", "lonely 7"],
+    "c.scene": ["stop"],
+    "d.scene": ["crossing 3", "straight 1", "straight 4", "straight 4"],
+}
+
+
+@pytest.fixture(autouse=True)
+def no_sync(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk's own cache is not under test, and waiting for it is slow."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> list[Path]:
+    return write(tmp_path / "logs", LOGS)
+
+
+def write(folder: Path, logs: dict[str, list[str]]) -> list[Path]:
+    folder.mkdir()
+    for name, lines in logs.items():
+        (folder / name).write_text("\n".join(lines))
+    return [folder / name for name in logs]
+
+
+def content(path: Path) -> dict[str, bytes]:
+    """Every file of a store."""
+    return {str(p.relative_to(path)): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+def snapshots(folder: Path, action: Callable[[], Any]) -> list[Path]:
+    """Copies of a folder as a process would leave it that is killed before it changes a file.
+
+    Of the many like moments, between the columns of one record and between the files of one store that is
+    removed, a few.
+    """
+    taken: list[Path] = []
+    count = itertools.count()
+
+    def spied(change: Callable[..., Any], every: int = 1) -> Callable[..., Any]:
+        def wrapper(*args: Any, **options: Any) -> Any:
+            if next(count) % every == 0:
+                taken.append(folder.parent / "moments" / str(len(taken)))
+                shutil.copytree(folder, taken[-1])
+            return change(*args, **options)
+
+        return wrapper
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store_format, "_write_at", spied(store_format._write_at, 29))
+        patch.setattr(unfinished.Draft, "_write", spied(unfinished.Draft._write))
+        for name, every in {"rename": 1, "replace": 1, "rmdir": 2, "unlink": 23}.items():
+            patch.setattr(os, name, spied(getattr(os, name), every))
+        action()
+    assert len(taken) > 10
+    return taken
+
+
+@pytest.mark.parametrize("way", ["alone", "workers", "append"])
+def test_killed_between_any_two_changes_of_a_file(
+    logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    monkeypatch.setattr(converting, "CHECKPOINT", 0.0)
+    monkeypatch.setattr(parts, "PART_FILES", 2)
+    monkeypatch.setattr(parts, "ordered_map", lambda function, tasks, **_: (function(task) for task in tasks))
+    workers = 2 if way == "workers" else 1
+    begin, home = tmp_path / "begin", tmp_path / "home"
+    begin.mkdir()
+    if way == "append":
+        convert(FakeReader(), [logs[0]], begin / "store")
+        (begin / "store" / "store.lock").unlink()
+
+    def run(folder: Path) -> Any:
+        return convert(FakeReader(), logs, folder / "store", workers=workers, append=way == "append")
+
+    shutil.copytree(begin, tmp_path / "whole")
+    report = run(tmp_path / "whole")
+    expected = content(tmp_path / "whole" / "store")
+    shutil.copytree(begin, home)
+    for moment in snapshots(home, lambda: run(home)):
+        if content(moment / "store") != expected or (moment / "store.partial" / "journal.jsonl").exists():
+            assert run(moment) == report
+        elif (moment / "store.partial").exists():
+            (moment / "store.partial").rmdir()  # all that was left to do
+        assert content(moment / "store") == expected
+        assert [p.name for p in moment.iterdir()] == ["store"]
+
+
+MAIN = """
+import os, sys
+os.fsync = lambda descriptor: None
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+from helpers_convert import FakeReader
+from symphony.data import convert as converting
+from symphony.data import parts
+converting.CHECKPOINT, parts.PART_FILES = 0.01, 3
+
+def show(*_):
+    print("on", flush=True)
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[2])
+    converting.convert(FakeReader(), [folder / "logs"], folder / "store", workers=int(sys.argv[3]), progress=show)
+    print("end", flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_kill_9_at_random_moments(tmp_path: Path, workers: int) -> None:
+    rng = random.Random(workers)
+    scenes = (f"{rng.choice(['straight', 'crossing', 'broken'])} {k}" for k in range(64))
+    logs = {f"{k:02d}.scene": list(itertools.islice(scenes, 4)) for k in range(16)}
+    files = write(tmp_path / "logs", logs)
+    whole = convert(FakeReader(), files, tmp_path / "whole")
+    (tmp_path / "main.py").write_text(MAIN)
+    command = [sys.executable, tmp_path / "main.py", Path(__file__).parent, tmp_path, str(workers)]
+    kills = 0
+    for _ in range(40):
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            if kills < 3:
+                time.sleep(rng.uniform(0, 0.08))
+                process.kill()
+            ended = process.stdout.read().endswith("end\n")
+        kills += process.returncode == -signal.SIGKILL
+        if ended:
+            break
+    assert kills >= 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["logs", "main.py", "store", "whole"]
+    assert content(tmp_path / "store") == content(tmp_path / "whole")
+    assert SegmentStore(tmp_path / "store").report == whole.to_json()
+
+
+def test_finished_files_are_not_read_again(
+    logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(converting, "CHECKPOINT", 0.0)
+    logs[3].write_text("crossing 3\ninterrupt\nstraight 4")
+    with pytest.raises(KeyboardInterrupt):
+        convert(FakeReader(), logs, tmp_path / "store")
+    read: list[str] = []
+
+    class Watched(FakeReader):
+        stops = False
+
+        def _read(self, path: Path) -> Any:
+            read.append(path.name)
+            return super()._read(path)
+
+    told: list[int] = []
+    convert(Watched(), logs, tmp_path / "store", progress=lambda done, total, report: told.append(done))
+    assert read == ["d.scene"]
+    assert told[0] == 3
+
+
+@pytest.mark.parametrize("workers", [3])
+def test_workers_make_the_same_store(
+    logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    monkeypatch.setattr(parts, "PART_FILES", 1)
+    told: list[list[tuple[int, int, int]]] = []
+    for count in (1, workers):
+        told.append([])
+        convert(
+            FakeReader(),
+            logs,
+            tmp_path / f"by{count}",
+            workers=count,
+            progress=lambda done, total, report: told[-1].append((done, total, report.converted)),
+        )
+    assert content(tmp_path / "by1") == content(tmp_path / f"by{workers}")
+    assert told[0] == told[1]
+    assert not multiprocessing.active_children()
+
+
+class Deadly(FakeReader):
+    def _read(self, path: Path) -> Any:
+        if path.name == "c.scene" and multiprocessing.parent_process() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super()._read(path)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_worker_that_dies_costs_no_finished_work(
+    logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "PART_FILES", 1)
+    with pytest.raises(SymphonyError, match="a worker process ended"):
+        convert(Deadly(), logs, tmp_path / "store", workers=2)
+    assert (tmp_path / "store.partial").is_dir()
+    convert(Deadly(), logs, tmp_path / "store")
+    convert(FakeReader(), logs, tmp_path / "whole")
+    assert content(tmp_path / "store") == content(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"rate": 10.0}, "rate is 10.0, but the conversion that was interrupted had 5.0"),
+        ({"interactive": 3}, "interactive is 3, but .* had 2"),
+        ({"smooth": 0.5}, "smooth is 0.5, but .* had 0.0"),
+        ({"files": 3}, "files is 3 .*, but .* had 4 "),
+        ({"order": True}, "files are in another order"),
+        ({"longer": True}, r"size of .*b\.scene is \d+, but .* had \d+"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
+)
+def test_other_arguments_do_not_go_on(
+    logs: list[Path], tmp_path: Path, changed: dict[str, Any], message: str
+) -> None:
+    logs[3].write_text("interrupt")
+    with pytest.raises(KeyboardInterrupt):
+        convert(FakeReader(), logs, tmp_path / "store")
+    files = logs[: changed.pop("files", 4)]
+    if changed.pop("order", False):
+        files = files[::-1]
+    if changed.pop("longer", False):
+        logs[1].write_text("straight 1\nstraight 2\nstraight 3")
+    with pytest.raises(ConfigError, match=message):
+        convert(FakeReader(), files, tmp_path / "store", **changed)
+    assert (tmp_path / "store.partial" / "journal.jsonl").is_file()
+
+
+def test_what_is_in_the_way_is_told(logs: list[Path], tmp_path: Path) -> None:
+    out, partial = tmp_path / "store", tmp_path / "store.partial"
+    logs[3].write_text("straight 9\ninterrupt")
+    with pytest.raises(KeyboardInterrupt):
+        convert(FakeReader(), logs, out)
+    with store_format.lock(partial), pytest.raises(DataError, match="being written by another process"):
+        convert(FakeReader(), logs, out)
+    convert(FakeReader(), logs[:1], tmp_path / "other")
+    (tmp_path / "other").rename(out)
+    with pytest.raises(DataError, match="unfinished conversion to that name: delete one of them"):
+        convert(FakeReader(), logs, out)
+    shutil.rmtree(partial)
+    with pytest.raises(KeyboardInterrupt):
+        convert(FakeReader(), logs, out, append=True)
+    shutil.rmtree(out)
+    with pytest.raises(DataError, match="is gone"):
+        convert(FakeReader(), logs, out, append=True)
+    (partial / "journal.jsonl").write_text('{"format": "symphony conversion", "version": 9, "job": {}}\n')
+    with pytest.raises(DataError, match="version 9; this release knows version 1"):
+        convert(FakeReader(), logs, out)
+    (partial / "journal.jsonl").write_text("[]\n")
+    with pytest.raises(DataError, match="not the journal of a conversion"):
+        convert(FakeReader(), logs, out)
+
+
+def test_the_papers_exclusions_are_counted_apart(logs: list[Path], tmp_path: Path) -> None:
+    report = convert(FakeReader(), logs, tmp_path / "store")
+    assert report.exclusions == {"playback_agents": 0, "roadgraph_points": 0, "interactive_agents": 1}
+    assert sum(report.problems.values()) + 1 == sum(report.reasons.values()) == len(report.skipped)
+    assert json.loads(json.dumps(report.to_json()))["exclusions"] == report.exclusions
+    found = converting.info(tmp_path / "store")
+    assert found["exclusions"] == report.exclusions
+    assert found["skipped"] == len(report.skipped)

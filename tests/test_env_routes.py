@@ -1,0 +1,369 @@
+"""Routes as the networks see them, goals as state, and clearances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from helpers_segments import CAR, crossing, straight_road
+from symphony import keys
+from symphony.data.segment import RunSegment
+from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.routes import (
+    AHEAD,
+    CHOICE_FEATURES,
+    POINTS,
+    ROUTE_FEATURES,
+    SPACING,
+    STRIDE,
+    pick_routes,
+    route_ahead,
+    route_choices,
+    route_table,
+)
+from symphony.geometry.boxes import box_gap
+from symphony.roadgraph import LaneGraph
+from symphony.roadgraph.assign import LATERAL
+from test_env import actions, moved, run
+
+SCALE = 20.0
+EVERYTHING = ObservationConfig(num_objects=16, num_points=30, route=True, clearance=True)
+
+
+def scenes_of(*segments: RunSegment, n: int = 2) -> Any:
+    return collate([scene(s, list(range(n)), LaneGraph(s.road)) for s in segments])
+
+
+def make_env(*segments: RunSegment, dynamics: Any = None, config: ObservationConfig = EVERYTHING) -> DrivingEnv:
+    return DrivingEnv(scenes_of(*segments), dynamics, config)
+
+
+def bend(straight: int = 10, turn: float = 1.6, radius: float = 15.0) -> NDArray[np.float64]:
+    """A line of points 3 m apart: straight along +x, then a turn, then straight again."""
+    angle = np.concatenate(
+        [np.zeros(straight), np.linspace(0, turn, max(2, round(abs(turn) * radius / SPACING))), [turn] * 12]
+    )
+    steps = SPACING * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)])[:POINTS]
+
+
+def padded(line: NDArray[np.float64], points: int = POINTS) -> torch.Tensor:
+    return torch.from_numpy(np.concatenate([line, np.repeat(line[-1:], points - len(line), 0)]))
+
+
+def see(x: float, y: float, heading: float, line: NDArray[np.float64]) -> torch.Tensor:
+    state = torch.tensor([[[x, y, heading, 5.0]]], dtype=torch.float64)
+    return route_ahead(state, padded(line)[None, None], torch.tensor([[len(line)]]), SCALE)[0, 0]
+
+
+lines = st.builds(bend, st.integers(2, 20), st.floats(-2.5, 2.5), st.floats(10, 60))
+headings = st.floats(-6, 6)
+
+
+@given(lines, st.floats(0, 0.99), st.floats(-9, 9), st.floats(0, 0.9), headings)
+def test_the_lateral_offset_is_the_signed_distance_to_the_route(
+    line: NDArray[np.float64], where: float, offset: float, share: float, heading: float
+) -> None:
+    k = int(where * (len(line) - 1))
+    along = (line[k + 1] - line[k]) / SPACING
+    left = np.array([-along[1], along[0]])
+    place = line[k] + share * SPACING * along + offset * left
+    # The route is cut at the point nearest to the vehicle; where the foot lies on the piece before, the offset is
+    # that from the piece's continuation.
+    assume(np.argmin(np.hypot(*(line - place).T)) == k)
+    route, point = shapely.LineString(line), shapely.Point(place)
+    foot = shapely.line_locate_point(route, point) / SPACING
+    assume(k - 1e-6 <= foot <= k + 1 + 1e-6)
+    assume(abs(route.distance(point) - abs(offset)) < 1e-6)
+    seen = see(*place, heading, line)
+    # Positive where the route lies to the left, that is, where the vehicle is to the right of it.
+    np.testing.assert_allclose(seen[1] * 5, -np.sign(offset) * route.distance(point), atol=1e-6)
+    turned = complex(*along) * np.exp(-1j * heading)
+    np.testing.assert_allclose(seen[2:4], [turned.real, turned.imag], atol=1e-9)
+
+
+@given(st.floats(10.1, 1000), st.sampled_from([-1, 1]))
+def test_far_from_the_route_the_offset_is_cut(offset: float, side: int) -> None:
+    assert see(10.0, side * offset, 0.3, bend(turn=0.0))[1] == -2 * side
+
+
+@given(lines, st.floats(0, 0.999), st.floats(-3, 3), headings)
+def test_seen_points_are_the_routes_points_ahead(
+    line: NDArray[np.float64], where: float, offset: float, heading: float
+) -> None:
+    k = int(where * len(line))
+    place = line[k] + [0.0, offset]
+    seen = see(*place, heading, line)
+    ahead = seen[4:].reshape(-1, 3).numpy()
+    exists = ahead[:, 2] == 1
+    assert (ahead[~exists] == 0).all()
+    back = complex(*place) + (ahead[exists, 0] + 1j * ahead[exists, 1]) * SCALE * np.exp(1j * heading)
+    distance = np.hypot(*(line - place).T)
+    first = min(int(distance.argmin()), len(line) - 2)
+    rows = [first + a for a in AHEAD[1:] if first + a < len(line)]
+    np.testing.assert_allclose(np.stack([back.real, back.imag], -1), line[rows], atol=1e-6)
+    # All of them lie ahead along the route, but for the last point, which a vehicle past the end still sees.
+    route = shapely.LineString(line)
+    here = shapely.line_locate_point(route, shapely.Point(place))
+    there = shapely.line_locate_point(route, shapely.points(line[rows]))
+    assume(abs(here - SPACING * distance.argmin()) < SPACING)
+    assert (there[rows != np.full(len(rows), len(line) - 1)] > here).all()
+
+
+@given(lines, st.floats(0, 6), st.floats(-500, 500), st.floats(-500, 500))
+def test_moving_the_world_changes_no_feature(
+    line: NDArray[np.float64], angle: float, x: float, y: float
+) -> None:
+    def there(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        turned = (points[..., 0] + 1j * points[..., 1]) * np.exp(1j * angle) + complex(x, y)
+        return np.stack([turned.real, turned.imag], -1)
+
+    place = line[3] + [0.4, 1.1]
+    a, b = see(*place, 0.2, line), see(*there(place), 0.2 + angle, there(line))
+    torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
+    state = [torch.tensor([[[*place, 0.2, 5.0]]]), torch.tensor([[[*there(place), 0.2 + angle, 5.0]]])]
+    choices = [padded(p)[None, None, None] for p in (line, there(line))]
+    count = torch.tensor([[[len(line)]]])
+    one, two = (route_choices(s.double(), c, count, SCALE)[0] for s, c in zip(state, choices, strict=True))
+    torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
+
+
+def test_without_a_route_all_features_are_zero() -> None:
+    state = torch.randn(2, 3, 4)
+    for points in (torch.zeros(2, 3, POINTS, 2), 1e6 * torch.randn(2, 3, POINTS, 2)):
+        seen = route_ahead(state, points, torch.zeros(2, 3, dtype=torch.int64), SCALE)
+        assert seen.shape == (2, 3, ROUTE_FEATURES)
+        assert (seen == 0).all()
+    env = make_env(crossing())
+    assert (env.start(torch.tensor([0]))[keys.ROUTE] == 0).all()
+    route = env.with_goals(env.start(torch.tensor([0])))[keys.ROUTE]
+    assert (route[..., 0] == 1).all()
+    assert (env.start(torch.tensor([0]))[keys.GOAL] == -1).all()
+
+
+@given(st.integers(2, 40), st.integers(0, 2**31 - 1))
+def test_padding_of_points_and_routes_changes_nothing(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    line = np.cumsum(SPACING * np.array([1.0, 0.0]) + rng.normal(0, 0.4, (count, 2)), 0)
+    state = torch.from_numpy(np.concatenate([rng.normal(0, 20, 2), rng.normal(0, 2, 2)]))[None, None]
+    number = torch.tensor([[count]])
+    short = route_ahead(state, torch.from_numpy(line)[None, None], number, SCALE)
+    for fill in (line[-1], np.full(2, 1e5)):
+        long = np.concatenate([line, np.tile(fill, (POINTS - count, 1))])
+        assert torch.equal(short, route_ahead(state, torch.from_numpy(long)[None, None], number, SCALE))
+    # One route of one agent among others of a wider table.
+    table = torch.from_numpy(rng.normal(0, 50, (2, 2, 3, POINTS, 2)))
+    counts = torch.from_numpy(rng.integers(0, POINTS, (2, 2, 3)))
+    table[1, 0, 2], counts[1, 0, 2] = padded(line), count
+    points, exist = pick_routes(table, counts, torch.tensor([1]), torch.tensor([[2, -1]]))
+    assert torch.equal(points[0, 0], padded(line))
+    assert exist.tolist() == [[count, 0]]
+    features, mask = route_choices(state.expand(1, 2, 4), table[1:], counts[1:], SCALE)
+    alone, one = route_choices(state, padded(line)[None, None, None], number[..., None], SCALE)
+    assert features.shape == (1, 2, 3, CHOICE_FEATURES)
+    assert torch.equal(mask, counts[1:] > 1)
+    assert torch.equal(features[0, 0, 2], alone[0, 0, 0])
+    assert one.all()
+    assert (features[counts[1:] == 0] == 0).all()
+
+
+def test_choices_are_points_of_the_route_with_their_directions() -> None:
+    line, heading, place = bend(straight=6, turn=1.2), 0.7, complex(3.0, -2.0)
+    state = torch.tensor([[[place.real, place.imag, heading, 5.0]]], dtype=torch.float64)
+    features, _ = route_choices(state, padded(line)[None, None, None], torch.tensor([[[len(line)]]]), SCALE)
+    rows = features[0, 0, 0].reshape(-1, 5).numpy()
+    kept = np.arange(0, len(line), STRIDE)
+    assert (rows[len(kept) :] == 0).all()
+    back = (rows[: len(kept), 0] + 1j * rows[: len(kept), 1]) * SCALE * np.exp(1j * heading) + place
+    np.testing.assert_allclose(np.stack([back.real, back.imag], -1), line[kept], atol=1e-9)
+    course = (rows[: len(kept), 2] + 1j * rows[: len(kept), 3]) * np.exp(1j * heading)
+    steps = np.diff(np.concatenate([line, line[-1:]]), axis=0)[kept]
+    np.testing.assert_allclose(np.stack([course.real, course.imag], -1), steps / SPACING, atol=1e-9)
+    assert (rows[: len(kept), 4] == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_logged_route_is_where_the_vehicle_drove(seed: int) -> None:
+    segment = crossing(4, seed=seed, steps=61)
+    graph, turns = LaneGraph(segment.road), []
+    for agent in range(4):
+        table = route_table(segment, graph, agent)
+        path = shapely.points(segment.position[agent, :, :2].astype(float))
+        away = [
+            shapely.distance(shapely.LineString(table.points[g, : table.count[g]]), path).mean()
+            for g in range(len(table.count))
+        ]
+        # Chords of 3 m cut an arc of 10 m radius by at most 0.11 m.
+        assert away[table.logged] < 0.12
+        assert away[table.logged] <= min(away) + 0.12
+        if abs(segment.heading[agent, -1] - segment.heading[agent, 0]) > 1:
+            turns.append(sorted(away)[1])
+    # A route that does not turn leads away from who does.
+    assert turns
+    assert min(turns) > 0.5
+
+
+def test_routes_are_evenly_spaced_from_beside_the_vehicle() -> None:
+    segment = crossing(4, seed=1)
+    graph = LaneGraph(segment.road)
+    for agent in range(4):
+        table = route_table(segment, graph, agent)
+        start = segment.position[agent, 0, :2]
+        for line, count in zip(table.points, table.count, strict=True):
+            assert np.hypot(*(line[0] - start)) < LATERAL
+            step = np.hypot(*np.diff(line[:count], axis=0).T)
+            assert (step < SPACING + 1e-3).all()
+            assert (step[:-1] > 0.9 * SPACING).all()
+            assert (line[count:] == line[count - 1]).all()
+        assert np.hypot(*(table.points[table.logged, 0] - start)) < 0.1
+
+
+def test_a_vehicle_on_no_lane_has_no_route() -> None:
+    segment = straight_road(2)
+    position = segment.position.copy()
+    position[1, :, 1] += 60
+    off = segment.replace(position=position)
+    table = route_table(off, LaneGraph(off.road), 1)
+    assert table.points.shape == (0, POINTS, 2)
+    assert table.logged == -1
+    env = make_env(off)
+    start = env.with_goals(env.start(torch.tensor([0])))
+    assert start[keys.GOAL][0, 1] == -1
+    assert (start[keys.ROUTE][0, 1] == 0).all()
+    assert start[keys.ROUTE][0, 0, 0] == 1
+    assert not env.choices(start)[keys.ROUTES_MASK][0, 1].any()
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_torchrl_accepts_an_environment_with_routes(dynamics: Any, shape: tuple[int, ...]) -> None:
+    env = make_env(straight_road(), crossing(), dynamics=dynamics)
+    start = env.reset(TensorDict(batch_size=shape))
+    check_env_specs(env, tensordict=start, break_when_any_done="both")
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_a_goal_stays_and_can_be_started_from(dynamics: Any) -> None:
+    env = make_env(straight_road(), crossing(), dynamics=dynamics)
+    plan = actions(env, (2, 12))
+    start = env.with_goals(env.start(torch.tensor([0, 1])), torch.tensor([[1, 0], [2, -1]]))
+    whole = run(env, start, plan)
+    assert (whole[keys.GOAL] == start[keys.GOAL][:, None]).all()
+    middle = env.reset(whole[:, 4].exclude(keys.REWARD), set_state=True)
+    assert (run(env, middle, plan[:, 5:]) == whole[:, 5:]).all()
+    # What a state shows is a function of the simulation state alone.
+    state = whole.select(*env.state_spec.keys(True, True))
+    assert (env.at(state) == whole.exclude(keys.REWARD)).all()
+    fresh = env.reset(whole[:, 4].clone().set("_reset", torch.tensor([[True], [False]])), set_state=False)
+    assert fresh[keys.GOAL].tolist() == [[-1, -1], [2, -1]]
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_a_rollout_with_goals_is_the_same_in_any_batch(dynamics: Any) -> None:
+    segment = straight_road(5, num_lanes=2)
+    alone = make_env(segment, dynamics=dynamics)
+    among = make_env(crossing(7, seed=2), segment, straight_road(8, steps=61, seed=5), dynamics=dynamics)
+    assert among.scenes.route.shape[2] > alone.scenes.route.shape[2]
+    plan, goal = actions(alone, (1, 20)), torch.tensor([[1, 0]])
+    one = run(alone, alone.with_goals(alone.start(torch.tensor([0]), 6), goal), plan)
+    start = among.start(torch.tensor([[2, 1], [0, 0]]), torch.tensor([[1, 6], [7, 8]]))
+    start = among.with_goals(start, goal.expand(2, 2, 2))
+    wide = run(among, start, plan.expand(2, 2, 20, *plan.shape[2:]))[0, 1]
+    for key in (keys.STATE, keys.OWN, keys.ROUTE, keys.ROAD, keys.GOAL, keys.COLLISION, keys.OFFROAD):
+        assert torch.equal(one[key][0], wide[key]), key
+    assert torch.equal(one[keys.GAP][0].sort(-1).values, wide[keys.GAP].sort(-1).values)
+
+
+def test_moving_the_world_changes_no_route_and_no_clearance() -> None:
+    segment = crossing(6, seed=1)
+    here, there = make_env(segment), make_env(moved(segment, 2.1, 310.0, -95.0))
+    plan = actions(here, (1, 15))
+    a, b = (run(e, e.with_goals(e.start(torch.tensor([0]))), plan) for e in (here, there))
+    for key in (keys.ROUTE, keys.ROAD):
+        torch.testing.assert_close(a[key], b[key], atol=2e-3, rtol=0)
+    torch.testing.assert_close(a[keys.GAP].sort(-1).values, b[keys.GAP].sort(-1).values, atol=2e-3, rtol=0)
+    one, two = (e.choices(e.start(torch.tensor([0])))[keys.ROUTES] for e in (here, there))
+    torch.testing.assert_close(one, two, atol=2e-3, rtol=0)
+
+
+def test_the_gradient_of_what_is_seen_matches_finite_differences() -> None:
+    line = bend(straight=4, turn=1.0, radius=20)
+    points, count = padded(line)[None, None].expand(1, 3, -1, -1), torch.tensor([[len(line)] * 3])
+    # Away from the middle between two points, where the nearest one changes.
+    state = [[1.0, 0.7, 0.1, 5.0], [13.0, -1.5, 0.4, 2.0], [20.5, 2.0, 1.3, 0.0]]
+    start = torch.tensor([state], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: route_ahead(s, points, count, SCALE), (start,))
+
+
+def test_gradient_flows_through_a_rollout_into_route_and_clearance() -> None:
+    env = make_env(crossing(6), straight_road(5), dynamics=Displacement())
+    for key in (keys.ROUTE, keys.GAP, keys.ROAD):
+        plan = actions(env, (2, 8)).requires_grad_()
+        out = run(env, env.with_goals(env.start(torch.tensor([0, 1]))), plan)
+        out[key].sum().backward()
+        assert torch.isfinite(plan.grad).all(), key
+        assert (plan.grad[:, 0].abs() > 0).any(), key
+
+
+def test_gaps_are_those_between_the_boxes_that_are_seen() -> None:
+    env = make_env(crossing(7), straight_road(5), dynamics=Displacement())
+    out = run(env, env.start(torch.arange(2)[:, None].expand(2, 6)), actions(env, (2, 6, 15)))
+    objects, mask, gap = out[keys.OBJECTS], out[keys.OBJECTS_MASK], out[keys.GAP]
+    assert not mask.all()
+    assert (gap[~mask] == 0).all()
+    zero, size = torch.zeros(()), torch.tensor(CAR[:2])
+    heading = torch.atan2(objects[..., 3], objects[..., 2])
+    expected = box_gap(zero.expand(2), zero, size, objects[..., :2] * SCALE, heading, objects[..., 6:8] * 5)
+    torch.testing.assert_close(gap[mask], expected[mask], atol=1e-3, rtol=0)
+    # All objects are seen, so an overlap is a collision and the other way round.
+    hit = ((gap < 0) & mask).any(-1)
+    assert torch.equal(hit, out[keys.COLLISION].squeeze(-1))
+    assert 0 < hit.float().mean() < 1
+
+
+CROSSING = crossing(4)
+CROSSING_ENV = make_env(CROSSING)
+_EDGES = [line[:, :2].astype(float) for line in (CROSSING.road.boundary[k] for k in range(4))]
+_AREA = shapely.Polygon(np.concatenate(_EDGES))
+
+
+@settings(max_examples=60)
+@given(st.floats(-40, 40), st.floats(-40, 40), st.floats(-4, 4))
+def test_road_distances_are_those_of_centre_and_corners(x: float, y: float, heading: float) -> None:
+    start = CROSSING_ENV.start(torch.tensor([0]))
+    state = start[keys.STATE].clone()
+    state[0, 0, :3] = torch.tensor([x, y, heading])
+    seen = CROSSING_ENV.at(start.set(keys.STATE, state))
+    length, width, _ = CAR
+    local = [0, *(0.5 * complex(a * length, b * width) for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1)))]
+    places = complex(x, y) + np.array(local) * np.exp(1j * heading)
+    points = shapely.points(places.real, places.imag)
+    signed = shapely.distance(shapely.MultiLineString(_EDGES), points)
+    signed[shapely.contains(_AREA, points)] *= -1
+    # The environment simplifies the boundary by up to 0.02 m.
+    np.testing.assert_allclose(seen[keys.ROAD][0, 0], signed, atol=0.03)
+    assert seen[keys.OFFROAD][0, 0, 0] == (seen[keys.ROAD][0, 0, 0] > 0)
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_clearance_changes_no_flag(dynamics: Any) -> None:
+    segments = crossing(5), straight_road(4)
+    plain = make_env(*segments, dynamics=dynamics, config=ObservationConfig(num_objects=2, num_points=1))
+    clear = make_env(
+        *segments, dynamics=dynamics, config=ObservationConfig(num_objects=2, num_points=1, clearance=True)
+    )
+    plan = actions(plain, (2, 8, 30))
+    a, b = (run(e, e.start(torch.arange(2)[:, None].expand(2, 8)), plan) for e in (plain, clear))
+    for key in (keys.STATE, keys.COLLISION, keys.OFFROAD, keys.REWARD):
+        assert torch.equal(a[key], b[key])
+    assert 0 < a[keys.OFFROAD].float().mean() < 1
+    assert a.get(keys.GAP, None) is None

@@ -1,0 +1,459 @@
+"""Generated sets: plans, resuming, and the measures of driving."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symphony.cli import main
+from symphony.data import generate as generation
+from symphony.data.builtin import builtin_store
+from symphony.data.generate import (
+    BARREN,
+    BLOCK,
+    MAX_SEED,
+    PER_NETWORK,
+    PRESETS,
+    SPLITS,
+    Generation,
+    Harvest,
+    Plan,
+    Split,
+    Task,
+    generate,
+    harvest,
+)
+from symphony.data.segment import RunSegment
+from symphony.data.selection import interactive_agents, travel, usable
+from symphony.data.sources import sumo
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import ConfigError, DataError
+from symphony.trainers.quality import measure, shortfalls
+
+needs_sumo = pytest.mark.skipif(
+    importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony[sumo]')"
+)
+seeds = st.integers(0, MAX_SEED)
+numbers = st.integers(0, BLOCK - 1)
+
+
+@pytest.fixture(scope="module")
+def segments() -> list[RunSegment]:
+    """Some of the built-in run segments, on several maps."""
+    return list(SegmentStore(builtin_store("train")))[:12]
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch, segments: list[RunSegment]) -> None:
+    """Networks that give one to three segments each in no time; each seventh fails and each fifth gives none."""
+
+    def give(task: Task) -> Harvest:
+        if task.seed % 7 == 3:
+            return Harvest(task, [], error="netconvert failed", seconds=0.5)
+        count = 0 if task.seed % 5 == 2 else 1 + task.seed % 3
+        names = [f"{task.name}-{k}" for k in range(count)]
+        made = [segments[(task.seed + k) % len(segments)].replace(segment_id=n) for k, n in enumerate(names)]
+        return Harvest(task, made, accepted=count + 1, reasons=Counter(overlap=2), seconds=0.25)
+
+    monkeypatch.setattr(generation, "harvest", give)
+    monkeypatch.setattr(generation, "sumo_version", lambda: "0.0")
+
+
+# Plans ----------------------------------------------------------------------------------------------------------
+
+
+@given(seeds, seeds, st.sampled_from(SPLITS), st.sampled_from(SPLITS), numbers, numbers)
+def test_networks_of_other_splits_seeds_and_numbers_are_others(
+    a: int, b: int, split_a: Split, split_b: Split, i: int, j: int
+) -> None:
+    first, second = Plan(1, a, split_a).network(i), Plan(1, b, split_b).network(j)
+    assert (first.seed == second.seed) == ((a, split_a, i) == (b, split_b, j))
+    # Below 2^32, each seed is one word of NumPy's seed sequence: no two of them mix to the same stream.
+    assert 1_000_000 <= first.seed < 2**32
+
+
+def test_built_in_networks_are_in_no_plan() -> None:
+    names = {
+        store.tags(i)["network"]
+        for store in map(SegmentStore, (builtin_store("train"), builtin_store("test")))
+        for i in range(len(store))
+    }
+    assert max(int(name.split("-")[1]) for name in names) < Plan(1).network(0).seed
+
+
+def test_kinds_take_turns() -> None:
+    kinds = [
+        task.kind
+        for _, task in zip(range(6), Plan(1, kinds=("town", "ramp", "town")).networks(), strict=False)
+    ]
+    assert kinds == ["town", "ramp", "town"] * 2
+    assert next(Plan(1).networks(5)) == Plan(1).network(5)
+
+
+def test_a_seed_has_an_end() -> None:
+    networks = Plan(1).networks(BLOCK - 1)
+    assert next(networks).seed == Plan(1, split="validation").network(0).seed - 1
+    with pytest.raises(ConfigError, match=str(BLOCK)):
+        next(networks)
+
+
+def test_smaller_standard_set_is_the_beginning_of_the_larger() -> None:
+    small, large = PRESETS["town-small"], PRESETS["town"]
+    assert [small.plans[s].segments for s in SPLITS] == [2_000, 200, 500]
+    assert [large.plans[s].segments for s in SPLITS] == [10_000, 200, 1_000]
+    for split in SPLITS:
+        assert (
+            dataclasses.replace(small.plans[split], segments=large.plans[split].segments)
+            == large.plans[split]
+        )
+    for preset in PRESETS.values():
+        assert set(preset.checksums) == set(SPLITS)
+        assert all(len(bytes.fromhex(checksum)) == 32 for checksum in preset.checksums.values())
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("segments", 0),
+        ("seed", -1),
+        ("seed", MAX_SEED + 1),
+        ("split", "dev"),
+        ("kinds", ("town", "village")),
+        ("kinds", ()),
+        ("duration", 15),
+        ("interactive", 1),
+    ],
+)
+def test_bad_plans_name_the_field(field: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=field.rstrip("s")):
+        Plan(**{"segments": 5, field: value})
+
+
+# Carrying a plan out --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("fake")
+def test_an_interrupted_store_is_continued_to_the_same_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Plan(23, seed=4)
+    whole = generate(plan, tmp_path / "whole")
+    want = SegmentStore(tmp_path / "whole")
+    assert len(want) == 23
+    assert whole.complete
+    assert whole.failed
+
+    class StoppedError(Exception):
+        pass
+
+    real, left = StoreWriter.append, [0]
+
+    def append(self: StoreWriter, *args: Any, **options: Any) -> int:
+        if left[0] == 0:
+            raise StoppedError
+        left[0] -= 1
+        return real(self, *args, **options)
+
+    # Each attempt is stopped a few segments further on, within a network or between two.
+    monkeypatch.setattr(StoreWriter, "append", append)
+    attempts = 0
+    while True:
+        left[0], attempts = attempts % 4, attempts + 1
+        try:
+            state = generate(plan, tmp_path / "broken")
+            break
+        except StoppedError:
+            assert not SegmentStore(tmp_path / "broken").report["generation"]["complete"]
+    assert attempts > 8
+    store = SegmentStore(tmp_path / "broken")
+    assert store.ids == want.ids
+    assert store.checksum() == want.checksum()
+    assert state == whole
+    assert [store.tags(i) for i in range(23)] == [want.tags(i) for i in range(23)]
+
+
+@pytest.mark.usefixtures("fake")
+def test_a_finished_store_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = generate(Plan(9), tmp_path)
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*") if file.name != "store.lock"}
+    monkeypatch.setattr(generation, "harvest", None)
+    assert generate(Plan(9), tmp_path, workers=3) == made
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+
+
+@pytest.mark.usefixtures("fake")
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("segments", 10),
+        ("seed", 1),
+        ("split", "test"),
+        ("kinds", ("grid",)),
+        ("duration", 20),
+        ("interactive", 8),
+    ],
+)
+def test_other_arguments_are_refused_by_name(tmp_path: Path, field: str, value: Any) -> None:
+    generate(Plan(3), tmp_path)
+    other = dataclasses.replace(Plan(3), **{field: value})
+    with pytest.raises(ConfigError, match=f"made with {field}"):
+        generate(other, tmp_path)
+
+
+@pytest.mark.usefixtures("fake")
+def test_another_version_of_sumo_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    generate(Plan(3), tmp_path)
+    monkeypatch.setattr(generation, "sumo_version", lambda: "0.1")
+    with pytest.raises(ConfigError, match=r"made with sumo 0\.0, not 0\.1"):
+        generate(Plan(3), tmp_path)
+
+
+@pytest.mark.usefixtures("fake")
+def test_a_store_of_another_origin_is_refused(tmp_path: Path, segments: list[RunSegment]) -> None:
+    with StoreWriter(tmp_path) as writer:
+        writer.append(segments[0])
+    with pytest.raises(DataError, match="not generated"):
+        generate(Plan(3), tmp_path)
+    assert len(SegmentStore(tmp_path)) == 1
+
+
+@pytest.mark.usefixtures("fake")
+def test_networks_in_vain_come_to_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(generation, "harvest", lambda task: Harvest(task, [], reasons=Counter(overlap=3)))
+    with pytest.raises(DataError, match=rf"{BARREN} networks(.|\n)*{3 * BARREN} x overlap"):
+        generate(Plan(3), tmp_path)
+
+
+def test_segments_are_spread_over_the_maps(segments: list[RunSegment]) -> None:
+    maps = [segments[0].road, segments[-1].road]
+    crowd = [segments[0].replace(segment_id=str(k), road=maps[k >= 9]) for k in range(12)]
+    taken = generation._spread(crowd, 6, np.random.default_rng(0))
+    assert len({segment.segment_id for segment in taken}) == 6
+    assert Counter(id(segment.road) for segment in taken) == {id(road): 3 for road in maps}
+    assert len(generation._spread(crowd, 50, np.random.default_rng(0))) == 12
+
+
+# With SUMO ------------------------------------------------------------------------------------------------------
+
+
+@needs_sumo
+@pytest.mark.parametrize(("kind", "seconds", "seed"), [("town", 20, 5), ("ramp", 30, 5), ("random", 20, 5)])
+def test_longer_segments_keep_the_ego_on_the_map(kind: str, seconds: int, seed: int) -> None:
+    rule = dataclasses.replace(sumo.crop_rule(kind, seconds), focuses=4, per_focus=1)
+    run = sumo.generate_run(kind, seed, 1.6 * seconds, rule=rule, straight=generation.STRAIGHT)
+    assert run.segments
+    for segment in run.segments:
+        usable(segment, 2)
+        assert segment.num_steps == 5 * seconds + 1
+        assert segment.valid[segment.ego].all()
+        assert travel(segment)[segment.ego] > 8
+
+
+@needs_sumo
+def test_routes_go_straight_on_as_often_as_asked() -> None:
+    """The same roads and drivers; only what the routes prefer differs."""
+    turns = [
+        np.mean([np.ptp(s.heading[a]) > 0.5 for s in run.segments for a in np.flatnonzero(s.valid.all(1))])
+        for run in (sumo.generate_run("random", 1, 45.0, straight=x) for x in (0.05, 20.0))
+    ]
+    assert turns[0] > turns[1] + 0.15
+
+
+@needs_sumo
+def test_crowded_segments_have_enough_interactive_agents() -> None:
+    task = Plan(1, interactive=8).network(1)
+    found = harvest(task)
+    assert found.task == task
+    assert 0 < len(found.segments) <= min(PER_NETWORK, found.accepted)
+    assert len({id(segment.road) for segment in found.segments}) > 1
+    for segment in found.segments:
+        assert len(interactive_agents(segment, 8)) == 8
+    assert any("too few moving" in reason for reason in found.reasons)
+
+
+ARGUMENTS = ["--segments", "10", "--seed", "11", "--kinds", "town,grid"]
+
+
+@needs_sumo
+def test_a_killed_run_is_continued_and_workers_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "symphony.cli", "data", "generate", "--out", str(out), *ARGUMENTS]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        index = out / "segments.idx"
+        while process.poll() is None and not (index.exists() and index.stat().st_size):
+            time.sleep(0.002)
+    finally:
+        process.kill()
+        process.wait()
+    some = len(SegmentStore(out))
+    assert 0 < some < 10
+    if os.name == "posix":
+        assert process.returncode == -signal.SIGKILL
+    assert main([*command[3:], "--workers", "2", "--json", str(tmp_path / "killed.json")]) == 0
+    assert "checksum" in capsys.readouterr().out
+    plan = Plan(10, seed=11, kinds=("town", "grid"))
+    state = generate(plan, tmp_path / "whole")
+    store, whole = SegmentStore(out), SegmentStore(tmp_path / "whole")
+    assert store.checksum() == whole.checksum()
+    assert store.ids == whole.ids
+    written = json.loads((tmp_path / "killed.json").read_text())["stores"]["train"]
+    assert written["checksum"] == whole.checksum()
+    assert written["generation"]["accepted"] == state.accepted
+    assert written["generation"]["reasons"] == state.reasons
+    assert store.report["quality"] == written["quality"]
+    # Once more, with the measures that are kept.
+    monkeypatch.setattr("symphony.cli.generate.measured", None)
+    assert main(command[3:]) == 0
+    assert main([*command[3:], "--interactive", "3"]) == 1
+    assert "interactive 2, not 3" in capsys.readouterr().err
+
+
+# The command ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "--segments or --preset"),
+        (["--segments", "0"], "segments"),
+        (["--preset", "town", "--seed", "3"], "--seed"),
+        (["--segments", "2", "--kinds", "town,village"], "village"),
+        (["--segments", "2", "--workers", "0"], "--workers"),
+    ],
+)
+def test_wrong_usage(
+    tmp_path: Path, arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["data", "generate", "--out", str(tmp_path / "store"), *arguments]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.usefixtures("fake")
+def test_a_preset_makes_three_stores_and_warns_of_other_checksums(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plans: dict[Split, Plan] = {split: Plan(4, split=split) for split in SPLITS}
+    monkeypatch.setattr("symphony.data.sources.sumo.sumo_version", lambda: "0.0")
+    small = generation.Preset(plans, dict.fromkeys(SPLITS, "0" * 64))
+    monkeypatch.setitem(PRESETS, "town-small", small)
+    command = ["data", "generate", "--out", str(tmp_path), "--preset", "town-small"]
+    assert main(command) == 0
+    assert capsys.readouterr().err.count("made with SUMO 0.0") == 3
+    sums: dict[Split, str] = {split: SegmentStore(tmp_path / split).checksum() for split in SPLITS}
+    monkeypatch.setitem(PRESETS, "town-small", generation.Preset(plans, sums))
+    assert main(command) == 0
+    assert "warning" not in capsys.readouterr().err
+    names = [{SegmentStore(tmp_path / split).tags(i)["network"] for i in range(4)} for split in SPLITS]
+    assert not names[0] & names[1] | names[0] & names[2] | names[1] & names[2]
+
+
+# Measures -------------------------------------------------------------------------------------------------------
+
+
+def test_built_in_set_meets_the_targets(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path, file = builtin_store("test"), tmp_path / "quality.json"
+    assert main(["data", "quality", str(path), "--json", str(file)]) == 0
+    assert "choices at branching lanes" in capsys.readouterr().out
+    quality = json.loads(file.read_text())
+    assert quality == measure(SegmentStore(path))
+    assert shortfalls(quality) == []
+    assert quality["segments"] == len(SegmentStore(path))
+    assert 0.1 < quality["lateral_offset"]["std"] < 0.35
+    assert quality["fit_error"]["mean"] < 0.1
+
+
+@pytest.fixture
+def altered(tmp_path: Path, segments: list[RunSegment]) -> Any:
+    """Measures of one segment after a change."""
+
+    def alter(**changes: Any) -> dict[str, Any]:
+        with StoreWriter(tmp_path / f"s{len(list(tmp_path.iterdir()))}") as writer:
+            writer.append(segments[0].replace(**changes))
+        return measure(SegmentStore(writer.path))
+
+    return alter
+
+
+def test_faults_are_found(altered: Any, segments: list[RunSegment]) -> None:
+    segment = segments[0]
+    ego, partner = interactive_agents(segment, 2)
+    plain = altered()
+    assert (plain["collision_rate"], plain["offroad_time"]) == (0, 0)
+    # The partner where the ego is, for one step, and both of them beside the road for half the time.
+    position = segment.position.copy()
+    position[partner, 20] = position[ego, 20]
+    assert altered(position=position)["collision_rate"] == 100
+    position = segment.position.copy()
+    edge = segment.road.boundary[0][:, :2]
+    along = (edge[1] - edge[0]) / np.linalg.norm(edge[1] - edge[0])
+    beside = (edge[0] + edge[1]) / 2 + np.array([along[1], -along[0]])
+    position[np.ix_([ego, partner], np.arange(26, 51), [0, 1])] = beside
+    moved = altered(position=position)
+    assert moved["offroad_time"] == 50
+    assert moved["fit_error"]["mean"] > 1
+    assert any("offroad_time" in text for text in shortfalls(moved))
+    velocity = segment.velocity * 2
+    assert altered(velocity=velocity)["speed"]["mean"] == pytest.approx(2 * plain["speed"]["mean"], abs=2e-4)
+
+
+def test_measures_do_not_depend_on_where_and_which_way_north_is(
+    altered: Any, segments: list[RunSegment]
+) -> None:
+    segment = segments[0]
+    turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], np.float32)  # a quarter to the left, rows times it
+    road = segment.road
+
+    def turned(lines: Any) -> Any:
+        return dataclasses.replace(lines, points=lines.points @ turn)
+
+    other = altered(
+        position=segment.position @ turn,
+        velocity=segment.velocity @ turn[:2, :2],
+        heading=np.where(segment.valid, segment.heading + np.float32(np.pi / 2), 0).astype(np.float32),
+        signal_point=segment.signal_point @ turn,
+        road=dataclasses.replace(
+            road, lanes=turned(road.lanes), boundary=turned(road.boundary), marks=turned(road.marks)
+        ),
+    )
+    plain = altered()
+    for name, value in plain.items():
+        assert other[name] == pytest.approx(value, abs=0.02), name
+
+
+def test_segments_with_too_few_agents_are_counted(tmp_path: Path, segments: list[RunSegment]) -> None:
+    many = [len(interactive_agents(s, 2)) and int((s.valid[:, 0]).sum()) for s in segments]
+    with StoreWriter(tmp_path / "s") as writer:
+        for segment in segments:
+            writer.append(segment)
+    store = SegmentStore(tmp_path / "s")
+    quality = measure(store, interactive=8)
+    assert quality["segments"] + quality["skipped"] == len(segments)
+    assert quality["skipped"] >= sum(count < 8 for count in many)
+    with pytest.raises(DataError, match="99 interactive"):
+        measure(store, interactive=99)
+
+
+def test_generation_counts_what_networks_gave() -> None:
+    state = Generation()
+    task = Plan(1).network(0)
+    state.add(Harvest(task, [], 3, Counter(a=1, b=5), 1.0))
+    state.add(Harvest(task, [], 2, Counter(a=1), 0.5, "failed"))
+    assert state == Generation(2, 5, {"b": 5, "a": 2}, {task.name: "failed"}, 1.5)

@@ -1,0 +1,412 @@
+"""The rows of the paper's tables: what training each of them means, and what their data is."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import torch
+from torch import Tensor
+
+from helpers_segments import crossing, hide, straight_road
+from symphony import keys
+from symphony.cli import main
+from symphony.config import (
+    AgentConfig,
+    DiscriminatorConfig,
+    Method,
+    SearchConfig,
+    TrainConfig,
+    from_dict,
+    to_json,
+)
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
+from symphony.envs.routes import POINTS
+from symphony.errors import ConfigError
+from symphony.trainers import load_agent, train
+from symphony.trainers.checkpoint import CheckpointError, checkpoints
+from symphony.trainers.dataset import SceneDataset, logged
+from symphony.trainers.learner import Learner
+from symphony.trainers.networks import build_networks
+from symphony.trainers.tracking import read_metrics
+
+METHODS: tuple[Any, ...] = get_args(Method)
+NETWORKS = {
+    "bc": {"policy"},
+    "bc_h": {"policy", "goals"},
+    "bc_ts": {"policy", "discriminator"},
+    "bc_ts_h": {"policy", "goals", "discriminator"},
+}
+ROUTED = ObservationConfig(num_objects=4, num_points=12, route=True)
+Trained = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        writer.append(straight_road(4, seed=0, steps=14))
+        writer.append(crossing(4, seed=0, steps=9))
+        # One vehicle comes into sight after the start.
+        writer.append(hide(crossing(5, seed=1, steps=11), 3, slice(0, 4)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def dataset(store: Path) -> SceneDataset:
+    return SceneDataset(SegmentStore(store), 2, Bicycle(), routes=True)
+
+
+def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
+    base = TrainConfig(
+        method,
+        data=store,
+        out=out,
+        steps=4,
+        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        segments=2,
+        states=16,
+        goals=8,
+        search=SearchConfig(branches=2, prune_every=4, segments=2, updates=2, states=8, test_branches=2),
+        discriminator=DiscriminatorConfig(hidden=8, head=8, states=8),
+        checkpoint_every=2,
+        log_every=1,
+        wandb="disabled",
+    )
+    return replace(base, **changes)
+
+
+@pytest.fixture(scope="module")
+def trained(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """Runs made once each; never written to again."""
+    runs: dict[str, Path] = {}
+
+    def get(method: str) -> Path:
+        if method not in runs:
+            runs[method] = train(config(method, store, tmp_path_factory.mktemp("runs") / method))
+        return runs[method]
+
+    return get
+
+
+def weights(run: Path) -> dict[str, Tensor]:
+    agent = load_agent(str(run))
+    found = {"policy": agent.policy, "goals": agent.goals, "discriminator": agent.discriminator}
+    return {
+        f"{name}.{key}": value.clone()
+        for name, module in found.items()
+        if isinstance(module, torch.nn.Module)
+        for key, value in module.state_dict().items()
+    }
+
+
+def of(network: str, found: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value for name, value in found.items() if name.startswith(f"{network}.")}
+
+
+def equal(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_method_trains_its_networks(trained: Trained, store: Path, method: str) -> None:
+    run = trained(method)
+    settings = config(method, store, run)
+    torch.manual_seed(settings.seed)
+    fresh = build_networks(settings, Bicycle()).present()
+    assert set(fresh) == NETWORKS[method]
+    after = weights(run)
+    assert {name.split(".")[0] for name in after} == NETWORKS[method]
+    for name, module in fresh.items():
+        before = {f"{name}.{key}": value for key, value in module.state_dict().items()}
+        assert of(name, after).keys() == before.keys()
+        assert all(torch.isfinite(value).all() for value in of(name, after).values())
+        changed = [not torch.equal(before[key], after[key]) for key in before]
+        assert sum(changed) >= 0.8 * len(changed), name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
+    records = read_metrics(trained(method))
+    assert [r["step"] for r in records] == [1, 2, 3, 4]
+    losses = {
+        "policy": "loss_distillation" if "ts" in method else "loss_bc",
+        "goals": "loss_goal",
+        "discriminator": "loss_discriminator",
+    }
+    for name, loss in losses.items():
+        assert (loss in records[0]) == (name in NETWORKS[method])
+        assert (f"gradient_norm_{name}" in records[0]) == (name in NETWORKS[method])
+        if name in NETWORKS[method]:
+            assert all(math.isfinite(r[loss]) and r[f"gradient_norm_{name}"] > 0 for r in records)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_metrics_are_strict_json(trained: Trained, method: str) -> None:
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    for line in (trained(method) / "metrics.jsonl").read_text(encoding="utf-8").splitlines():
+        json.loads(line, parse_constant=refuse)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path, method: str) -> None:
+    again = train(config(method, store, tmp_path / "again"))
+    assert equal(weights(again), weights(trained(method)))
+    if method == "bc_ts_h":
+        other = weights(train(config(method, store, tmp_path / "other", seed=1)))
+        assert not any(
+            equal(of(n, other), of(n, weights(again))) for n in ("policy", "goals", "discriminator")
+        )
+
+
+def stopped(run: Path, out: Path, step: int) -> None:
+    """A copy of a run as it was after so many updates."""
+    shutil.copytree(run, out)
+    for done in checkpoints(out / "checkpoints"):
+        if int(done.name[-12:]) > step:
+            shutil.rmtree(done)
+    lines = (out / "metrics.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
+    (out / "metrics.jsonl").write_text("".join(lines[: step + 1]), encoding="utf-8")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_resumed_run_ends_like_an_uninterrupted_one(
+    trained: Trained, store: Path, tmp_path: Path, method: str
+) -> None:
+    stopped(trained(method), tmp_path / "part", 2)
+    train(config(method, store, tmp_path / "part", resume=True))
+    assert equal(weights(tmp_path / "part"), weights(trained(method)))
+    assert [r["step"] for r in read_metrics(tmp_path / "part")] == [1, 2, 3, 4]
+
+
+def test_so_does_one_whose_discriminator_sees_noise_and_a_penalty(store: Path, tmp_path: Path) -> None:
+    judge = DiscriminatorConfig(
+        hidden=8, head=8, states=8, instance_noise=0.1, gradient_penalty=0.1, features="foresight"
+    )
+    whole = train(config("bc_ts", store, tmp_path / "whole", discriminator=judge))
+    stopped(whole, tmp_path / "part", 2)
+    train(config("bc_ts", store, tmp_path / "part", discriminator=judge, resume=True))
+    assert equal(weights(tmp_path / "part"), weights(whole))
+
+
+def test_a_warm_start_takes_over_what_both_runs_have(trained: Trained, store: Path, tmp_path: Path) -> None:
+    # Rates so small that no weight moves.
+    still = DiscriminatorConfig(hidden=8, head=8, states=8, learning_rate=1e-30)
+    changes: dict[str, Any] = {"learning_rate": 1e-30, "discriminator": still, "steps": 2, "seed": 9}
+    source = trained("bc_h")
+    out = train(config("bc_ts_h", store, tmp_path / "warm", warm_start=source, **changes))
+    after, before = weights(out), weights(source)
+    for name in ("policy", "goals"):
+        assert equal(of(name, after), of(name, before))
+    torch.manual_seed(9)
+    fresh = build_networks(config("bc_ts_h", store, out, **changes), Bicycle())
+    assert fresh.discriminator is not None
+    new = {f"discriminator.{k}": v for k, v in fresh.discriminator.state_dict().items()}
+    assert equal(of("discriminator", after), new)
+    # And from one with more networks than are asked for.
+    out = train(config("bc_h", store, tmp_path / "less", warm_start=trained("bc_ts_h"), **changes))
+    assert equal(
+        weights(out), {k: v for k, v in weights(trained("bc_ts_h")).items() if "discriminator" not in k}
+    )
+
+
+def test_a_resumed_run_does_not_start_warm_again(trained: Trained, store: Path, tmp_path: Path) -> None:
+    whole = config("bc_ts", store, tmp_path / "whole", warm_start=trained("bc"))
+    train(whole)
+    assert not equal(of("policy", weights(whole.out)), of("policy", weights(trained("bc_ts"))))
+    stopped(whole.out, tmp_path / "part", 2)
+    train(replace(whole, out=tmp_path / "part", resume=True))
+    assert equal(weights(tmp_path / "part"), weights(whole.out))
+
+
+@pytest.mark.parametrize("kind", ["nowhere", "another shape"])
+def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(
+    trained: Trained, store: Path, tmp_path: Path, kind: str
+) -> None:
+    source = tmp_path / "nowhere" if kind == "nowhere" else trained("bc_h")
+    with pytest.raises((ConfigError, CheckpointError)):
+        train(config("bc", store, tmp_path / "run", warm_start=source))
+    # Else the corrected command would be refused: the folder holds a run already.
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_configurations_survive_json(store: Path, tmp_path: Path, method: str) -> None:
+    settings = config(
+        method,
+        store,
+        tmp_path,
+        warm_start=tmp_path / "other",
+        search=SearchConfig(updates=1, survivors="best"),
+        discriminator=DiscriminatorConfig(features="paper", radius=7.5),
+    )
+    assert from_dict(TrainConfig, json.loads(to_json(settings))) == settings
+    plain = replace(settings, warm_start=None)
+    assert from_dict(TrainConfig, json.loads(to_json(plain))) == plain
+
+
+def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None:
+    saved = json.loads(to_json(config("bc_ts", store, tmp_path)))
+    wrong: list[dict[str, Any]] = [
+        {**saved, "format": 1},
+        {**saved, "serach": {}},
+        {**saved, "search": {**saved["search"], "branch": 4}},
+        {**saved, "discriminator": {**saved["discriminator"], "feature": "paper"}},
+        {**saved, "method": "mgail_bc"},
+        {**saved, "discriminator": {**saved["discriminator"], "features": "papre"}},
+        {**saved, "search": {**saved["search"], "survivors": "some"}},
+    ]
+    for values in wrong:
+        with pytest.raises(ConfigError):
+            from_dict(TrainConfig, values)
+
+
+def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:
+    for method in ("bc_ts", "bc_ts_h"):
+        with pytest.raises(ConfigError, match="multiple of search"):
+            config(method, store, tmp_path, checkpoint_every=3)
+    for method in ("bc", "bc_h"):
+        config(method, store, tmp_path, checkpoint_every=3)
+    for bad in ({"keep": 1.5}, {"keep": 0}, {"weight": -1}, {"branches": 0}, {"updates": 0}):
+        with pytest.raises(ConfigError):
+            SearchConfig(**bad)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_runs_may_share_one_dataset(
+    store: Path, dataset: SceneDataset, tmp_path: Path, trained: Trained, method: Any
+) -> None:
+    run = train(config(method, store, tmp_path / "run"), dataset)
+    assert equal(weights(run), weights(trained(method)))
+
+
+def test_the_command_line_trains_and_judges_a_method_with_search(store: Path, tmp_path: Path) -> None:
+    out, file = tmp_path / "run", tmp_path / "numbers.json"
+    command = f"""train bc_ts --data {store} --out {out} --steps 2 --states 16 --wandb disabled
+        --agent.hidden 8 --agent.head 8 --agent.num-points 12 --search.branches 2 --search.segments 2
+        --search.states 8 --discriminator.states 8 --discriminator.hidden 8"""
+    assert main(command.split()) == 0
+    assert {name.split(".")[0] for name in weights(out)} == NETWORKS["bc_ts"]
+    command = f"evaluate {out} --data {store} --json {file} --rollouts 2 --search tree --branches 2"
+    assert main(command.split()) == 0
+    assert math.isfinite(json.loads(file.read_text())["ade"])
+    assert main(f"evaluate {out} --data {store} --rollouts 4 --search tree --branches 2".split()) == 1
+
+
+def test_learners_judge_states_up_to_the_end_of_each_scene(store: Path, dataset: SceneDataset) -> None:
+    wide = SearchConfig(branches=4, segments=3, prune_every=4, updates=2, states=8)
+    settings = config("bc_ts_h", store, Path(), segments=3, search=wide)
+    torch.manual_seed(0)
+    learner = Learner(settings, build_networks(settings, Bicycle()), dataset, torch.device("cpu"))
+    record = learner.update(0)
+    found = learner._found
+    assert found is not None
+    seen = found.env.at(found.simulated)
+    going = (seen[keys.STEP] <= found.env.scenes.last_step[seen[keys.SCENE]]) & seen[keys.VALID]
+    assert not going.all()
+    for name, key in (("collision", keys.COLLISION), ("offroad", keys.OFFROAD)):
+        share = seen[key].squeeze(-1)[going].float().mean()
+        torch.testing.assert_close(record[f"search_{name}_all"], share)
+    assert record["search_offroad_all"] > 0
+
+
+def test_what_learners_search_is_what_they_imitate(store: Path, dataset: SceneDataset) -> None:
+    """Actions of survivors lead from each of their states to the next."""
+    settings = config("bc_ts_h", store, Path(), segments=3)
+    torch.manual_seed(0)
+    learner = Learner(settings, build_networks(settings, Bicycle()), dataset, torch.device("cpu"))
+    learner.update(0)
+    found = learner._found
+    assert found is not None
+    env, lived = found.env, found.survivors
+    before, after = lived[..., :-1], lived[..., 1:]
+    stepped = env.step(env.at(before).set(keys.ACTION, before[keys.ACTION]))["next"]
+    assert torch.equal(stepped[keys.STATE], after[keys.STATE])
+    assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
+    rows = found.env.scenes.route_logged[:, None, None].expand(*lived.shape, 2)
+    assert torch.equal(lived[keys.GOAL], rows)
+    assert sorted(found.rank[0].tolist()) == [0, 1]
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_expert_batches_show_what_the_environment_shows_with_logged_goals(store: Path, dynamics: Any) -> None:
+    dataset = SceneDataset(SegmentStore(store), 2, dynamics, routes=True)
+    for item in range(3):
+        scenes = dataset.scenes([item])
+        env = DrivingEnv(scenes, dynamics, ROUTED)
+        start = env.with_goals(env.start(torch.tensor([0])))
+        batch = dataset.sample_states([item], 1500, ROUTED, torch.Generator().manual_seed(0))
+        sums = [b[keys.POINTS].double().sum((-1, -2)) for b in (batch, start)]
+        # Points are fixed in the world, so that few other states look alike.
+        for agent in range(2):
+            near = (sums[0][:, 0] - sums[1][0, agent]).abs() < 1e-4
+            assert near.any()
+            for key in (keys.OWN, keys.ROUTE):
+                torch.testing.assert_close(
+                    batch[key][near, 0], start[key][0, agent].expand(int(near.sum()), -1), atol=1e-4, rtol=0
+                )
+
+
+def test_goal_batches_are_the_choices_of_the_environment(dataset: SceneDataset) -> None:
+    for item in range(3):
+        env = DrivingEnv(dataset.scenes([item]), Bicycle(), ROUTED)
+        seen = env.choices(env.start(torch.tensor([0])))
+        batch = dataset.sample_goals([item], 60, ROUTED, torch.Generator().manual_seed(0))
+        routes, mask, label = batch[keys.ROUTES][:, 0], batch[keys.ROUTES_MASK][:, 0], batch[keys.GOAL][:, 0]
+        assert batch[keys.VALID].all()
+        assert mask.gather(-1, label[:, None]).all()
+        for agent in range(2):
+            exists = seen[keys.ROUTES_MASK][0, agent]
+            own = seen[keys.ROUTES][0, agent, exists]
+            same = (mask.sum(-1) == len(own)) & mask[:, : len(own)].all(-1)
+            away = (routes[:, : len(own)] - own).abs().amax((-1, -2))
+            same &= away < 1e-4
+            assert same.any()
+            assert (label[same] == env.scenes.route_logged[0, agent]).all()
+
+
+def test_goal_batches_start_where_each_vehicle_comes_into_sight(store: Path, dataset: SceneDataset) -> None:
+    """Its route begins beside it, not where it was never seen."""
+    batch = dataset.sample_goals([2], 80, ROUTED, torch.Generator().manual_seed(0))
+    first = batch[keys.ROUTES][:, 0, :, :2].masked_fill(~batch[keys.ROUTES_MASK][:, 0, :, None], 0)
+    assert (first.norm(dim=-1) * ROUTED.distance_scale < 4).all()
+    taken = batch[keys.GOAL][:, 0]
+    own = first[torch.arange(len(taken)), taken].norm(dim=-1) * ROUTED.distance_scale
+    assert (own < 0.5).all()
+
+
+def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
+    items = [2, 0, 1]
+    scenes = dataset.scenes(items)
+    state, valid = dataset.fitted(items, scenes)
+    log, log_valid = logged(scenes)
+    assert torch.equal(valid, log_valid)
+    for b, item in enumerate(items):
+        found = dataset.experts(item)
+        for n, agent in enumerate(scenes.interactive[b].tolist()):
+            row = found.agent.tolist().index(agent)
+            steps = found.states.shape[1]
+            assert torch.equal(state[b, :steps, n], found.states[row])
+            away = (state[b, :, n, :2] - log[b, :, n, :2]).norm(dim=-1)[valid[b, :, n]]
+            assert away.max() < 0.5
+    assert not torch.equal(state, log)
+
+
+def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneDataset) -> None:
+    small = SceneDataset(SegmentStore(store), 2, Bicycle(), routes=True, keep=1)
+    for draw in (SceneDataset.sample_states, SceneDataset.sample_goals):
+        one, two = (
+            draw(each, [2, 0, 1], 40, ROUTED, torch.Generator().manual_seed(3)) for each in (small, dataset)
+        )
+        assert (one == two).all()
+    assert small.scene.cache_info().currsize == small.experts.cache_info().currsize == 1
+    assert small.scene(0).route.shape[3] == POINTS

@@ -1,0 +1,313 @@
+"""Kinds of collisions: staged ones, and what must not change them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symphony.metrics import CollisionKind, CollisionKinds, RolloutMetrics, collision_kinds, collisions
+
+KIND = CollisionKind
+STEPS, DT = 10, 0.2
+
+
+def stage(*agents, subjects=(0,), size=(4.5, 2.0)):
+    """Agents (x, y, heading in degrees, speed) that drive straight on, as the arguments of `collision_kinds`."""
+    start = torch.tensor(agents, dtype=torch.float64)
+    heading = start[:, 2].deg2rad()
+    velocity = start[:, 3, None] * torch.stack([heading.cos(), heading.sin()], -1)
+    time = DT * torch.arange(STEPS + 1)
+    position = start[:, None, :2] + time[:, None] * velocity[:, None]
+    heading, velocity = (
+        value[:, None].expand(len(agents), STEPS + 1, -1) for value in (heading[:, None], velocity)
+    )
+    log = torch.cat([position, heading, velocity], -1)
+    sizes = torch.tensor(size, dtype=torch.float64).expand(len(agents), 2)
+    return scene(log, start[:, 3, None].expand(-1, STEPS + 1), sizes, torch.tensor(subjects))
+
+
+def scene(log, speed, size, subject):
+    """With the flags that belong to it."""
+    valid = torch.ones(log.shape[:-1], dtype=torch.bool)
+    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)[..., 1:]
+    state = torch.cat([log[..., :3], speed[..., None]], -1)
+    rows = subject.clamp(min=0)[..., None]
+    exists = (subject >= 0)[..., None].expand(*subject.shape, log.shape[-2])
+    return {
+        "collided": flags,
+        "state": torch.take_along_dim(state, rows[..., None], -3),
+        "exists": exists,
+        "subject": subject,
+        "log_state": log,
+        "log_valid": valid,
+        "size": size,
+    }
+
+
+def kinds_of(*agents, **arguments):
+    return collision_kinds(**stage(*agents, **arguments)).kind.tolist()
+
+
+EGO = (0.0, 0.0, 0.0, 10.0)
+CASES = {
+    "into a slow leader": ([EGO, (12, 0, 0, 2)], KIND.INTO_LEADER, KIND.REAR_ENDED),
+    "into a standing leader, half beside it": ([EGO, (12, 1.2, 0, 0)], KIND.INTO_LEADER, KIND.REAR_ENDED),
+    "into one that turns off": ([EGO, (10, 1, 40, 3)], KIND.INTO_LEADER, KIND.REAR_ENDED),
+    "at a speed of 5 m a step": ([(0, 0, 0, 25), (9, 0, 0, 0)], KIND.INTO_LEADER, KIND.REAR_ENDED),
+    "head on": ([EGO, (20, 0.5, 180, 8)], KIND.ONCOMING, KIND.ONCOMING),
+    "into the oncoming lane": ([(0, 0, 5, 10), (20, 2.6, 180, 8)], KIND.ONCOMING, KIND.ONCOMING),
+    "crossing from the right": ([EGO, (10, -10, 90, 10)], KIND.CROSSING, KIND.CROSSING),
+    "crossing, hit in the flank": ([(0, 0, 0, 5), (6, 10, -90, 10)], KIND.CROSSING, KIND.CROSSING),
+    "into one that stands across": ([EGO, (12, 1, 100, 0)], KIND.CROSSING, KIND.CROSSING),
+    "changing lane": ([(0, 0, 10, 10), (0.5, 3, 0, 10)], KIND.SIDESWIPE, KIND.SIDESWIPE),
+    "changing lane into a tail": ([(0, 0, 8, 12), (9, 3.2, 0, 4)], KIND.INTO_LEADER, KIND.REAR_ENDED),
+    "backing into one that stands": ([(0, 0, 0, -2), (-6, 0, 0, 0)], KIND.OTHER, KIND.OTHER),
+    "into one that backs": ([EGO, (14, 0, 0, -2)], KIND.INTO_LEADER, KIND.REAR_ENDED),
+}
+
+
+@pytest.mark.parametrize(("agents", "kind", "other"), CASES.values(), ids=CASES)
+def test_staged(agents, kind, other):
+    """Also turned and shifted, mirrored, and seen by the other."""
+    assert kinds_of(*agents) == [kind]
+    assert kinds_of(*agents, subjects=(1, 0)) == [other, kind]
+    for turn in (33, 90, 178, -120):
+        c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        turned = [(c * x - s * y + 50, s * x + c * y - 9, h + turn, v) for x, y, h, v in agents]
+        assert kinds_of(*turned, subjects=(1, 0)) == [other, kind]
+        assert kinds_of(*[(x, -y, -h, v) for x, y, h, v in turned], subjects=(1, 0)) == [other, kind]
+
+
+def test_the_record_of_one_collision():
+    # The leader's tail is 7.5 m ahead: closing at 8 m/s they meet within step 4 (from 0), the fifth.
+    inputs = stage((12, 0, 0, 2), (0, 50, 0, 0), EGO, subjects=(2, 1))
+    assert inputs["collided"][0].int().argmax() == 4
+    found = collision_kinds(**inputs)
+    assert [value.tolist() for value in found] == [[KIND.INTO_LEADER, -1], [4, -1], [0, -1], [True, False]]
+    found = collision_kinds(**stage((12, 0, 0, 2), (0, 50, 0, 0), EGO, subjects=(2, 1, 0, -1)))
+    assert found.other.tolist() == [0, -1, 2, -1]
+    assert found.playback.tolist() == [False] * 4
+
+
+def test_the_first_collision_counts_and_of_several_the_deepest():
+    # Rear-ended at once, pushed nowhere, into the leader later.
+    found = collision_kinds(**stage((0, 0, 0, 10), (-6, 0, 0, 24), (20, 0, 0, 0)))
+    assert (found.kind.tolist(), found.other.tolist()) == ([KIND.REAR_ENDED], [1])
+    # At the same step: 0.1 m into the flank of one, half a metre into the tail of the other.
+    found = collision_kinds(**stage((0, 0, 0, 5), (5, 0, 0, 0), (0, 3.9, -90, 5), size=(4.5, 2.0)))
+    assert (found.kind.tolist(), found.other.tolist()) == ([KIND.INTO_LEADER], [1])
+
+
+@pytest.mark.parametrize("when", ["it appears at contact", "they overlap from the start"])
+def test_without_a_state_before_contact_the_one_at_contact_decides(when):
+    inputs = stage((0, 0, 0, 0), (4.3, 0.2, 0, 0), subjects=(0, 1))
+    if when == "it appears at contact":
+        inputs["exists"] = inputs["exists"].clone()
+        inputs["exists"][1, :4] = False
+        inputs["collided"] = inputs["collided"].clone()
+        inputs["collided"][:, :3] = False
+    assert collision_kinds(**inputs).kind.tolist() == [KIND.INTO_LEADER, KIND.REAR_ENDED]
+    beside = stage((0, 0, 0, 0), (0.2, 1.9, 0, 0), subjects=(0, 1))
+    assert collision_kinds(**beside).kind.tolist() == [KIND.SIDESWIPE] * 2
+
+
+def crowd(seed, lead=(3, 4), agents=6, subjects=3):
+    """Agents that drive through each other at random."""
+    rng = np.random.default_rng(seed)
+    speed = torch.tensor(rng.uniform(-1, 12, (*lead, agents)))
+    turn = torch.tensor(rng.uniform(-0.3, 0.3, (*lead, agents)))[..., None] * DT * torch.arange(STEPS + 1)
+    heading = torch.tensor(rng.uniform(-4, 4, (*lead, agents)))[..., None] + turn
+    velocity = speed[..., None, None] * torch.stack([heading.cos(), heading.sin()], -1)
+    position = torch.tensor(rng.uniform(0, 32, (*lead, agents, 1, 2))) + DT * velocity.cumsum(-2)
+    log = torch.cat([position, heading[..., None], velocity], -1)
+    size = torch.tensor(rng.uniform((3.5, 1.6), (8, 2.4), (*lead, agents, 2)))
+    subject = torch.tensor(np.stack([rng.permutation(agents)[:subjects] for _ in range(math.prod(lead))]))
+    return scene(log, speed[..., None].expand(heading.shape), size, subject.reshape(*lead, subjects))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_every_first_collision_has_a_kind(seed):
+    inputs = crowd(seed)
+    found = collision_kinds(**inputs)
+    hit = inputs["collided"].any(-1)
+    assert torch.equal(found.kind >= 0, hit)
+    assert torch.equal(found.step[hit], inputs["collided"].int().argmax(-1)[hit])
+    assert (found.step[~hit] == -1).all()
+    assert (found.other[hit] != inputs["subject"][hit]).all()
+    listed = (found.other[..., None] == inputs["subject"][..., None, :]).any(-1)
+    assert torch.equal(found.playback, hit & ~listed)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-3, 3), st.booleans())
+def test_rotation_shift_and_mirror_change_nothing(seed, angle, mirror):
+    inputs = crowd(seed)
+    moved = dict(inputs)
+    c, s = math.cos(angle), math.sin(angle)
+    sign = -1.0 if mirror else 1.0
+    # Headings turn by the angle after the mirror; speeds stay.
+    matrix = torch.tensor([[c, -s], [s, c]], dtype=torch.float64) * torch.tensor([1.0, sign])
+    shift = torch.tensor([70.0, -30.0], dtype=torch.float64)
+    for name in ("state", "log_state"):
+        old = inputs[name]
+        parts = [old[..., :2] @ matrix.T + shift, sign * old[..., 2:3] + angle]
+        parts.append(old[..., 3:] @ matrix.T if name == "log_state" else old[..., 3:])
+        moved[name] = torch.cat(parts, -1)
+    for a, b in zip(collision_kinds(**inputs), collision_kinds(**moved), strict=True):
+        assert torch.equal(a, b)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_two_agents_agree_on_what_they_did(seed):
+    found = collision_kinds(**crowd(seed, lead=(40,), agents=2, subjects=2))
+    one, two = found.kind.unbind(-1)
+    swapped = one.clone()
+    swapped[one == KIND.INTO_LEADER], swapped[one == KIND.REAR_ENDED] = KIND.REAR_ENDED, KIND.INTO_LEADER
+    assert torch.equal(two, swapped)
+    kind, playback = found.first()
+    assert not playback.any()
+    assert torch.equal(kind, torch.where(kind == KIND.REAR_ENDED, -1, torch.minimum(one, two)))
+
+
+def test_padding_order_and_batch_change_nothing():
+    inputs = crowd(5)
+    found = collision_kinds(**inputs)
+    assert len(found.kind.unique()) > 3
+    assert set(found.playback[found.kind >= 0].tolist()) == {True, False}
+    for b, k in np.ndindex(3, 4):
+        one = collision_kinds(**{name: value[b, k] for name, value in inputs.items()})
+        assert all(torch.equal(a[b, k], x) for a, x in zip(found, one, strict=True))
+    # Agents in another order with two more that are never valid, and subjects with two more that are none.
+    order = torch.tensor([4, 2, 0, 1, 5, 3])
+    place = torch.argsort(order)
+    changed = {
+        name: torch.cat([value[:, :, order], value[:, :, :2]], 2)
+        for name, value in inputs.items()
+        if name in ("log_state", "log_valid", "size")
+    }
+    changed["log_valid"][:, :, 6:] = False
+    changed["log_state"][:, :, 6:] = torch.nan
+    changed["subject"] = torch.cat([place[inputs["subject"]], torch.full((3, 4, 2), -1)], -1)
+    for name in ("state", "exists", "collided"):
+        changed[name] = torch.cat([inputs[name], inputs[name][:, :, :2]], 2)
+    changed["collided"][:, :, 3:], changed["exists"][:, :, 3:] = False, False
+    again = collision_kinds(**changed)
+    for name, value in again._asdict().items():
+        expected = getattr(found, name)
+        if name == "other":
+            expected = torch.where(expected < 0, -1, place[expected])
+        assert torch.equal(value[..., :3], expected), name
+        assert (value[..., 3:] <= 0).all()
+
+
+def test_the_log_of_interactive_agents_is_not_read_and_leading_dimensions_broadcast():
+    inputs = crowd(6)
+    log = inputs["log_state"][:, :1].expand(3, 4, 6, STEPS + 1, 5).clone()
+    subject = inputs["subject"][:, :1]
+    rows = torch.arange(3)[:, None, None], torch.arange(4)[:, None], subject.expand(3, 4, 3)
+    driven = torch.cat([inputs["state"][..., :3], torch.zeros_like(inputs["state"][..., :2])], -1)
+    log[rows] = driven
+    size = inputs["size"][:, :1]
+    valid = torch.ones(log.shape[:-1], dtype=torch.bool)
+    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)[..., 1:]
+    shared = inputs["log_state"][:, :1].clone()
+    shared[torch.arange(3)[:, None, None], 0, subject] = torch.nan
+    arguments = {**inputs, "collided": flags, "size": size, "subject": subject}
+    narrow = collision_kinds(**{**arguments, "log_state": shared, "log_valid": valid[:, :1]})
+    wide = collision_kinds(**{**arguments, "log_state": log, "log_valid": valid})
+    assert (narrow.kind >= 0).any()
+    for a, b in zip(narrow, wide, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_who_is_first_in_a_rollout():
+    none = -1
+    kind = torch.tensor([[4, 5], [5, 0], [0, none], [none, none], [1, 1]])
+    step = torch.tensor([[7, 3], [4, 4], [0, none], [none, none], [2, 2]])
+    playback = torch.tensor([[True, False], [False, False], [True, False], [False, False], [False, True]])
+    first, with_playback = CollisionKinds(kind, step, kind, playback).first()
+    assert first.tolist() == [5, 0, 0, -1, 1]
+    assert with_playback.tolist() == [False, False, True, False, True]
+    empty = CollisionKinds(*(value[:, :0] for value in (kind, step, kind, playback)))
+    assert empty.first()[0].tolist() == [-1] * 5
+
+
+def test_flags_that_are_not_those_of_the_states_are_refused():
+    inputs = stage(EGO, (12, 30, 0, 2), subjects=(0, -1))
+    flags = torch.zeros(2, STEPS, dtype=torch.bool)
+    assert not inputs["collided"].any()
+    flags[0, 3] = True
+    with pytest.raises(ValueError, match=r"28\.\d+ m away from all others"):
+        collision_kinds(**{**inputs, "collided": flags})
+    with pytest.raises(ValueError, match="stands for no agent"):
+        collision_kinds(**{**inputs, "collided": flags.flip(0)})
+
+
+@pytest.mark.parametrize("name", ["state", "exists", "subject", "log_state", "log_valid", "size"])
+def test_wrong_shapes_are_refused(name):
+    inputs = stage(EGO, (12, 0, 0, 2))
+    inputs[name] = inputs[name][..., :0]
+    with pytest.raises(ValueError, match=f"{name} is .* expected"):
+        collision_kinds(**inputs)
+
+
+def update(metrics, name, inputs, kinds):
+    shape = inputs["collided"].shape
+    metrics.update(
+        [f"{name}{k}" for k in range(shape[0])],
+        collided=inputs["collided"],
+        offroad=torch.zeros(shape, dtype=torch.bool),
+        displacement=torch.zeros(shape),
+        simulated=torch.ones(shape, dtype=torch.bool),
+        logged=torch.ones(shape[0], *shape[2:], dtype=torch.bool),
+        curvature=[np.zeros(1)] * shape[0],
+        curvature_log=[np.zeros(1)] * shape[0],
+        kinds=kinds,
+    )
+
+
+def test_in_the_table_kinds_sum_to_the_collision_rate():
+    whole, one, two = RolloutMetrics(), RolloutMetrics(), RolloutMetrics()
+    found = []
+    for number, part in ((3, one), (4, two)):
+        inputs = crowd(number)
+        kinds = collision_kinds(**inputs)
+        update(whole, f"s{number}", inputs, kinds)
+        update(part, f"s{number}", inputs, kinds)
+        found.append(kinds.first())
+    one.merge(two)
+    numbers = whole.compute()
+    assert one.compute() == numbers
+    assert 0 < numbers["collision_rate"] < 100
+    rates = {kind: numbers[f"collision_{kind.name.lower()}"] for kind in CollisionKind}
+    assert sum(rates.values()) == pytest.approx(numbers["collision_rate"])
+    kind, playback = (torch.cat([pair[k].flatten() for pair in found]) for k in (0, 1))
+    assert len(kind) == 24
+    for k in CollisionKind:
+        assert rates[k] == pytest.approx(100 * float((kind == k).double().mean()))
+    assert numbers["collision_with_playback"] == pytest.approx(100 * float(playback.double().mean()))
+    rear = (kind == KIND.REAR_ENDED) & playback
+    assert numbers["collision_rear_ended_by_playback"] == pytest.approx(100 * float(rear.double().mean()))
+    assert numbers["collision_crossing_se"] > 0
+
+
+def test_the_table_refuses_kinds_of_other_collisions_or_for_a_part():
+    inputs, metrics = crowd(3), RolloutMetrics()
+    kinds = collision_kinds(**inputs)
+    wrong = CollisionKinds(torch.full_like(kinds.kind, -1), *kinds[1:])
+    with pytest.raises(ValueError, match="segment a0: kinds are not those of its collisions"):
+        update(metrics, "a", inputs, wrong)
+    with pytest.raises(ValueError, match="kinds are of"):
+        update(metrics, "a", inputs, CollisionKinds(*(value[:1] for value in kinds)))
+    update(metrics, "a", inputs, None)
+    assert not any("into_leader" in name for name in metrics.compute())
+    update(metrics, "b", inputs, kinds)
+    with pytest.raises(ValueError, match="for 3 of 6 segments"):
+        metrics.compute()

@@ -1,0 +1,451 @@
+"""The search through the driving environment, and the evaluator's kinds of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+import symphony.trainers.evaluation as evaluation
+from helpers_segments import crossing, make_road, make_segment, straight_road
+from symphony import keys
+from symphony.collectors import BeamSearchResult, KeepAll, KeepBest
+from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import Bicycle, DrivingEnv, scene
+from symphony.envs.scene import SceneBatch
+from symphony.errors import ConfigError
+from symphony.trainers import evaluate, simulate
+from symphony.trainers.agents import Agent
+from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.evaluation import simulated
+from symphony.trainers.networks import build_networks, observation_config
+from symphony.trainers.simulate import (
+    ENDED,
+    Rollouts,
+    SeededNoise,
+    draw_goals,
+    flag_score,
+    rollouts_of,
+    search,
+)
+
+SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=3)
+KINDS = ("none", "tree", "oracle", "best")
+
+
+def make_agent(seed: int = 0, method: Any = "bc_ts_h", judge: int = 0) -> Agent:
+    """A tiny untrained agent; ``judge`` is the seed of the discriminator alone."""
+    config = TrainConfig(
+        method,
+        data=Path(),
+        out=Path(),
+        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        search=SEARCH,
+    )
+    torch.manual_seed(seed)
+    networks = build_networks(config, Bicycle())
+    torch.manual_seed(judge)
+    other = build_networks(config, Bicycle())
+    return Agent(
+        "tiny",
+        networks.policy,
+        Bicycle(),
+        observation_config(config),
+        goals=networks.goals,
+        discriminator=other.discriminator,
+        search=SEARCH,
+    )
+
+
+SEGMENTS = [
+    crossing(3, seed=1, steps=7),
+    straight_road(4, seed=0, steps=11),
+    crossing(4, seed=2, steps=9),
+    straight_road(3, seed=3, steps=7),
+]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        for segment in SEGMENTS:
+            writer.append(segment)
+    return SegmentStore(path)
+
+
+@pytest.fixture(scope="module")
+def dataset(store: SegmentStore) -> SceneDataset:
+    return SceneDataset(store, 2, Bicycle(), routes=True)
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    return make_agent()
+
+
+@pytest.fixture(scope="module")
+def env(dataset: SceneDataset, agent: Agent) -> DrivingEnv:
+    return DrivingEnv(dataset.scenes(range(4)), agent.dynamics, agent.observation)
+
+
+def start_of(env: DrivingEnv, branches: int) -> TensorDict:
+    rows = torch.arange(len(env.scenes))[:, None].expand(-1, branches)
+    return env.with_goals(env.start(rows, torch.arange(branches).expand(rows.shape)))
+
+
+def look(env: DrivingEnv, agent: Agent, start: TensorDict, **changes: Any) -> BeamSearchResult:
+    settings: dict[str, Any] = {"seed": 5, "rule": KeepBest(0.5), "prune_every": 3}
+    with torch.no_grad():
+        return search(env, agent.policy, agent.discriminator, start, **{**settings, **changes})
+
+
+def plain(env: DrivingEnv, agent: Agent, start: TensorDict, seed: int = 5) -> Rollouts:
+    return simulate(env, TensorDictSequential(SeededNoise(seed), agent.policy), start)
+
+
+def same(a: Rollouts, b: Rollouts) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def part(rollouts: Rollouts, *index: Any) -> Rollouts:
+    return Rollouts(*(value[index] for value in rollouts))
+
+
+def judged(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> Tensor:
+    """Scores [B, S, T, N] of states [B, S, T + 1, N, 4], the first left out."""
+    steps = states.shape[2] - 1
+    whole = [*start.shape, steps]
+    state = start.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL).unsqueeze(-1).expand(*whole).clone()
+    state.set(keys.STATE, states[:, :, 1:])
+    state.set(keys.STEP, torch.arange(1, steps + 1)[:, None].expand(*whole, 1))
+    with torch.no_grad():
+        assert agent.discriminator is not None
+        return agent.discriminator(env.at(state)).get(keys.SCORE)
+
+
+def test_one_branch_is_a_plain_rollout(env: DrivingEnv, agent: Agent) -> None:
+    start = start_of(env, 1)
+    found = rollouts_of(env, start, look(env, agent, start).trajectories)
+    assert same(found, plain(env, agent, start))
+
+
+def test_independent_branches_are_plain_rollouts(env: DrivingEnv, agent: Agent) -> None:
+    start = start_of(env, 3)
+    found = rollouts_of(env, start, look(env, agent, start, rule=KeepAll()).trajectories)
+    assert same(found, plain(env, agent, start))
+
+
+def test_if_all_score_alike_the_first_half_goes_on(env: DrivingEnv, agent: Agent) -> None:
+    def alike(td: TensorDictBase) -> TensorDictBase:
+        return td.set(keys.SCORE, torch.full(td.get(keys.VALID).shape, 0.3))
+
+    start = start_of(env, 6)
+    found = rollouts_of(env, start, look(env, replace(agent, discriminator=alike), start).trajectories)
+    first = part(plain(env, agent, start[:, :3]), slice(None), [0, 1, 2, 0, 1, 2])
+    assert same(found, first)
+
+
+def test_the_actions_of_every_leaf_lead_where_it_went(env: DrivingEnv, agent: Agent) -> None:
+    start = start_of(env, 4)
+    result = look(env, agent, start)
+    # Some leaf must have been simulated in more than one slot, else nothing was forked.
+    assert (result.slots != result.slots[:, :1]).any()
+    found, actions, now = (
+        rollouts_of(env, start, result.trajectories),
+        result.trajectories[keys.ACTION],
+        start,
+    )
+    for t in range(actions.shape[2]):
+        now = step_mdp(env.step(now.clone(False).set(keys.ACTION, actions[:, :, t])))
+        assert torch.equal(now[keys.STATE], found.state[:, :, t + 1])
+        assert torch.equal(now[keys.COLLISION].squeeze(-1), found.collision[:, :, t])
+        assert torch.equal(now[keys.OFFROAD].squeeze(-1), found.offroad[:, :, t])
+
+
+def test_what_the_search_scored_is_what_the_discriminator_says_of_the_leaves(
+    env: DrivingEnv, agent: Agent
+) -> None:
+    start = start_of(env, 4)
+    result = look(env, agent, start, keep_tree=True)
+    found = rollouts_of(env, start, result.trajectories)
+    assert result.tree is not None
+    tree = torch.cat([start[keys.STATE][:, :, None], result.tree[("next", *keys.STATE)]], 2)
+    counted = found.counted.any(-1)
+    for states, scores in ((found.state, result.scores), (tree, result.simulated_scores)):
+        expected = judged(env, agent, start, states)
+        torch.testing.assert_close(scores[counted], expected[counted], atol=1e-6, rtol=1e-5)
+        assert (scores[~counted] == ENDED).all()
+        assert scores[counted].min() > ENDED / 2
+    assert not counted.all()
+
+
+def test_low_scores_survive(env: DrivingEnv, agent: Agent) -> None:
+    result = look(env, agent, start_of(env, 4), keep_tree=True)
+    # Totals by hand: the worst moment of each agent in the period, added up.
+    for period in range(result.totals.shape[1]):
+        steps = slice(3 * period, 3 * period + 3)
+        total = result.simulated_scores[:, :, steps].amax(2).sum(-1)
+        torch.testing.assert_close(result.totals[:, period], total)
+        kept = total.argsort(dim=-1, stable=True)[:, [0, 1, 0, 1]]
+        assert torch.equal(result.parents[:, period], kept)
+
+
+def test_an_agents_goal_is_that_of_its_tree_in_every_branch(env: DrivingEnv, agent: Agent) -> None:
+    """What the policy is shown after forks is still the route of the start."""
+    seen = []
+
+    class Spy(torch.nn.Module):
+        def forward(self, td: TensorDictBase) -> TensorDictBase:
+            seen.append(td.get(keys.GOAL).clone())
+            return td
+
+    start = start_of(env, 4)
+    assert agent.policy is not None
+    look(env, replace(agent, policy=TensorDictSequential(_module(Spy()), agent.policy)), start)
+    assert len(seen) == 10
+    assert all(torch.equal(goal, start[keys.GOAL]) for goal in seen)
+
+
+def _module(inner: torch.nn.Module) -> Any:
+    """An inner module that takes the whole TensorDict, where TensorDictSequential takes modules with keys."""
+    inner.in_keys, inner.out_keys = [keys.GOAL], []
+    return inner
+
+
+@pytest.mark.parametrize(("method", "kind"), [("bc_ts", "tree"), *(("bc_ts_h", kind) for kind in KINDS[1:])])
+def test_no_rollout_depends_on_the_batch(store: SegmentStore, kind: Any, method: Any) -> None:
+    agent = make_agent(method=method)
+    one, three = (
+        evaluate(agent, store, EvaluateConfig(search=kind, rollouts=4, trees=2, batch=b)).metrics.rows()
+        for b in (1, 3)
+    )
+    assert one == three
+    assert len({row["ade"] for row in one}) == 4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_rollout_depends_on_the_order_of_segments(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
+    config, order = EvaluateConfig(search=kind, rollouts=4, trees=2), [2, 0, 3, 1]
+    sorted_ = simulated(agent, dataset.scenes(range(4)), config)
+    mixed = simulated(agent, dataset.scenes(order), config)
+    counted = sorted_.counted[order]
+    assert torch.equal(mixed.counted, counted)
+    real = counted.any(-1)
+    for a, b in (
+        (mixed.state[:, :, 1:], sorted_.state[order][:, :, 1:]),
+        (mixed.collision, sorted_.collision[order]),
+    ):
+        assert torch.equal(a[real], b[real])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rollouts_of_a_segment_stay_in_it(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
+    scenes = dataset.scenes(range(4))
+    found = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2))
+    assert found.state.shape == (4, 4, 11, 2, 4)
+    assert found.collision.shape == found.offroad.shape == found.counted.shape == (4, 4, 10, 2)
+    first = scenes.log_state[:, 0].gather(1, scenes.interactive[..., None].expand(4, 2, 5))
+    assert torch.equal(found.state[:, :, 0, :, :3], first[:, None, :, :3].expand(-1, 4, -1, -1))
+    step = (found.state[:, :, 1:, :, :2] - found.state[:, :, :-1, :, :2]).norm(dim=-1)
+    assert step.max() < 6  # 30 m/s; elsewhere in another segment it would be tens of metres
+    ends = torch.tensor([s.num_steps - 1 for s in SEGMENTS])
+    assert torch.equal(found.counted.sum(2), ends[:, None, None].expand(4, 4, 2))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_decides_the_rollouts(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
+    scenes = dataset.scenes([0])
+    a, b, c = (simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=2, seed=s)) for s in (3, 3, 4))
+    assert same(a, b)
+    assert not torch.equal(a.state, c.state)
+
+
+def test_trees_of_one_branch_are_independent_rollouts(dataset: SceneDataset, agent: Agent) -> None:
+    scenes = dataset.scenes(range(4))
+    none = simulated(agent, scenes, EvaluateConfig(search="none", rollouts=3))
+    tree = simulated(agent, scenes, EvaluateConfig(search="tree", rollouts=3, trees=3, branches=1))
+    assert same(none, tree)
+
+
+@pytest.mark.parametrize("kind", ["tree", "oracle"])
+def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
+    scenes = dataset.scenes(range(4))
+    few = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2))
+    many = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=6, trees=3))
+    assert same(few, part(many, slice(None), slice(0, 4)))
+
+
+def test_trees_differ_from_each_other(dataset: SceneDataset, agent: Agent) -> None:
+    found = simulated(agent, dataset.scenes([0]), EvaluateConfig(search="tree", rollouts=4, trees=4))
+    assert len({tuple(x.flatten().tolist()) for x in found.state[0]}) == 4
+
+
+def goals_of(
+    monkeypatch: pytest.MonkeyPatch, agent: Agent, scenes: SceneBatch, config: EvaluateConfig
+) -> tuple[Tensor, Tensor]:
+    """Goals [B, trees, N] drawn on the way, and the states of the rollouts."""
+    found = []
+
+    def noted(*args: Any) -> Tensor:
+        found.append(draw_goals(*args))
+        return found[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "draw_goals", noted)
+        state = simulated(agent, scenes, config).state
+    assert len(found) == 1
+    return found[0], state
+
+
+def test_neither_discriminator_nor_search_touches_the_goals(
+    dataset: SceneDataset, agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = dataset.scenes(range(4))
+    reference, none = goals_of(monkeypatch, agent, scenes, EvaluateConfig(search="none", rollouts=5))
+    assert len(reference[1, :, 0].unique()) > 1  # else there is nothing to bias
+    strict = replace(agent, discriminator=make_agent(judge=1).discriminator)
+    driven = []
+    for kind, judge in (("tree", agent), ("tree", strict), ("oracle", agent), ("best", strict)):
+        trees = 1 if kind == "best" else 5
+        config = EvaluateConfig(search=kind, rollouts=5, trees=trees, branches=3)
+        goals, state = goals_of(monkeypatch, judge, scenes, config)
+        assert torch.equal(goals, reference)
+        driven.append(state)
+    # Each of them does change what survives.
+    assert all(not torch.equal(a, b) for a, b in zip([none, *driven], [*driven, none], strict=True))
+
+
+def test_goals_depend_on_seed_scene_and_tree_alone(env: DrivingEnv, agent: Agent) -> None:
+    tree = torch.arange(40).expand(4, 40)
+    start = env.start(torch.arange(4)[:, None].expand(4, 40), 1000 + tree)
+    whole = draw_goals(env, agent.goals, start, 7, tree)
+    # Another stream (branch), another batch, another order: the same goals.
+    rows = torch.randperm(160, generator=torch.Generator().manual_seed(0))[:50]
+    other = env.start(rows // 40, 3)
+    assert torch.equal(draw_goals(env, agent.goals, other, 7, rows % 40), whole.flatten(0, 1)[rows])
+    assert torch.equal(draw_goals(env, agent.goals, start[2, :3], 7, tree[2, :3]), whole[2, :3])
+    assert not torch.equal(draw_goals(env, agent.goals, start, 8, tree), whole)
+    counts = env.scenes.route_count > 0
+    assert (whole[..., None] == torch.arange(counts.shape[-1])).any(1)[counts].float().mean() > 0.9
+    assert counts.gather(-1, whole.transpose(1, 2)).all()
+
+
+def test_drawing_goals_builds_no_graph(env: DrivingEnv, agent: Agent) -> None:
+    """With gradients enabled a row's rounding would depend on the batch (see ``symphony.modules.in_blocks``)."""
+    modes = []
+    assert agent.goals is not None
+    hook = agent.goals[0].register_forward_pre_hook(lambda *_: modes.append(torch.is_grad_enabled()))
+    start = env.start(torch.arange(4))
+    draw_goals(env, agent.goals, start, 0, torch.zeros(4, dtype=torch.int64))
+    simulated(agent, env.scenes, EvaluateConfig(search="none", rollouts=1))
+    hook.remove()
+    assert modes == [False, False]
+
+
+def test_logged_goals_are_the_logged_routes(
+    dataset: SceneDataset, agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = dataset.scenes(range(4))
+    config = EvaluateConfig(search="none", rollouts=3, logged_goals=True)
+    goals, _ = goals_of(monkeypatch, agent, scenes, config)
+    assert torch.equal(goals, scenes.route_logged[:, None].expand(-1, 3, -1))
+
+
+def test_agents_without_any_route_are_no_error(tmp_path: Path, agent: Agent) -> None:
+    segment = straight_road(3, steps=9)
+    position = segment.position.copy()
+    position[..., 1] += 200
+    with StoreWriter(tmp_path / "store") as writer:
+        writer.append(segment.replace(position=position))
+    result = evaluate(agent, tmp_path / "store", EvaluateConfig(search="tree", rollouts=2, trees=1))
+    assert np.isfinite(result.numbers()["ade"])
+
+
+@pytest.mark.parametrize("branches", [3, 5])
+def test_best_is_the_best_of_independent_rollouts(dataset: SceneDataset, agent: Agent, branches: int) -> None:
+    scenes = dataset.scenes(range(4))
+    config = EvaluateConfig(search="best", rollouts=2, branches=branches, logged_goals=True, seed=5)
+    found = simulated(agent, scenes, config)
+    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
+    start = start_of(env, 2 * branches)
+    every = plain(env, agent, start)
+    scores = judged(env, agent, start, every.state).masked_fill(~every.counted, -torch.inf)
+    total = scores.amax(2).sum(-1).unflatten(1, (2, branches))
+    best = total.argmin(-1) + branches * torch.arange(2)
+    for b in range(4):
+        assert same(part(found, b), part(every, b, best[b]))
+    assert best.unique().numel() > 2
+
+
+def blocked() -> RunSegment:
+    """On a wide road the ego follows two cars that brake to a stand; the first of them is interactive too."""
+    steps, dt = 31, 0.2
+    time = np.arange(steps) * dt
+    x = np.arange(-60, 200, 2.0)
+    line = np.stack([x, 0 * x], -1)
+    road = make_road([line], boundary=[line - [0, 9.0], (line + [0, 9.0])[::-1]])
+    speed = np.stack([np.full(steps, 7.0), np.maximum(0, 7 - 2 * time), np.maximum(0, 6 - 3 * time)])
+    driven = np.cumsum(speed * dt, 1) - speed * dt
+    place = np.array([[0.0], [18.0], [32.0]]) + driven
+    flat = np.zeros_like(place)
+    velocity = np.stack([speed, flat], -1)
+    return make_segment(road, np.stack([place, flat], -1), flat, velocity, dt, "blocked")
+
+
+def test_the_oracle_lowers_what_it_judges() -> None:
+    agent, scenes = make_agent(method="bc_ts"), scene(blocked(), [0, 1])
+
+    def bad(kind: Any) -> tuple[float, float]:
+        """Share of rollouts with a collision, and of agent-steps with a collision or off the road."""
+        found = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=16, trees=2, branches=8))
+        flags = (found.collision | found.offroad) & found.counted
+        return found.collision.any(-1).any(-1).float().mean().item(), flags.float().mean().item()
+
+    none, oracle = bad("none"), bad("oracle")
+    assert none[0] > 0.3
+    assert oracle[0] < 0.7 * none[0]
+    assert oracle[1] < 0.5 * none[1]
+
+
+def test_the_oracle_scores_flags_of_real_agents_alone() -> None:
+    shape = (3, 2)
+    flags = TensorDict(
+        {
+            keys.COLLISION: torch.tensor([[1, 0], [0, 0], [1, 1]]).bool()[..., None],
+            keys.OFFROAD: torch.tensor([[0, 0], [1, 0], [1, 1]]).bool()[..., None],
+            keys.VALID: torch.tensor([[1, 1], [1, 1], [1, 0]]).bool(),
+        },
+        batch_size=shape[:1],
+    )
+    assert flag_score(flags).tolist() == [[1, 0], [1, 0], [1, 0]]
+
+
+def test_kinds_and_sizes_that_do_not_fit_are_refused(store: SegmentStore, agent: Agent) -> None:
+    without = replace(agent, discriminator=None)
+    for kind in ("tree", "best"):
+        with pytest.raises(ConfigError, match="needs an agent with a discriminator"):
+            evaluate(without, store, EvaluateConfig(search=kind))
+    with pytest.raises(ConfigError, match="less than 16 rollouts"):
+        evaluate(agent, store, EvaluateConfig(search="tree", branches=3, trees=2))
+    wrong: list[Callable[[], EvaluateConfig]] = [
+        lambda: EvaluateConfig(rollouts=16, trees=3),
+        lambda: EvaluateConfig(trees=0),
+        lambda: EvaluateConfig(branches=-1),
+        lambda: EvaluateConfig(search="orcale"),  # type: ignore[arg-type]
+    ]
+    for make in wrong:
+        with pytest.raises(ConfigError):
+            make()
