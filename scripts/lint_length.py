@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-FOLDERS = ("src", "tests", "scripts", "recipes", "benchmarks")
+FOLDERS = ("src", "tests", "scripts", "recipes", "examples", "benchmarks")
 LIMIT = 600
 
 

@@ -52,8 +52,8 @@ def track(
 def scenario(steps: int = 20) -> Columns:
     """Three cars, one against the others, and one each of what else there is; 8 steps of history."""
     columns: Columns = {}
-    track(columns, "102", "vehicle", range(steps), CARS["102"], CARS["102"][2], category=2)
-    track(columns, "101", "vehicle", range(steps), CARS["101"], CARS["101"][2], category=3)
+    track(columns, "102", "vehicle", range(steps), CARS["102"], CARS["102"][2], category=3)
+    track(columns, "101", "vehicle", range(steps), CARS["101"], CARS["101"][2], category=2)
     track(columns, "7", "pedestrian", range(2, steps - 2), (50, -6), 1.0)
     track(columns, "8", "cyclist", range(steps), (30, -3), 4.0)
     track(columns, "9", "static", range(3, 5), (40, 11), 0.0, category=0)
@@ -67,7 +67,7 @@ def finished(columns: Columns, steps: int | None = None) -> Columns:
     steps = steps or max(columns["timestep"]) + 1
     same = {
         "scenario_id": NAME,
-        "focal_track_id": "101",
+        "focal_track_id": "102",
         "start_timestamp": 3.15986559459579e17,
         "end_timestamp": 3.15986559459579e17 + 1e8 * (steps - 1),
         "num_timestamps": steps,

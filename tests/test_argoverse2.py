@@ -85,8 +85,8 @@ def test_tracks(tmp_path: Path) -> None:
     assert not segment.position[1, [0, 1, 18, 19]].any()
     assert not segment.position[..., 2].any()
     # The focal track, and then the scored one.
-    assert segment.interest.tolist() == [4]
-    assert segment.predict.tolist() == [4, 5]
+    assert segment.interest.tolist() == [5]
+    assert segment.predict.tolist() == [5, 4]
 
 
 def test_the_order_of_rows_does_not_matter(tmp_path: Path) -> None:
@@ -362,7 +362,7 @@ def rename(name: str, to: str) -> Callable[[Columns], None]:
         (put("start_timestamp", 3.0e17, 2), "start_timestamp", "differs"),
         (put("object_type", "tram"), "object_type", "unknown value 'tram'"),
         (put("object_type", "bus", 3), "object_type", "track 102 has more than one"),
-        (put("object_category", 2, 25), "object_category", "track 101 has more than one"),
+        (put("object_category", 1, 25), "object_category", "track 101 has more than one"),
         (put("object_category", 4), "object_category", "expected 0 … 3"),
         (put("observed", False), "observed", "no step"),
         (put("focal_track_id", "555"), "focal_track_id", "no track"),

@@ -411,6 +411,29 @@ class HalfReads(LinesReader):
         yield self._segment(table, self._lanes(path.with_suffix(".road")), path)
 
 
+class HalfReadsAndTells(HalfReads):
+    def _read(self, path: Path) -> Iterator[Item]:
+        yield from super()._read(path)
+        if not path.read_bytes().endswith(b"\n"):
+            raise DataError("cut short", field="cars")
+
+
+class OnePerLine(HalfReads):
+    """Each car is a record of its own, and those that are gone are not missed."""
+
+    def _segment(self, table: Any, lanes: int, path: Path) -> RunSegment:
+        made = super()._segment(table[:1], lanes, path)
+        return made.replace(segment_id=f"{path.stem}-{table[0, 0]:.0f}")
+
+    def _read(self, path: Path) -> Iterator[Item]:
+        lines = path.read_bytes().split(b"\n")[:-1]
+        for number in range(1, len(lines)):
+            table = np.array([[float(x) for x in lines[number].split()]])
+            yield self._segment(table, self._lanes(path.with_suffix(".road")), path)
+        if len(lines) < 2:
+            raise DataError("no cars", field="cars")
+
+
 class Silent(LinesReader):
     def read(self, path: str | Path) -> Iterator[Item]:
         yield from (item for item in super().read(path) if isinstance(item, RunSegment))
@@ -471,6 +494,7 @@ def test_a_reader_of_a_new_format_conforms(files: list[Path]) -> None:
         (Anonymous, {"source"}),
         (HidesItsMap, {"determinism"}),
         (HalfReads, {"truncated"}),
+        (HalfReadsAndTells, {"truncated"}),
         (Silent, {"truncated", "damaged", "foreign"}),
         (Crashes, {"truncated", "damaged", "foreign"}),
         (BlamesAnother, {"truncated", "damaged", "foreign"}),
@@ -480,6 +504,17 @@ def test_a_reader_of_a_new_format_conforms(files: list[Path]) -> None:
 )
 def test_readers_that_break_a_promise(kind: type[Reader], expected: set[str], files: list[Path]) -> None:
     assert expected <= set(failing(lambda: check_reader(kind(), files, flips=8)).failures)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [(HalfReadsAndTells, "gives a segment that the whole file does not"), (OnePerLine, "no error, though")],
+)
+def test_half_read_files_are_told_from_lost_records(
+    kind: type[Reader], message: str, files: list[Path]
+) -> None:
+    found = failing(lambda: check_reader(kind(), files, flips=0)).failures["truncated"]
+    assert all(message in text for text in found)
 
 
 def test_good_files_that_raise_are_reported(files: list[Path]) -> None:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from symphony.data.generate import (
 from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents, travel, usable
 from symphony.data.sources import sumo
+from symphony.data.sources.sumo import demand, networks, roads
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.trainers.quality import measure, shortfalls
@@ -120,8 +122,10 @@ def test_smaller_standard_set_is_the_beginning_of_the_larger() -> None:
             dataclasses.replace(small.plans[split], segments=large.plans[split].segments)
             == large.plans[split]
         )
+        if small.plans[split] == large.plans[split]:
+            assert small.checksums[split] == large.checksums[split]
     for preset in PRESETS.values():
-        assert set(preset.checksums) == set(SPLITS)
+        assert set(preset.checksums) <= set(SPLITS)
         assert all(len(bytes.fromhex(checksum)) == 32 for checksum in preset.checksums.values())
 
 
@@ -172,13 +176,13 @@ def test_an_interrupted_store_is_continued_to_the_same_end(
     monkeypatch.setattr(StoreWriter, "append", append)
     attempts = 0
     while True:
-        left[0], attempts = attempts % 4, attempts + 1
+        left[0], attempts = 1 + attempts % 4, attempts + 1
         try:
             state = generate(plan, tmp_path / "broken")
             break
         except StoppedError:
             assert not SegmentStore(tmp_path / "broken").report["generation"]["complete"]
-    assert attempts > 8
+    assert attempts > 6
     store = SegmentStore(tmp_path / "broken")
     assert store.ids == want.ids
     assert store.checksum() == want.checksum()
@@ -251,10 +255,12 @@ def test_segments_are_spread_over_the_maps(segments: list[RunSegment]) -> None:
 
 
 @needs_sumo
-@pytest.mark.parametrize(("kind", "seconds", "seed"), [("town", 20, 5), ("ramp", 30, 5), ("random", 20, 5)])
-def test_longer_segments_keep_the_ego_on_the_map(kind: str, seconds: int, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "seconds", "seed"), [("town", 30, 10), ("ramp", 20, 10), ("random", 10, 10)]
+)
+def test_ego_is_on_the_map_throughout(kind: str, seconds: int, seed: int) -> None:
     rule = dataclasses.replace(sumo.crop_rule(kind, seconds), focuses=4, per_focus=1)
-    run = sumo.generate_run(kind, seed, 1.6 * seconds, rule=rule, straight=generation.STRAIGHT)
+    run = sumo.generate_run(kind, seed, 2.0 * seconds, rule=rule, straight=generation.STRAIGHT)
     assert run.segments
     for segment in run.segments:
         usable(segment, 2)
@@ -264,13 +270,22 @@ def test_longer_segments_keep_the_ego_on_the_map(kind: str, seconds: int, seed: 
 
 
 @needs_sumo
-def test_routes_go_straight_on_as_often_as_asked() -> None:
-    """The same roads and drivers; only what the routes prefer differs."""
-    turns = [
-        np.mean([np.ptp(s.heading[a]) > 0.5 for s in run.segments for a in np.flatnonzero(s.valid.all(1))])
-        for run in (sumo.generate_run("random", 1, 45.0, straight=x) for x in (0.05, 20.0))
-    ]
-    assert turns[0] > turns[1] + 0.15
+def test_routes_go_straight_on_as_often_as_asked(tmp_path: Path) -> None:
+    network = roads.read_network(networks.town(np.random.default_rng(3), tmp_path))
+    first, last = network.edge_headings()
+    number = {name: k for k, name in enumerate(network.edge_names)}
+    shares = []
+    for straight in (0.05, 1.0, 20.0):
+        rng = np.random.default_rng(0)
+        made = demand.write_demand(
+            network, rng, tmp_path, 120.0, through=False, sublane=False, straight=straight
+        )
+        turns: list[float] = []
+        for route in ET.parse(made.file).getroot().iter("route"):  # noqa: S314
+            edges = np.array([number[name] for name in route.attrib["edges"].split()])
+            turns += np.abs(np.angle(np.exp(1j * (first[edges[1:]] - last[edges[:-1]])))).tolist()
+        shares.append(np.mean(np.array(turns) < 0.6))
+    assert shares[0] + 0.1 < shares[1] < shares[2] - 0.1
 
 
 @needs_sumo
@@ -285,7 +300,7 @@ def test_crowded_segments_have_enough_interactive_agents() -> None:
     assert any("too few moving" in reason for reason in found.reasons)
 
 
-ARGUMENTS = ["--segments", "10", "--seed", "11", "--kinds", "town,grid"]
+ARGUMENTS = ["--segments", "10", "--seed", "11"]
 
 
 @needs_sumo
@@ -308,7 +323,7 @@ def test_a_killed_run_is_continued_and_workers_change_nothing(
         assert process.returncode == -signal.SIGKILL
     assert main([*command[3:], "--workers", "2", "--json", str(tmp_path / "killed.json")]) == 0
     assert "checksum" in capsys.readouterr().out
-    plan = Plan(10, seed=11, kinds=("town", "grid"))
+    plan = Plan(10, seed=11)
     state = generate(plan, tmp_path / "whole")
     store, whole = SegmentStore(out), SegmentStore(tmp_path / "whole")
     assert store.checksum() == whole.checksum()

@@ -157,15 +157,11 @@ def test_metrics_are_strict_json(trained: Trained, method: str) -> None:
         json.loads(line, parse_constant=refuse)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path, method: str) -> None:
-    again = train(config(method, store, tmp_path / "again"))
-    assert equal(weights(again), weights(trained(method)))
-    if method == "bc_ts_h":
-        other = weights(train(config(method, store, tmp_path / "other", seed=1)))
-        assert not any(
-            equal(of(n, other), of(n, weights(again))) for n in ("policy", "goals", "discriminator")
-        )
+def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path) -> None:
+    first = weights(trained("bc_ts_h"))
+    assert equal(weights(train(config("bc_ts_h", store, tmp_path / "again"))), first)
+    other = weights(train(config("bc_ts_h", store, tmp_path / "other", seed=1)))
+    assert not any(equal(of(n, other), of(n, first)) for n in ("policy", "goals", "discriminator"))
 
 
 def stopped(run: Path, out: Path, step: int) -> None:
@@ -281,7 +277,7 @@ def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:
             SearchConfig(**bad)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", METHODS[:3])
 def test_runs_may_share_one_dataset(
     store: Path, dataset: SceneDataset, tmp_path: Path, trained: Trained, method: Any
 ) -> None:

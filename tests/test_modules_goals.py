@@ -199,7 +199,7 @@ def test_it_learns_which_route_is_taken():
     loss.set_keys(label=GOAL)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     first = loss(td)
-    for _ in range(80):
+    for _ in range(50):
         optimizer.zero_grad()
         last = loss(td)
         last["loss_goal"].backward()

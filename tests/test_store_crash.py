@@ -1,7 +1,10 @@
-"""A writer that dies at any moment loses no segment that was on record, and none comes twice."""
+"""A writer that dies at any moment loses no segment that was on record, and none comes twice; readers of other
+processes never see half of one.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import signal
@@ -20,6 +23,7 @@ from helpers_segments import random_segment
 from helpers_store import files, fill, hashes, unlike
 from symphony.data.segment import RunSegment, content_hash
 from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import DataError
 
 
 @pytest.fixture
@@ -155,3 +159,61 @@ def test_kill_9_loses_nothing_and_repeats_nothing(folder: Path) -> None:
         count = len(store)
     assert store.ids == [f"r{k}" for k in range(count)]
     assert hashes(store) == [content_hash(random_segment(f"r{k}", seed=k)) for k in range(count)]
+
+
+def watch(path: Path, count: int) -> list[int]:
+    """Open a store again and again until it holds so many segments, verifying all; how many it held each time."""
+    seen = [0]
+    while seen[-1] < count:
+        store = SegmentStore(path)
+        store.verify()
+        assert store.ids == [f"r{k}" for k in range(len(store))]
+        if len(store) != seen[-1]:
+            seen.append(len(store))
+    return seen
+
+
+def test_processes_read_while_a_writer_appends(folder: Path) -> None:
+    count = 60
+    fill(folder, [])
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        results = [pool.apply_async(watch, (folder, count)) for _ in range(2)]
+        fill(folder, unlike(count // 2), append=True)
+        fill(folder, unlike(count - count // 2, start=count // 2), append=True)
+        for result in results:
+            seen = result.get(timeout=60)
+            assert seen[-1] == count
+            assert seen == sorted(seen)
+    assert hashes(SegmentStore(folder)) == hashes(unlike(count))
+
+
+@pytest.mark.parametrize("keep", [0, 2, 4])
+def test_the_last_segments_can_be_taken_back(folder: Path, tmp_path: Path, keep: int) -> None:
+    fill(folder, unlike(4))
+    fill(tmp_path / "kept", unlike(keep))
+    with StoreWriter(folder, append=True, keep=keep) as writer:
+        assert len(writer) == keep
+        for file in files(folder):
+            assert file.read_bytes() == (tmp_path / "kept" / file.relative_to(folder)).read_bytes()
+        for segment in unlike(5 - keep, start=keep):
+            writer.append(segment)
+    assert hashes(SegmentStore(folder)) == hashes(unlike(5))
+    with pytest.raises(DataError, match="index holds 5 records, 6 are in use"):
+        StoreWriter(folder, append=True, keep=6)
+
+
+def test_copying_a_segment_is_appending_it(folder: Path, tmp_path: Path) -> None:
+    found = [*unlike(3), unlike(1)[0].replace(segment_id="same map")]
+    fill(folder, found)
+    with StoreWriter(folder, append=True) as writer:
+        writer.append(random_segment("tagged", seed=9), tags={"kind": "merge"})
+    store = SegmentStore(folder)
+    with StoreWriter(tmp_path / "copy") as writer:
+        assert [writer.copy(store, k) for k in range(5)] == list(range(5))
+        assert [writer.index_of(name) for name in store.ids] == list(range(5))
+        with pytest.raises(DataError, match="segment r1, field segment_id: a segment of this name"):
+            writer.copy(store, 1)
+    for file in files(folder):
+        assert file.read_bytes() == (tmp_path / "copy" / file.relative_to(folder)).read_bytes()
+    assert SegmentStore(tmp_path / "copy").tags(4) == {"kind": "merge"}
+    assert SegmentStore(tmp_path / "copy").num_maps == 4

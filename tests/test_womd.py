@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,11 @@ def refuse(path: Path, scenario: womd_pb2.Scenario) -> DataError:
 def test_readers_are_found_by_name() -> None:
     assert readers() == ("argoverse2", "commonroad", "womd")
     for name in readers():
-        assert get_reader(name).name == name
+        if name != "argoverse2" or importlib.util.find_spec("pyarrow"):
+            assert get_reader(name).name == name
     with pytest.raises(ConfigError, match="did you mean 'womd'"):
         get_reader("wmod")
-    with pytest.raises(ConfigError, match="known: commonroad, womd"):
+    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, womd"):
         get_reader("?")
     with pytest.raises(ConfigError, match="'egoes'"):
         get_reader("commonroad", egoes="all")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, train
+from symphony.cli import data, demo, evaluate, plot, train
 from symphony.errors import ConfigError, SymphonyError
 
 __all__ = ["main"]
@@ -30,6 +30,7 @@ app = tyro.extras.SubcommandApp()
 app.command(data.app, name="data", help=data.__doc__)
 app.command(name="train")(train.Train)
 app.command(name="evaluate")(evaluate.Evaluate)
+app.command(plot.app, name="plot", help=plot.__doc__)
 app.command(name="demo")(demo.Demo)
 
 

@@ -22,11 +22,14 @@ app.command(name="quality")(Quality)
 class Convert:
     """Convert logs into a store of run segments.
 
-    A record that can't be used is skipped, counted and reported. A new store appears once it is complete.
+    A record that can't be used is skipped, counted and reported. The store appears, or changes, once everything is
+    converted; until then the work lies in OUT.partial. A conversion that was interrupted or killed goes on where it
+    stopped when the same command is given again.
     """
 
     format: tyro.conf.Positional[Literal["womd", "commonroad", "argoverse2"]]
-    """Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML)."""
+    """Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion forecasting
+    (Parquet, each with its map beside it)."""
     files: Annotated[
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="FILE ...", help_behavior_hint="(required)"),
@@ -45,6 +48,11 @@ class Convert:
     moving vehicles around it, or one for every moving vehicle seen throughout."""
     append: bool = False
     """Add to a store that exists; what it holds already is left as it is."""
+    workers: int = 1
+    """Processes that convert files; the store does not depend on their number."""
+    engine: Literal["local", "ray"] = "local"
+    """Where they are: on this machine, or on the Ray cluster at RAY_ADDRESS (else a Ray on this machine), whose
+    machines must share the files and the folder of the store."""
 
     def __post_init__(self) -> None:
         if not self.files:
@@ -55,6 +63,8 @@ class Convert:
             raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
         if not self.smooth >= 0:
             raise ConfigError(f"--smooth must not be negative, is {self.smooth}")
+        if self.workers < 1:
+            raise ConfigError(f"--workers must be at least 1, is {self.workers}")
         if self.egos == "all" and self.format != "commonroad":
             raise ConfigError(f"--egos all is for commonroad; {self.format} names its ego vehicle")
 
@@ -74,17 +84,23 @@ class Convert:
                 skipped = len(so_far.skipped)
                 bar.update(task, completed=done, total=total, converted=so_far.converted, skipped=skipped)
 
-            report = convert(
-                self.format,
-                self.files,
-                self.out,
-                rate=self.rate,
-                interactive=self.interactive,
-                smooth=self.smooth,
-                append=self.append,
-                reader_options={"egos": self.egos} if self.format == "commonroad" else None,
-                progress=show,
-            )
+            try:
+                report = convert(
+                    self.format,
+                    self.files,
+                    self.out,
+                    rate=self.rate,
+                    interactive=self.interactive,
+                    smooth=self.smooth,
+                    append=self.append,
+                    workers=self.workers,
+                    engine=self.engine,
+                    reader_options={"egos": self.egos} if self.format == "commonroad" else None,
+                    progress=show,
+                )
+            except KeyboardInterrupt:
+                bar.console.print("What is done is kept: the same command goes on with it.", highlight=False)
+                raise
         _print_report(report, self.out)
 
 
@@ -177,9 +193,24 @@ def _print_report(report: Any, out: Path) -> None:
     table.add_row("converted", str(report.converted))
     if report.present:
         table.add_row("there already", str(report.present))
-    for reason, count in report.reasons.items():
+    for reason, count in _exclusions(report.exclusions):
+        table.add_row(f"excluded: {reason}", str(count))
+    for reason, count in report.problems.items():
         table.add_row(f"skipped: {escape(reason)}", str(count))
     Console().print(table)
+
+
+def _exclusions(found: dict[str, int]) -> list[tuple[str, int]]:
+    """The paper's exclusions that left something out."""
+    from symphony.data.selection import EXCLUSIONS
+
+    return [(EXCLUSIONS[name], count) for name, count in found.items() if count]
+
+
+def _unfinished_row(found: dict[str, int] | None) -> list[tuple[str, str]]:
+    if found is None:
+        return []
+    return [("unfinished", f"a conversion that adds to it: {found['files']} of {found['of']} files done")]
 
 
 def _print_info(found: dict[str, Any]) -> None:
@@ -209,8 +240,11 @@ def _print_info(found: dict[str, Any]) -> None:
         *_interactive_rows(found.get("interactive")),
         ("size on disk", f"{found['bytes'] / 2**20:.1f} MiB"),
         ("checksum", f"{found['checksum'][:16]}… (in full with --json)"),
-        ("skipped", f"{found['skipped']}"),
-        *((f"  {reason}", str(count)) for reason, count in found["reasons"].items()),
+        ("excluded", f"{sum(found['exclusions'].values())}"),
+        *((f"  {reason}", str(count)) for reason, count in _exclusions(found["exclusions"])),
+        ("skipped", f"{sum(found['problems'].values())}"),
+        *((f"  {reason}", str(count)) for reason, count in found["problems"].items()),
+        *_unfinished_row(found["unfinished"]),
     ]
     table = Table(
         show_header=False, box=None, pad_edge=False, title=escape(found["path"]), title_style="bold"

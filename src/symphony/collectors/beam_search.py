@@ -193,7 +193,7 @@ def _simulate(
         now = env.step_mdp(stepped)
         records.append(stepped if keep is None else stepped.select(*keep))
         scores.append(score_state(env, score, stepped, now))
-        del stepped
+        del stepped  # or one more set of observations lives through the next step
     joined = torch.stack(scores, -2)
     totals = aggregate(joined)
     if totals.shape != now.shape:

@@ -239,10 +239,10 @@ def info(path: str | Path) -> dict[str, Any]:
     """What a store holds, as JSON can hold it.
 
     Returns:
-        Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each) and
-        ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions``
-        (how many of these under each of the paper's), and ``unfinished`` (None, or how far a conversion is that
-        will add to the store).
+        Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each),
+        ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
+        many of these under each of the paper's), ``problems`` (the reasons of the others) and ``unfinished``
+        (None, or how far a conversion is that will add to the store).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -260,6 +260,7 @@ def info(path: str | Path) -> dict[str, Any]:
         "skipped": len(report.skipped),
         "exclusions": report.exclusions,
         "reasons": report.reasons,
+        "problems": report.problems,
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),
     }

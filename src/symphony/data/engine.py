@@ -98,39 +98,51 @@ def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int) -> 
         lifeline.close()
 
 
-_stopped = threading.Event()  # in a worker: the parent wants no more results
+class _Worker:
+    """State of this process as a worker."""
+
+    busy = False  # with a task
+    stopped = False  # the parent wants no more results
 
 
 def _begin_worker(lifeline: Connection) -> None:
     """Stop when the parent closes its end of the pipe, and end when it ends, in whatever way."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # outside of tasks: a result half sent would hang the parent
+    signal.signal(signal.SIGINT, _interrupt)
     _mask(signal.SIG_UNBLOCK)
+    threading.Thread(target=_watch, args=(lifeline,), daemon=True).start()
 
-    def wait() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            lifeline.recv_bytes()
-        _stopped.set()
-        if hasattr(signal, "pthread_kill"):  # a real signal also ends a sleep or a read
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        else:
-            _thread.interrupt_main()
-        parent = multiprocessing.parent_process()
-        if parent is not None:
-            parent.join()
-        os._exit(1)
 
-    threading.Thread(target=wait, daemon=True).start()
+def _interrupt(number: int, frame: object) -> None:
+    # Only a task, once: a result that is half sent would hang the parent.
+    if _Worker.busy:
+        _Worker.busy = False
+        raise KeyboardInterrupt
+
+
+def _watch(lifeline: Connection) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        lifeline.recv_bytes()
+    _Worker.stopped = True
+    parent = multiprocessing.parent_process()
+    while parent is not None and parent.is_alive():
+        if _Worker.busy:
+            if hasattr(signal, "pthread_kill"):  # a real signal also ends a sleep or a read
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            else:
+                _thread.interrupt_main()
+        parent.join(0.05)  # and again: a signal just before a sleep would not end it
+    os._exit(1)
 
 
 def _interruptible(function: Callable[[T], R], task: T) -> R:
     """One task in a worker."""
     try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if _stopped.is_set():
+        _Worker.busy = True
+        if _Worker.stopped:
             raise KeyboardInterrupt
         return function(task)
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _Worker.busy = False
 
 
 def _mask(how: int) -> None:
@@ -141,8 +153,8 @@ def _mask(how: int) -> None:
 @contextlib.contextmanager
 def _no_interrupts() -> Iterator[None]:
     """Put off interrupts; processes started inside put them off too, and do not complain while they start."""
-    _mask(signal.SIG_BLOCK)
     try:
+        _mask(signal.SIG_BLOCK)
         yield
     finally:
         _mask(signal.SIG_UNBLOCK)

@@ -1,5 +1,17 @@
-"""Pictures of run segments and rollouts."""
+"""Pictures of run segments, rollouts, searches and training."""
 
+from symphony.render.curves import plot_curves
+from symphony.render.genealogy import plot_genealogy, plot_search
 from symphony.render.plots import plot_grid, plot_rollout, plot_segment
+from symphony.render.tree import SearchTree, plot_tree
 
-__all__ = ["plot_grid", "plot_rollout", "plot_segment"]
+__all__ = [
+    "SearchTree",
+    "plot_curves",
+    "plot_genealogy",
+    "plot_grid",
+    "plot_rollout",
+    "plot_search",
+    "plot_segment",
+    "plot_tree",
+]

@@ -91,7 +91,9 @@ def draw_genealogy(axes: Axes, tree: SearchTree, dt: float, start: int) -> None:
     title: dict[str, Any] = {"fontweight": "bold", "color": INK, "loc": "left", "pad": 20}
     axes.set_title("The same branches over time", fontsize=font(axes, 11), **title)
     place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": "#5B616B"}
-    axes.annotate("coloured by the agent that scores highest", (0, 1), (0, 6), fontsize=font(axes, 8.5), **place)
+    axes.annotate(
+        "coloured by the agent that scores highest", (0, 1), (0, 6), fontsize=font(axes, 8.5), **place
+    )
 
 
 def plot_search(
@@ -120,7 +122,12 @@ def plot_search(
     add_color_bar(right, tree)
     columns = max(3, int(figure.get_figwidth() / 2.6))
     figure.legend(
-        handles=entries, loc="outside lower left", ncols=columns, fontsize=8.5, frameon=False, handlelength=1.8
+        handles=entries,
+        loc="outside lower left",
+        ncols=columns,
+        fontsize=8.5,
+        frameon=False,
+        handlelength=1.8,
     )
     save(figure, file)
     return figure

@@ -281,6 +281,7 @@ def _draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str)
 
 
 def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[Any]) -> None:
+    """Draw those of the agents [K] that are seen at a step, in grey."""
     shown = agents[segment.valid[agents, step]]
     if len(shown):
         place = segment.position[shown, step, :2], segment.heading[shown, step], segment.size[shown]
@@ -302,6 +303,7 @@ def colors_of(segment: RunSegment, agents: Any) -> list[str]:
 
 
 def describe(segment: RunSegment) -> str:
+    """Source, duration, rate and agents of a segment, for a caption."""
     duration = (segment.num_steps - 1) * segment.dt
     return (
         f"{segment.source}   ·   {duration:.1f} s at {1 / segment.dt:g} Hz   ·   {segment.num_agents} agents"
@@ -309,6 +311,8 @@ def describe(segment: RunSegment) -> str:
 
 
 def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
+    """Legend entries of agents in colour."""
+
     def label(agent: int) -> str:
         role = "ego" if agent == segment.ego else "interactive"
         return f"{role} {AgentType(segment.agent_type[agent]).name.lower()} {segment.agent_id[agent]}"
@@ -318,4 +322,5 @@ def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
 
 
 def playback_entry(label: str = "playback") -> Patch:
+    """Legend entry of the agents in grey."""
     return Patch(color=PLAYBACK, label=label)

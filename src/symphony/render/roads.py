@@ -43,9 +43,7 @@ def draw_roads(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
     # Closes the slits where one lane meets the next at an angle.
     surface = surface.buffer(SLIT, quad_segs=2).buffer(-SLIT, quad_segs=2)
     for polygon in () if surface.is_empty else shapely.get_parts(surface):
-        axes.add_patch(
-            PathPatch(outline(polygon), facecolor=ROAD, edgecolor="none", zorder=1, gid="surface")
-        )
+        axes.add_patch(PathPatch(outline(polygon), facecolor=ROAD, edgecolor="none", zorder=1, gid="surface"))
     entries = _draw_marks(axes, road, view)
     lanes = [road.lanes[k][:, :2] for k in _visible(road.lanes, view)]
     axes.add_collection(

@@ -12,9 +12,10 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_hex, to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from symphony.data.segment import RunSegment
@@ -68,8 +69,8 @@ class _Stroke:
 
 STROKES = (
     _Stroke("branch: reaches the end", 2.4, 0.0, 9.0),
-    _Stroke("branch: survived, died out later", 1.2, 0.35, 8.6),
-    _Stroke("branch: pruned", 0.8, 0.5, 8.2),
+    _Stroke("branch: survived, died out later", 1.3, 0.2, 8.6),
+    _Stroke("branch: pruned", 0.9, 0.4, 8.2),
 )
 
 
@@ -236,7 +237,15 @@ def draw_tree(
         paths = np.stack([tree.before(position, first), position], 2)
         draw_branches(axes, tree, paths, tree.score[:, :, n], str(agent))
         shown = np.where(logged[rank, :, None], log[rank], np.nan)
-        axes.plot(*shown.T, color=INK, linestyle=LOG_DASHES, linewidth=1.1, zorder=9.4, gid=f"log-{agent}")
+        # Dark dashes on dark branches need a light edge.
+        style: dict[str, Any] = {"linestyle": LOG_DASHES, "linewidth": 1.2, "zorder": 9.4}
+        axes.plot(
+            *shown.T,
+            color=INK,
+            path_effects=[withStroke(linewidth=2.8, foreground=ROAD)],
+            **style,
+            gid=f"log-{agent}",
+        )
         if logged[rank, 0]:
             box = log[rank, :1], segment.heading[[agent], start], segment.size[[agent]]
             draw_boxes(axes, *box, color, gid=f"box-{agent}")
@@ -248,7 +257,9 @@ def draw_tree(
     frame(axes, view, title or segment.segment_id, subtitle)
     lines = [Line2D([], [], color=INK, linestyle=LOG_DASHES, linewidth=1.1, label="log")]
     if any(line is not None for line in tree.routes):
-        lines.append(Line2D([], [], color=_pale(AGENT_COLORS[0], BAND), linewidth=7, label="route it follows"))
+        lines.append(
+            Line2D([], [], color=_pale(AGENT_COLORS[0], BAND), linewidth=7, label="route it follows")
+        )
     strokes = [_stroke_entry(kind) for kind in np.unique(tree.fate)]
     marks = filter(None, [forks, *events])
     playback = playback_entry("playback, at the start")
@@ -264,7 +275,7 @@ def _log(segment: RunSegment, tree: SearchTree, start: int) -> tuple[NDArray[Any
 def score_colors(tree: SearchTree) -> tuple[Colormap, Normalize]:
     """Colour map, dark to bright, and scale of the scores; a few extreme ones don't squeeze the others."""
     # The bright end of the map can't be seen on white.
-    shade = LinearSegmentedColormap.from_list("score", colormaps["plasma"](np.linspace(0.0, 0.82, 64)))
+    shade = LinearSegmentedColormap.from_list("score", colormaps["plasma"](np.linspace(0.0, 0.78, 64)))
     score = tree.score[..., tree.real]
     score = score[np.isfinite(score)]
     low, high = np.percentile(score, [1, 99]).tolist() if len(score) else (0.0, 1.0)
@@ -347,6 +358,7 @@ def add_color_bar(axes: Axes, tree: SearchTree) -> None:
     bar = figure.colorbar(ScalarMappable(norm, shade), cax=slot, extend="both")
     bar.set_label(SCORE_LABEL, color=INK, fontsize=font(axes, 9))
     slot.tick_params(labelsize=font(axes, 8), color=INK, labelcolor=INK)
+    bar.outline.set(edgecolor="#C8C4BC")
     slot.set_gid("scores")
 
 
@@ -364,5 +376,7 @@ def _stroke_entry(kind: int) -> Line2D:
     return Line2D([], [], color=_pale(INK, stroke.pale), linewidth=stroke.width, label=stroke.label)
 
 
-def _pale(color: str, share: float) -> NDArray[np.float64]:
-    return share * np.asarray(to_rgb(ROAD)) + (1 - share) * np.asarray(to_rgb(color))
+def _pale(color: str, share: float) -> str:
+    """The colour with a share of white, opaque, so that overlaps of one thing with itself don't show."""
+    red, green, blue = share * np.asarray(to_rgb(ROAD)) + (1 - share) * np.asarray(to_rgb(color))
+    return to_hex((red, green, blue))

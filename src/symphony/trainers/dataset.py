@@ -187,7 +187,8 @@ class SceneDataset:
         ordinal = torch.arange(len(lengths))
         action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
         agent = torch.cat([e.agent for e in found])[row]
-        taken = logged_routes([table for e in found for table in e.routes], row) if self.routes else None
+        tables = [table for expert in found for table in expert.routes]
+        taken = logged_routes(tables, row) if observation.route else None
         return expert_batch(
             self.scenes(items).to(device),
             item.to(device),

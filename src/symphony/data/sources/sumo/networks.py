@@ -362,7 +362,7 @@ def random(rng: np.random.Generator, folder: Path) -> Path:
 def _grown(rng: np.random.Generator, folder: Path) -> tuple[Point, list[tuple[int, int]]]:
     """Nodes [N, 2] and the two-way streets between them, from a random network; no street ends nowhere."""
     nearest = rng.uniform(65, 85)
-    arguments = ["--rand", "--rand.iterations", str(rng.integers(50, 90)), "--rand.num-tries", "60"]
+    arguments = ["--rand", "--rand.iterations", str(rng.integers(25, 50)), "--rand.num-tries", "60"]
     arguments += ["--rand.min-distance", f"{nearest:.2f}", "--rand.max-distance", f"{nearest * 1.8:.2f}"]
     arguments += ["--rand.min-angle", "65", "--rand.connectivity", "0.98"]
     for arms, chance in enumerate((0, 0, 5, 10, 1, 0), start=1):
