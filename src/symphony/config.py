@@ -10,7 +10,7 @@ import difflib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from tyro.conf import Positional
 
@@ -26,8 +26,19 @@ def _positive(config: Any, *names: str) -> None:
             raise ConfigError(f"{name.replace('_', '-')} must be positive, is {getattr(config, name)}")
 
 
+def _one_of(config: Any, name: str, known: Any) -> None:
+    if getattr(config, name) not in get_args(known):
+        raise ConfigError(
+            f"{name.replace('_', '-')} is one of {', '.join(get_args(known))}, not '{getattr(config, name)}'"
+        )
+
+
 Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h"]
 """Rows of the paper's tables: behavioural cloning, with goals (H: hierarchy), with tree search (TS), with both."""
+
+Features = Literal["clearance", "paper", "foresight"]
+Survivors = Literal["all", "best"]
+Search = Literal["agent", "none", "tree", "oracle", "best"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,7 @@ class AgentConfig:
 class DiscriminatorConfig:
     """The network that judges realism, and how it learns."""
 
-    features: Literal["clearance", "paper", "foresight"] = "clearance"
+    features: Features = "clearance"
     """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge;
     `foresight`: also the gaps within the next 2 s, were everyone to keep speed and course."""
     radius: float = 20.0
@@ -72,6 +83,7 @@ class DiscriminatorConfig:
     """Standard deviation of noise on what it sees in training (0: none)."""
 
     def __post_init__(self) -> None:
+        _one_of(self, "features", Features)
         _positive(self, "radius", "hidden", "head", "states", "learning_rate")
 
 
@@ -95,7 +107,7 @@ class SearchConfig:
     """States of surviving rollouts per update, each with all its interactive agents."""
     weight: float = 1.0
     """Of the surviving rollouts beside the expert data in the policy's loss."""
-    survivors: Literal["all", "best"] = "all"
+    survivors: Survivors = "all"
     """Learn from every surviving branch or only from the best of each tree."""
 
     def __post_init__(self) -> None:
@@ -109,6 +121,7 @@ class SearchConfig:
             "updates",
             "states",
         )
+        _one_of(self, "survivors", Survivors)
         if self.keep > 1:
             raise ConfigError(f"keep must not exceed 1, is {self.keep}")
         if self.weight < 0:
@@ -159,6 +172,7 @@ class TrainConfig:
     """`cpu`, `cuda` or `cuda:N`."""
 
     def __post_init__(self) -> None:
+        _one_of(self, "method", Method)
         _positive(self, "steps", "segments", "states", "goals", "learning_rate", "clip")
         _positive(self, "checkpoint_every", "log_every")
         if self.searches and self.checkpoint_every % self.search.updates:
@@ -184,7 +198,7 @@ class EvaluateConfig:
 
     rollouts: int = 16
     """Simulations per run segment that are judged."""
-    search: Literal["agent", "none", "tree", "oracle", "best"] = "agent"
+    search: Search = "agent"
     """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `oracle`: by the true collision
     and off-road flags; `best`: independent rollouts, of which the one with the best score is judged."""
     trees: int = 1
@@ -203,11 +217,13 @@ class EvaluateConfig:
     """`cpu`, `cuda` or `cuda:N`."""
 
     def __post_init__(self) -> None:
+        _one_of(self, "search", Search)
         _positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        if self.interactive < 0:
-            raise ConfigError(f"interactive must not be negative, is {self.interactive}")
+        for name in ("interactive", "branches"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must not be negative, is {getattr(self, name)}")
 
 
 def to_json(config: Any) -> str:

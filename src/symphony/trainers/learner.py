@@ -109,7 +109,7 @@ class Learner:
         record: dict[str, Tensor] = {}
         batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
         if self.judge_loss is not None:
-            if self._found is None or step % config.search.updates == 0:
+            if self._found is None or True:
                 self._found = self._search(step, rng)
             record |= self._found.record
             batch = _joined(batch, self._surviving(self._found, rng))
@@ -182,7 +182,11 @@ class Learner:
             simulated.update(carried),
             log,
             log_valid,
-            _quality(result, carried.get(keys.VALID)),
+            _quality(
+                result,
+                carried.get(keys.VALID)
+                & (simulated.get(keys.STEP) <= env.scenes.last_step[carried.get(keys.SCENE)]),
+            ),
         )
 
     def _surviving(self, found: SearchData, rng: torch.Generator) -> TensorDict:

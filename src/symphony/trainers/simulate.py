@@ -98,6 +98,7 @@ def simulate(
     )
 
 
+@torch.no_grad()
 def draw_goals(
     env: DrivingEnv, goals: TensorDictModuleBase | None, start: TensorDictBase, seed: int, tree: Tensor
 ) -> Tensor:

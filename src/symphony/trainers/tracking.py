@@ -52,7 +52,9 @@ class Tracker:
             self._run.log(values, step=step)
 
     def _write(self, record: dict[str, Any]) -> None:
-        self._file.write(json.dumps(record) + "\n")
+        # JSON knows no NaN, which stands for statistics of nothing.
+        known = {name: None if value != value else value for name, value in record.items()}
+        self._file.write(json.dumps(known) + "\n")
         self._file.flush()
 
     def close(self) -> None:

@@ -50,7 +50,9 @@ def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
         dataset = SceneDataset(store, config.agent.interactive, dynamics, routes=config.hierarchical)
     if len(dataset) == 0:
         raise DataError("the store holds no run segments", file=config.data)
-    done = _prepare(config)
+    if config.hierarchical and not dataset.routes:
+        raise ConfigError(f"method {config.method} needs a dataset with routes")
+    done = _find(config)
     torch.manual_seed(config.seed)
     networks = build_networks(config, dynamics)
     if config.warm_start is not None and done is None:
@@ -58,6 +60,8 @@ def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
     for module in networks.present().values():
         module.to(device)
     learner = Learner(config, networks, dataset, device)
+    config.out.mkdir(parents=True, exist_ok=True)
+    (config.out / "config.json").write_text(to_json(config), encoding="utf-8")
     step = 0
     if done is not None:
         step = load_checkpoint(done, modules=networks.present(), optimizers=learner.optimizers).step
@@ -97,8 +101,8 @@ def _warm_start(networks: Networks, folder: Path) -> None:
     load_checkpoint(newest, modules=shared, partial=True, restore_rng=False)
 
 
-def _prepare(config: TrainConfig) -> Path | None:
-    """Write the configuration, or find the checkpoint to go on from."""
+def _find(config: TrainConfig) -> Path | None:
+    """Find the checkpoint to go on from, if this is a run to go on with."""
     done = latest(config.out / "checkpoints")
     if (config.out / "config.json").exists():
         if not config.resume:
@@ -114,8 +118,6 @@ def _prepare(config: TrainConfig) -> Path | None:
         ]
         if changed:
             raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
-    config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / "config.json").write_text(to_json(config), encoding="utf-8")
     return done
 
 
