@@ -31,11 +31,13 @@ KINDS: dict[str, dict[str, Any]] = {
     "none": {"search": "none"},
     "tree": {"search": "tree"},
     "trees4": {"search": "tree", "trees": 4},
+    "tree64": {"search": "tree", "branches": 64},
     "best": {"search": "best", "rollouts": 1},
     "oracle": {"search": "oracle"},
 }
 """Ways to simulate: independent rollouts; the leaves of one tree; the best quarter of the leaves of four trees; the best
-of sixteen independent rollouts by the discriminator; one tree pruned by the true flags.
+of sixteen independent rollouts by the discriminator; the best sixteen leaves of a tree of 64 branches; one tree pruned by
+the true flags.
 """
 DEFAULT_KINDS = {"bc": ("none",), "bc_h": ("none",)}
 COLUMNS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
@@ -71,7 +73,9 @@ def learn(arguments: argparse.Namespace) -> None:
                     states=512 if searches else 1024,
                     learning_rate=arguments.search_rate if searches else 1e-3,
                     search=SearchConfig(weight=arguments.weight, survivors=arguments.survivors),
-                    discriminator=DiscriminatorConfig(features=arguments.features),
+                    discriminator=DiscriminatorConfig(features=arguments.features)
+                    if searches
+                    else DiscriminatorConfig(),
                     warm_start=before,
                     checkpoint_every=500,
                     resume=(out / "config.json").is_file(),

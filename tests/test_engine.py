@@ -178,6 +178,7 @@ def ray() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("RAY_ADDRESS", raising=False)
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # for its workers
+        patch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
         assert list(ordered_map(slow_square, [2], workers=2, engine="ray")) == [4]
     yield
     module.shutdown()

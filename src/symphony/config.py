@@ -37,6 +37,7 @@ Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h"]
 """Rows of the paper's tables: behavioural cloning, with goals (H: hierarchy), with tree search (TS), with both."""
 
 Features = Literal["clearance", "paper", "foresight"]
+Rule = Literal["best", "systematic"]
 Survivors = Literal["all", "best"]
 Search = Literal["agent", "none", "tree", "oracle", "best"]
 
@@ -85,6 +86,9 @@ class DiscriminatorConfig:
     def __post_init__(self) -> None:
         _one_of(self, "features", Features)
         _positive(self, "radius", "hidden", "head", "states", "learning_rate")
+        for name in ("gradient_penalty", "instance_noise"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name.replace('_', '-')} must not be negative, is {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -97,8 +101,13 @@ class SearchConfig:
     """Branches per run segment in evaluation."""
     prune_every: int = 10
     """Steps between prunings (T_p)."""
+    rule: Rule = "best"
+    """`best`: the better share of the branches survives (the paper); `systematic`: every branch gets copies in
+    proportion to exp(-score / temperature), as in a particle filter."""
     keep: float = 0.5
-    """Share of the branches that survives a pruning."""
+    """Share of the branches that survives a pruning with rule `best`."""
+    temperature: float = 0.3
+    """Of rule `systematic`: the lower, the stricter."""
     segments: int = 16
     """Run segments searched at a time."""
     updates: int = 10
@@ -117,11 +126,13 @@ class SearchConfig:
             "test_branches",
             "prune_every",
             "keep",
+            "temperature",
             "segments",
             "updates",
             "states",
         )
         _one_of(self, "survivors", Survivors)
+        _one_of(self, "rule", Rule)
         if self.keep > 1:
             raise ConfigError(f"keep must not exceed 1, is {self.keep}")
         if self.weight < 0:
@@ -204,7 +215,9 @@ class EvaluateConfig:
     trees: int = 1
     """Search trees per run segment, each with goals of its own; each gives its share of the rollouts."""
     branches: int = 0
-    """Branches of each tree; 0: as many as it gives rollouts, or more where the agent was trained so."""
+    """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
+    rule: Literal["agent"] | Rule = "agent"
+    """How trees are pruned: `agent` as it was trained, else see `search.rule` of training."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
@@ -218,6 +231,8 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         _one_of(self, "search", Search)
+        if self.rule != "agent":
+            _one_of(self, "rule", Rule)
         _positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")

@@ -45,8 +45,8 @@ from symphony.render.style import (
     view_around,
 )
 
-WIDTH = 2.4
-"""Metres, of the band that stands for a route."""
+WIDTH = 2.6
+"""Metres, of the band that stands for a route: a little more than a car."""
 BAND = 0.75
 """Share of white in its colour."""
 SCORE_LABEL = "discriminator logit: high = looks simulated"
@@ -231,7 +231,9 @@ def draw_tree(
     for rank, (n, agent) in enumerate(zip(tree.real, agents, strict=True)):
         color = colors_of(segment, agents)[rank]
         if tree.routes and tree.routes[n] is not None:
-            _draw_route(axes, tree.routes[n], color, f"route-{agent}")
+            # Narrower one after the other, for agents on one route.
+            width = WIDTH * (1 - 0.5 * rank / len(agents))
+            _draw_route(axes, tree.routes[n], width, color, f"route-{agent}")
         first = np.where(logged[rank, :1], log[rank, 0], np.nan)
         position = tree.position[:, :, n]
         paths = np.stack([tree.before(position, first), position], 2)
@@ -362,9 +364,9 @@ def add_color_bar(axes: Axes, tree: SearchTree) -> None:
     slot.set_gid("scores")
 
 
-def _draw_route(axes: Axes, route: Any, color: str, gid: str) -> None:
-    """A band about as broad as a car."""
-    band = shapely.LineString(np.asarray(route)).buffer(WIDTH / 2, cap_style="flat")
+def _draw_route(axes: Axes, route: Any, width: float, color: str, gid: str) -> None:
+    """A pale band along points [K, 2]."""
+    band = shapely.LineString(np.asarray(route)).buffer(width / 2, cap_style="flat")
     for polygon in shapely.get_parts(band):
         axes.add_patch(
             PathPatch(outline(polygon), facecolor=_pale(color, BAND), edgecolor="none", zorder=2.5, gid=gid)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
-from symphony.collectors import KeepAll, KeepBest, max_then_sum
+from symphony.collectors import KeepAll, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv
@@ -22,7 +22,15 @@ from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds, co
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.trainers.agents import Agent, load_agent
 from symphony.trainers.dataset import SceneDataset, logged
-from symphony.trainers.simulate import Rollouts, SeededNoise, draw_goals, rollouts_of, search, simulate
+from symphony.trainers.simulate import (
+    Rollouts,
+    SeededNoise,
+    draw_goals,
+    pruning_rule,
+    rollouts_of,
+    search,
+    simulate,
+)
 
 
 @dataclass(frozen=True)
@@ -161,6 +169,9 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         found = simulate(env, policy, start)
     else:
         best = config.search == "best"
+        settings = agent.search
+        if config.rule != "agent":
+            settings = replace(settings, rule=config.rule)
         with torch.no_grad():
             result = search(
                 env,
@@ -168,8 +179,9 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
                 None if config.search == "oracle" else agent.discriminator,
                 start,
                 seed=config.seed,
-                rule=KeepAll() if best else KeepBest(agent.search.keep),
-                prune_every=agent.search.prune_every,
+                rule=KeepAll() if best else pruning_rule(settings),
+                prune_every=settings.prune_every,
+                leaves=None if best else taken,
             )
         found = rollouts_of(env, start, result.trajectories)
         if best:

@@ -10,14 +10,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from symphony import keys
-from symphony.collectors import BeamSearchResult, KeepBest
+from symphony.collectors import BeamSearchResult
 from symphony.config import TrainConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, auc
 from symphony.streams import fold_in
 from symphony.trainers.dataset import SceneDataset
 from symphony.trainers.networks import Networks, observation_config
-from symphony.trainers.simulate import search
+from symphony.trainers.simulate import pruning_rule, search
 
 _SEED_STRIDE = 1_000_003
 _POLICY_KEYS = (
@@ -109,7 +109,7 @@ class Learner:
         record: dict[str, Tensor] = {}
         batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
         if self.judge_loss is not None:
-            if self._found is None or True:
+            if self._found is None or step % config.search.updates == 0:
                 self._found = self._search(step, rng)
             record |= self._found.record
             batch = _joined(batch, self._surviving(self._found, rng))
@@ -158,7 +158,7 @@ class Learner:
             self.networks.discriminator,
             start,
             seed=self.config.seed,
-            rule=KeepBest(settings.keep),
+            rule=pruning_rule(settings),
             prune_every=settings.prune_every,
             keep_tree=True,
         )

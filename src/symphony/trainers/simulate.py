@@ -12,7 +12,15 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
-from symphony.collectors import BeamSearchResult, KeyScore, PruningRule, beam_search
+from symphony.collectors import (
+    BeamSearchResult,
+    KeepBest,
+    KeyScore,
+    PruningRule,
+    Systematic,
+    beam_search,
+)
+from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.modules import drawn_goals
 from symphony.streams import fold_in, uniform
@@ -22,7 +30,8 @@ ENDED = -100.0
 equally on all branches.
 """
 _GOALS = 1 << 40
-"""Number of the stream that goals are drawn from, far above the numbers of rollouts."""
+_PRUNING = (1 << 40) + 1
+"""Numbers of the streams that goals and prunings draw from, far above those of rollouts and agents."""
 
 
 class Rollouts(NamedTuple):
@@ -122,6 +131,11 @@ def draw_goals(
     return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
 
 
+def pruning_rule(config: SearchConfig) -> PruningRule:
+    """Which branches go on."""
+    return Systematic(config.temperature) if config.rule == "systematic" else KeepBest(config.keep)
+
+
 def flag_score(state: TensorDictBase) -> Tensor:
     """Score [..., N] of an oracle: 1 where an agent collides or is off the road."""
     bad = state.get(keys.COLLISION) | state.get(keys.OFFROAD)
@@ -137,6 +151,7 @@ def search(
     seed: int,
     rule: PruningRule,
     prune_every: int,
+    leaves: int | None = None,
     keep_tree: bool = False,
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S] to the last logged step (paper, section IV-A).
@@ -149,6 +164,7 @@ def search(
         seed: of the actions.
         rule: which branches go on.
         prune_every: T_p.
+        leaves: return only so many of each tree, the best of the last period; by default all.
         keep_tree: also return the pruned branches.
     """
     score: Callable[[TensorDictBase], Tensor] = flag_score
@@ -160,15 +176,20 @@ def search(
         going = state.get(keys.STEP) <= last[state.get(keys.SCENE)]
         return torch.where(going, score(state), ENDED)
 
+    # The random numbers of the pruning are the tree's: those of its first branch, told apart from its actions'.
+    steps, root = _steps(env, start), start.get(keys.STREAM)[..., 0, :]
+    periods = torch.arange(-(-steps // prune_every), device=start.device)
     following = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
     return beam_search(
         env,
         TensorDictSequential(SeededNoise(seed), policy),
         until_the_end,
         start,
-        steps=_steps(env, start),
+        steps=steps,
         prune_every=prune_every,
         rule=rule,
+        noise=uniform(seed, fold_in(root, _PRUNING), periods),
+        leaves=leaves,
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         keep=[keys.STATE, keys.ACTION, keys.STEP, *following],
@@ -177,7 +198,8 @@ def search(
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
-    """What the evaluator reads, from the trajectories [..., S, T] of a search."""
+    """What the evaluator reads, from the leaves [..., L, T] of a search that began in ``start`` [..., S], S >= L."""
+    start = start[..., : trajectories.shape[-2]]
     state = torch.cat([start.get(keys.STATE)[..., None, :, :], trajectories.get(("next", *keys.STATE))], -3)
     collision, offroad = (
         trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any, Literal
@@ -53,7 +54,10 @@ class Tracker:
 
     def _write(self, record: dict[str, Any]) -> None:
         # JSON knows no NaN, which stands for statistics of nothing.
-        known = {name: None if value != value else value for name, value in record.items()}
+        known = {
+            name: None if isinstance(value, float) and math.isnan(value) else value
+            for name, value in record.items()
+        }
         self._file.write(json.dumps(known) + "\n")
         self._file.flush()
 
