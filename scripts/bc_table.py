@@ -35,9 +35,9 @@ KINDS: dict[str, dict[str, Any]] = {
     "best": {"search": "best", "rollouts": 1},
     "oracle": {"search": "oracle"},
 }
-"""Ways to simulate: independent rollouts; the leaves of one tree; the best quarter of the leaves of four trees; the best
-of sixteen independent rollouts by the discriminator; the best sixteen leaves of a tree of 64 branches; one tree pruned by
-the true flags.
+"""Ways to simulate: independent rollouts; the leaves of one tree; the best quarter of the leaves of four trees; the
+best sixteen leaves of a tree of 64 branches; the best of sixteen independent rollouts by the discriminator; one tree
+pruned by the true flags.
 """
 DEFAULT_KINDS = {"bc": ("none",), "bc_h": ("none",)}
 COLUMNS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")

@@ -75,9 +75,9 @@ def snapshots(folder: Path, action: Callable[[], Any]) -> list[Path]:
         return wrapper
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store_format, "_write_at", spied(store_format._write_at, 29))
+        patch.setattr(store_format, "_write_at", spied(store_format._write_at, 37))
         patch.setattr(unfinished.Draft, "_write", spied(unfinished.Draft._write))
-        for name, every in {"rename": 1, "replace": 1, "rmdir": 2, "unlink": 23}.items():
+        for name, every in {"rename": 1, "replace": 1, "rmdir": 3, "unlink": 37}.items():
             patch.setattr(os, name, spied(getattr(os, name), every))
         action()
     assert len(taken) > 10
@@ -149,8 +149,8 @@ def test_kill_9_at_random_moments(tmp_path: Path, workers: int) -> None:
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             process.stdout.readline()
-            if kills < 3:
-                time.sleep(rng.uniform(0, 0.08))
+            if kills < 2:
+                time.sleep(rng.uniform(0, 0.04))
                 process.kill()
             ended = process.stdout.read().endswith("end\n")
         kills += process.returncode == -signal.SIGKILL

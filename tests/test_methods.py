@@ -406,3 +406,19 @@ def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneD
         assert (one == two).all()
     assert small.scene.cache_info().currsize == small.experts.cache_info().currsize == 1
     assert small.scene(0).route.shape[3] == POINTS
+
+
+def test_one_search_serves_as_many_updates_as_configured(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[int] = []
+    real = Learner._search
+
+    def counted(self: Learner, step: int, rng: torch.Generator) -> Any:
+        searched.append(step)
+        return real(self, step, rng)
+
+    monkeypatch.setattr(Learner, "_search", counted)
+    settings = config("bc_ts", store, tmp_path / "run", steps=6, checkpoint_every=6)
+    train(replace(settings, search=replace(settings.search, updates=3)))
+    assert searched == [0, 3]

@@ -13,7 +13,7 @@ import torch
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.cli import main
-from symphony.config import AgentConfig, EvaluateConfig, SearchConfig, TrainConfig, from_dict, to_json
+from symphony.config import AgentConfig, EvaluateConfig, TrainConfig, from_dict, to_json
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
