@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from helpers_convert import FakeReader
+from symphony.cli import main
 from symphony.data import convert as converting
 from symphony.data import parts, store_format, unfinished
 from symphony.data.convert import convert
@@ -120,6 +121,7 @@ os.fsync = lambda descriptor: None
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from helpers_convert import FakeReader
+from symphony.cli import main
 from symphony.data import convert as converting
 from symphony.data import parts
 converting.CHECKPOINT, parts.PART_FILES = 0.01, 3
@@ -277,7 +279,9 @@ def test_what_is_in_the_way_is_told(logs: list[Path], tmp_path: Path) -> None:
         convert(FakeReader(), logs, out)
 
 
-def test_the_papers_exclusions_are_counted_apart(logs: list[Path], tmp_path: Path) -> None:
+def test_the_papers_exclusions_are_counted_apart(
+    logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     report = convert(FakeReader(), logs, tmp_path / "store")
     assert report.exclusions == {"playback_agents": 0, "roadgraph_points": 0, "interactive_agents": 1}
     assert sum(report.problems.values()) + 1 == sum(report.reasons.values()) == len(report.skipped)
@@ -285,3 +289,7 @@ def test_the_papers_exclusions_are_counted_apart(logs: list[Path], tmp_path: Pat
     found = converting.info(tmp_path / "store")
     assert found["exclusions"] == report.exclusions
     assert found["skipped"] == len(report.skipped)
+    assert main(["data", "info", str(tmp_path / "store")]) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert {"excluded 1", "too few interactive agents 1"} <= set(lines)
+    assert f"skipped {len(report.skipped) - 1}" in lines

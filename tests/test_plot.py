@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
@@ -130,6 +130,7 @@ def test_what_survives_is_thicker_and_on_top() -> None:
     assert counts == {"leaf": 2 * 2 + 2 * 2 + 2, "died-out": 2, "pruned": 2 * 2 + 2 + 2}
 
 
+@settings(deadline=None, max_examples=50)
 @given(arrays(np.int64, (3, 5), elements=st.integers(0, 4)))
 def test_fates_are_those_of_the_search(parents: np.ndarray) -> None:
     nothing = torch.zeros(0)
@@ -271,6 +272,7 @@ def test_tree_must_fit_the_segment(tmp_path: Path) -> None:
 # The branches over time
 
 
+@settings(deadline=None, max_examples=50)
 @given(arrays(np.int64, (4, 6), elements=st.integers(0, 5)))
 def test_lines_of_descent_do_not_cross(parents: np.ndarray) -> None:
     tree = SearchTree(
@@ -375,6 +377,7 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
     assert figure.axes[0].lines[1].get_marker() == "o"
 
 
+@settings(deadline=None, max_examples=50)
 @given(
     arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e3, 1e3) | st.just(math.nan)),
     st.floats(0, 1),

@@ -19,7 +19,7 @@ MAX_ROAD_POINTS = 10_000
 EXCLUSIONS = {
     "playback_agents": f"more than {MAX_PLAYBACK_AGENTS} playback agents",
     "roadgraph_points": f"more than {MAX_ROAD_POINTS} roadgraph points",
-    "interactive_agents": "fewer interactive agents at the first step than asked for",
+    "interactive_agents": "too few interactive agents",
 }
 """The paper's exclusions, in words."""
 POINT_SPACING = 2.0
