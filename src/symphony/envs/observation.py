@@ -21,9 +21,9 @@ from symphony.geometry.frames import rotate, wrap
 from symphony.geometry.polylines import signed_distance
 
 SELF_FEATURES = 4
-OBJECT_FEATURES = 8 + len(AgentType)
+OBJECT_FEATURES = 10 + len(AgentType)
 _LIGHTS = len(SignalState)
-POINT_FEATURES = 5 + len(PointType) + _LIGHTS
+POINT_FEATURES = 6 + len(PointType) + _LIGHTS
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class Observation(NamedTuple):
 
     Attributes:
         own: [M, N, 4] speed, length, width, last logged step reached (0 or 1).
-        objects: [M, N, O, 13].
+        objects: [M, N, O, 15].
         objects_mask: [M, N, O].
-        points: [M, N, P, 22].
+        points: [M, N, P, 23].
         points_mask: [M, N, P].
         gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked; None if not asked for.
         gap_ahead: [M, N, O, H] likewise at H times ahead; None if not asked for.
@@ -155,7 +155,7 @@ def observe(
         -1,
     )
     seen, seen_mask, gap, ahead = _see_objects(objects, index, own, own_size, config)
-    points, points_mask = _see_points(scenes, scene, step, origin, heading, config)
+    points, points_mask = _see_points(scenes, scene, step, origin, heading, speed, config)
     road = None
     if config.clearance:
         corners = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
@@ -186,6 +186,8 @@ def _see_objects(
             relative.cos()[..., None],
             relative.sin()[..., None],
             rotate(state[..., 3:], angle) / config.speed_scale,
+            # Elements are encoded one by one, so each must tell how fast it is approached.
+            rotate(state[..., 3:] - own[..., None, 3:], angle) / config.speed_scale,
             size / config.size_scale,
             one_hot(kind, len(AgentType)).to(state.dtype),
         ],
@@ -229,6 +231,7 @@ def _see_points(
     step: Tensor,
     origin: Tensor,
     heading: Tensor,
+    speed: Tensor,
     config: ObservationConfig,
 ) -> tuple[Tensor, Tensor]:
     total = scenes.point.shape[1]
@@ -255,6 +258,7 @@ def _see_points(
             rotate(look(scenes.point) - origin[..., None, :], angle) / config.distance_scale,
             rotate(look(scenes.point_direction), angle),
             (look(scenes.point_speed) / config.speed_scale)[..., None],
+            (speed / config.speed_scale)[..., None, None].expand(*shape, 1),
             kind,
             _light_states(scenes, scene, step, light).to(origin.dtype),
         ],
