@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# A busy machine must not fail a test.
+settings.register_profile("symphony", deadline=None)
+settings.load_profile("symphony")
 
 # Two torch threads on shared cores spin against each other otherwise; must precede the first torch import.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

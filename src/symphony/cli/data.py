@@ -160,14 +160,13 @@ class Plot:
 
     def run(self) -> None:
         """Draw it."""
+        from symphony.cli.plot import segment_index
         from symphony.data.selection import interactive_choice
         from symphony.data.store import SegmentStore
         from symphony.render import plot_segment
 
         store = SegmentStore(self.store)
-        known = self.segment in store.ids
-        by_number = not known and self.segment.isdecimal() and int(self.segment) < len(store)
-        segment = store[int(self.segment) if by_number else store.index_of(self.segment)]
+        segment = store[segment_index(store, self.segment)]
         if not 0 <= self.step < segment.num_steps:
             raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
         if self.interactive < 1:
