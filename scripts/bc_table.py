@@ -33,12 +33,14 @@ KINDS: dict[str, dict[str, Any]] = {
     "trees4": {"search": "tree", "trees": 4},
     "tree64": {"search": "tree", "branches": 64},
     "systematic": {"search": "tree", "rule": "systematic"},
+    "small": {"search": "tree", "rule": "systematic", "trees": 4, "branches": 4},
     "best": {"search": "best", "rollouts": 1},
     "oracle": {"search": "oracle"},
 }
 """Ways to simulate: independent rollouts; the leaves of one tree; the best quarter of the leaves of four trees; the
-best sixteen leaves of a tree of 64 branches; the leaves of a tree resampled instead of halved; the best of sixteen
-independent rollouts by the discriminator; one tree pruned by the true flags.
+best sixteen leaves of a tree of 64 branches; the leaves of a tree resampled instead of halved; those of four such
+trees of four branches; the best of sixteen independent rollouts by the discriminator; one tree pruned by the true
+flags.
 """
 DEFAULT_KINDS = {"bc": ("none",), "bc_h": ("none",)}
 COLUMNS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
