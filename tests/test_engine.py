@@ -156,7 +156,8 @@ def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path
         assert gone(pids)
         errors = process.stderr.read()
     assert process.returncode in {-getattr(signal, how), 128 + signal.SIGINT}
-    assert errors.count("Traceback") == (how == "SIGINT")
+    # An interrupted task may add its own traceback to that of the main process.
+    assert ("Traceback" in errors) == (how == "SIGINT")
 
 
 @pytest.mark.parametrize("bad", [{"workers": 0}, {"engine": "dask"}])

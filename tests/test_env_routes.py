@@ -326,8 +326,11 @@ def test_gaps_are_those_between_the_boxes_that_are_seen() -> None:
     assert (gap[~mask] == 0).all()
     zero, size = torch.zeros(()), torch.tensor(CAR[:2])
     heading = torch.atan2(objects[..., 3], objects[..., 2])
-    expected = box_gap(zero.expand(2), zero, size, objects[..., :2] * SCALE, heading, objects[..., 6:8] * 5)
+    expected = box_gap(zero.expand(2), zero, size, objects[..., :2] * SCALE, heading, objects[..., 8:10] * 5)
     torch.testing.assert_close(gap[mask], expected[mask], atol=1e-3, rtol=0)
+    own = torch.cat([out[keys.OWN][..., :1], torch.zeros_like(out[keys.OWN][..., :1])], -1)[..., None, :]
+    relative = objects[..., 4:6] - own
+    torch.testing.assert_close(objects[..., 6:8][mask], relative[mask], atol=1e-4, rtol=0)
     # All objects are seen, so an overlap is a collision and the other way round.
     hit = ((gap < 0) & mask).any(-1)
     assert torch.equal(hit, out[keys.COLLISION].squeeze(-1))
@@ -347,7 +350,7 @@ def test_gaps_ahead_are_those_after_everyone_kept_speed_and_course() -> None:
     for k, time in enumerate(times):
         own = torch.cat([speed, torch.zeros_like(speed)], -1)[..., None, :] * time
         there = objects[..., :2] * SCALE + objects[..., 4:6] * 10 * time
-        expected = box_gap(own, zero, size, there, heading, objects[..., 6:8] * 5)
+        expected = box_gap(own, zero, size, there, heading, objects[..., 8:10] * 5)
         torch.testing.assert_close(ahead[..., k][mask], expected[mask], atol=2e-3, rtol=0)
     # Seeing ahead changes nothing else.
     plain = make_env(crossing(7), straight_road(5), config=ObservationConfig(16, 1, clearance=True))

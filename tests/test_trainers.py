@@ -104,7 +104,7 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path)
 
 def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
     out = train(
-        config(store, tmp_path / "long", steps=60, states=128, learning_rate=3e-3, checkpoint_every=60)
+        config(store, tmp_path / "long", steps=100, states=128, learning_rate=3e-3, checkpoint_every=100)
     )
     losses, rates = ([r[name] for r in read_metrics(out)] for name in ("loss_bc", "learning_rate"))
     assert rates[0] == 3e-3
@@ -199,7 +199,7 @@ def test_expert_batches_show_what_the_environment_shows(
     rng = torch.Generator().manual_seed(0)
     batch = dataset.sample_states([0, 1], 50, ObservationConfig(num_objects=4, num_points=20), rng)
     assert batch.shape == (50,)
-    assert batch[keys.POINTS].shape == (50, 1, 20, 22)
+    assert batch[keys.POINTS].shape == (50, 1, 20, 23)
     assert batch[keys.VALID].all()
     assert batch[keys.OWN][..., 0].mean() > 0.3  # everybody drives at 6 to 15 m/s
     seen = batch[keys.OBJECTS][..., :2][batch[keys.OBJECTS_MASK]]
