@@ -154,7 +154,9 @@ PRESETS: dict[str, Preset] = {
         200,
         1_000,
         {
+            "train": "5fcd71bef8cc5ea81c118cd28b933280b344eb492a98caba9fcc3a8e1235b141",
             "validation": "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
+            "test": "c2c4a0677f9b780f20f23af5d57b00dc5961d840bcc8b4d95eacc7ff3f0d032d",
         },
     ),
 }
