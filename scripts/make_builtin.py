@@ -12,11 +12,9 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-import shapely
-import torch
 from numpy.typing import NDArray
 
 from symphony.data.builtin import builtin_store
@@ -24,8 +22,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.data.sources.sumo import generate_run
 from symphony.data.store import SegmentStore, StoreWriter
-from symphony.geometry import segments_of, signed_distance
 from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
+from symphony.trainers.quality import measure
 
 SplitName = Literal["train", "test"]
 DURATION = 150.0
@@ -96,64 +94,13 @@ def make(name: SplitName, split: Split) -> tuple[int, Counter[str], float]:
     return accepted, reasons, seconds
 
 
-def describe(store: SegmentStore) -> dict[str, str]:
-    """Measures of the logged driving, of the ego and its partner (the nearest moving vehicle) in each segment."""
-    collided, off, motion, turns, errors = [], [], [], [], []
-    for segment in store:
-        pair = interactive_agents(segment, 2)
-        collided.append([_collides(segment, int(agent)) for agent in pair])
-        off.append(_off_road(segment, pair))
-        heading, velocity = segment.heading[pair].astype(float), segment.velocity[pair].astype(float)
-        speed = np.linalg.norm(velocity, axis=-1)
-        rates = [np.diff(speed, axis=1) / segment.dt, np.diff(heading, axis=1) / segment.dt]
-        motion.append(np.stack([speed[:, 1:], *rates]))
-        turns.append(np.ptp(heading, axis=1) > 0.5)
-        errors += _route_errors(segment, pair)
-    values = np.stack(motion, 1).reshape(3, -1)
-    names = ("speed (m/s)", "acceleration (m/s²)", "yaw rate (rad/s)")
-    points = (1, 50, 99)
+def describe(store: SegmentStore) -> dict[str, Any]:
+    """What the logged driving is like, and how far the paths of egos and partners are from a feasible route."""
+    errors = [e for segment in store for e in _route_errors(segment, interactive_agents(segment, 2))]
     return {
-        "segments with a collision of the pair": f"{np.mean(np.any(collided, 1)):.2%}",
-        "steps of the pair with the centre off the road": f"{np.mean(off):.3%}",
-        **{
-            f"{name}, percentiles {points}": " ".join(f"{q:.2f}" for q in np.percentile(row, points))
-            for name, row in zip(names, values, strict=True)
-        },
-        "egos that turn by more than 0.5 rad": f"{np.mean(turns, 0)[0]:.0%}",
-        "partners that do": f"{np.mean(turns, 0)[1]:.0%}",
+        **measure(store),
         "distance to the best feasible route, mean / largest (m)": f"{np.mean(errors):.2f} / {np.max(errors):.2f}",
-        "segments with lights": f"{np.mean([len(s.signal_lane) > 0 for s in store]):.0%}",
     }
-
-
-def _boxes(segment: RunSegment, agent: int) -> NDArray[np.object_]:
-    """[T] rectangles."""
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * segment.size[agent, :2] / 2
-    heading = segment.heading[agent]
-    along = np.stack([np.cos(heading), np.sin(heading)], -1)
-    left = np.stack([-along[:, 1], along[:, 0]], -1)
-    center = segment.position[agent, :, None, :2]
-    return shapely.polygons(center + corners[:, :1] * along[:, None] + corners[:, 1:] * left[:, None])
-
-
-def _collides(segment: RunSegment, agent: int) -> bool:
-    own = _boxes(segment, agent)
-    for other in range(segment.num_agents):
-        both = segment.valid[agent] & segment.valid[other]
-        if other != agent and shapely.area(shapely.intersection(own, _boxes(segment, other)))[both].sum() > 0:
-            return True
-    return False
-
-
-def _off_road(segment: RunSegment, pair: NDArray[np.int64]) -> float:
-    """Share of the pair's steps."""
-    boundary = segment.road.boundary
-    start, end, previous, following = (
-        torch.as_tensor(part)[None] for part in segments_of(boundary.points, boundary.offsets)
-    )
-    points = torch.as_tensor(segment.position[pair, :, :2]).reshape(1, -1, 2)
-    valid = torch.ones(start.shape[:2], dtype=torch.bool)
-    return float((signed_distance(points, start, end, valid, previous, following) > 0).float().mean())
 
 
 def _route_errors(segment: RunSegment, pair: NDArray[np.int64]) -> list[float]:

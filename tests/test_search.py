@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, DrivingEnv, scene
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.trainers import evaluate, evaluation, simulate
+from symphony.trainers import evaluate, simulate
 from symphony.trainers.agents import Agent
 from symphony.trainers.dataset import SceneDataset
 from symphony.trainers.evaluation import simulated
@@ -312,7 +313,7 @@ def goals_of(
         return found[-1]
 
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "draw_goals", noted)
+        patch.setattr(sys.modules["symphony.trainers.simulate"], "draw_goals", noted)
         state = simulated(agent, scenes, config).state
     assert len(found) == 1
     return found[0], state

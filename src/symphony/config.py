@@ -26,6 +26,12 @@ def _positive(config: Any, *names: str) -> None:
             raise ConfigError(f"{name.replace('_', '-')} must be positive, is {getattr(config, name)}")
 
 
+def _not_negative(config: Any, *names: str) -> None:
+    for name in names:
+        if getattr(config, name) < 0:
+            raise ConfigError(f"{name.replace('_', '-')} must not be negative, is {getattr(config, name)}")
+
+
 def _one_of(config: Any, name: str, known: Any) -> None:
     if getattr(config, name) not in get_args(known):
         raise ConfigError(
@@ -86,9 +92,7 @@ class DiscriminatorConfig:
     def __post_init__(self) -> None:
         _one_of(self, "features", Features)
         _positive(self, "radius", "hidden", "head", "states", "learning_rate")
-        for name in ("gradient_penalty", "instance_noise"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name.replace('_', '-')} must not be negative, is {getattr(self, name)}")
+        _not_negative(self, "gradient_penalty", "instance_noise")
 
 
 @dataclass(frozen=True)
@@ -135,8 +139,7 @@ class SearchConfig:
         _one_of(self, "rule", Rule)
         if self.keep > 1:
             raise ConfigError(f"keep must not exceed 1, is {self.keep}")
-        if self.weight < 0:
-            raise ConfigError(f"weight must not be negative, is {self.weight}")
+        _not_negative(self, "weight")
 
 
 @dataclass(frozen=True)
@@ -236,9 +239,7 @@ class EvaluateConfig:
         _positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        for name in ("interactive", "branches"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name} must not be negative, is {getattr(self, name)}")
+        _not_negative(self, "interactive", "branches")
 
 
 def to_json(config: Any) -> str:

@@ -77,26 +77,27 @@ class Tree:
         import torch
 
         from symphony import keys
-        from symphony.collectors import KeepBest
         from symphony.envs.driving import DrivingEnv
         from symphony.render import SearchTree
-        from symphony.trainers.simulate import draw_goals, search
+        from symphony.trainers.simulate import plant, pruning_rule, search
 
         scene = dataset.scene(0).to(torch.device(self.device))
         env = DrivingEnv(scene, agent.dynamics, agent.observation)
-        number = torch.arange(self.branches, device=scene.device)[None]
-        start = env.start(torch.zeros_like(number), number)
+        start = plant(
+            env,
+            agent.goals,
+            trees=1,
+            branches=self.branches,
+            seed=self.seed,
+            logged_goals=self.logged_goals,
+        )[:, 0]
         routes = []
         if agent.goals is not None:
-            goals = None if self.logged_goals else agent.goals
-            first = torch.zeros(1, dtype=torch.int64, device=scene.device)
-            goal = draw_goals(env, goals, start[:, 0], self.seed, first)
-            start = env.with_goals(start, goal[:, None].expand(*start.shape, -1))
             routes = [
                 scene.route[0, n, route, : scene.route_count[0, n, route]].cpu().numpy()
                 if route >= 0
                 else None
-                for n, route in enumerate(goal[0].tolist())
+                for n, route in enumerate(start.get(keys.GOAL)[0, 0].tolist())
             ]
         every = self.prune_every or agent.search.prune_every
         with torch.no_grad():
@@ -106,7 +107,7 @@ class Tree:
                 agent.discriminator,
                 start,
                 seed=self.seed,
-                rule=KeepBest(agent.search.keep),
+                rule=pruning_rule(agent.search),
                 prune_every=every,
                 keep_tree=True,
             )

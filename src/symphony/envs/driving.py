@@ -24,6 +24,7 @@ from symphony.envs.observation import (
 )
 from symphony.envs.routes import ROUTE_FEATURES, pick_routes, route_ahead, route_choices
 from symphony.envs.scene import SceneBatch
+from symphony.geometry.frames import forward_speed
 from symphony.streams import fold_in
 
 
@@ -225,7 +226,7 @@ class DrivingEnv(EnvBase):
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
         logged = _rows(self.scenes.log_state[:, 0], scene, self.scenes.interactive[scene])
         heading, velocity = logged[..., 2], logged[..., 3:]
-        speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
+        speed = forward_speed(velocity, heading)
         return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
 
     def _from_state(

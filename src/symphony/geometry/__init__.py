@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from symphony.geometry.boxes import box_corners, box_gap, boxes_overlap
-from symphony.geometry.frames import from_frame, rotate, to_frame, wrap
+from symphony.geometry.frames import forward_speed, from_frame, rotate, to_frame, wrap
 from symphony.geometry.polylines import NO_BOUNDARY, segments_of, signed_distance
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "box_corners",
     "box_gap",
     "boxes_overlap",
+    "forward_speed",
     "from_frame",
     "rotate",
     "segments_of",

@@ -37,3 +37,10 @@ def from_frame(
 ) -> Float[Tensor, "*batch 2"]:
     """Inverse of :func:`to_frame`."""
     return rotate(points, heading) + origin
+
+
+def forward_speed(
+    velocity: Float[Tensor, "*batch 2"], heading: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch"]:
+    """Component of a velocity along a heading, m/s; negative when reversing."""
+    return velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()

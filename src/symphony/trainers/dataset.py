@@ -19,6 +19,7 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
 from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices, route_table
 from symphony.envs.scene import SceneBatch, collate, scene
+from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, lane_of
 
 IN_LANE = 1.0
@@ -90,7 +91,7 @@ def experts(
         tensor(segment.heading),
         tensor(segment.velocity),
     )
-    speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
+    speed = forward_speed(velocity, heading)
     mask = tensor(valid)
     # An agent that appears later is fitted from its first valid state; its rows before that are masked.
     actions, states = dynamics.fit(position, heading, speed, mask, tensor(segment.size[:, :2]), segment.dt)
@@ -281,7 +282,7 @@ def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
     index = scenes.interactive[:, None].expand(-1, steps, -1)
     log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
     heading, velocity = log[..., 2], log[..., 3:]
-    speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
+    speed = forward_speed(velocity, heading)
     valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
     return torch.cat([log[..., :3], speed[..., None]], -1), valid
 

@@ -25,7 +25,7 @@ from symphony.trainers.dataset import SceneDataset, logged
 from symphony.trainers.simulate import (
     Rollouts,
     SeededNoise,
-    draw_goals,
+    plant,
     pruning_rule,
     rollouts_of,
     search,
@@ -157,13 +157,14 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         raise ValueError("log playback has nothing to simulate")
     env = DrivingEnv(scenes, agent.dynamics, agent.observation)
     trees, branches, taken = _plan(agent, config)
-    number = torch.arange(trees * branches, device=scenes.device).reshape(trees, branches)
-    scene = torch.arange(len(scenes), device=scenes.device)[:, None, None]
-    start = env.start(scene.expand(-1, trees, branches), number.expand(len(scenes), -1, -1))
-    if agent.goals is not None:
-        roots, tree = start[..., 0], torch.arange(trees, device=scenes.device).expand(len(scenes), trees)
-        goal = draw_goals(env, None if config.logged_goals else agent.goals, roots, config.seed, tree)
-        start = env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
+    start = plant(
+        env,
+        agent.goals,
+        trees=trees,
+        branches=branches,
+        seed=config.seed,
+        logged_goals=config.logged_goals,
+    )
     if _kind(agent, config) == "none":
         policy = TensorDictSequential(SeededNoise(config.seed), agent.policy)
         found = simulate(env, policy, start)

@@ -131,6 +131,36 @@ def draw_goals(
     return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
 
 
+def plant(
+    env: DrivingEnv,
+    goals: TensorDictModuleBase | None,
+    *,
+    trees: int,
+    branches: int,
+    seed: int,
+    logged_goals: bool = False,
+) -> TensorDictBase:
+    """First states [B, trees, branches] of all scenes; branches of a tree share their goals, trees draw their own.
+
+    Args:
+        env: the environment.
+        goals: the goal policy; None for agents that follow none.
+        trees: per scene.
+        branches: per tree.
+        seed: of the goals.
+        logged_goals: take the routes nearest to the log instead.
+    """
+    device, scenes = env.scenes.device, len(env.scenes)
+    number = torch.arange(trees * branches, device=device).reshape(trees, branches)
+    scene = torch.arange(scenes, device=device)[:, None, None]
+    start = env.start(scene.expand(-1, trees, branches), number.expand(scenes, -1, -1))
+    if goals is None:
+        return start
+    tree = torch.arange(trees, device=device).expand(scenes, trees)
+    goal = draw_goals(env, None if logged_goals else goals, start[..., 0], seed, tree)
+    return env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
+
+
 def pruning_rule(config: SearchConfig) -> PruningRule:
     """Which branches go on."""
     return Systematic(config.temperature) if config.rule == "systematic" else KeepBest(config.keep)
