@@ -44,7 +44,7 @@ def main() -> None:
         agent=AgentConfig(num_points=arguments.points),
         discriminator=DiscriminatorConfig(features="foresight"),
     )
-    networks = build_networks(config, Bicycle())
+    networks = build_networks(config)
     dataset = SceneDataset(SegmentStore(builtin_store("train")), 2, routes=True)
     env = DrivingEnv(dataset.scenes(range(arguments.scenes)), Bicycle(), observation_config(config))
     scene = torch.arange(arguments.scenes)[:, None].expand(-1, arguments.branches)

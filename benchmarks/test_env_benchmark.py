@@ -27,7 +27,7 @@ def parts(points: int) -> tuple[SceneDataset, DrivingEnv, Any, TrainConfig]:
     config = TrainConfig("bc", Path(), Path(), agent=AgentConfig(num_points=points))
     dataset = SceneDataset(SegmentStore(builtin_store("train")))
     env = DrivingEnv(dataset.scenes(range(16)), Bicycle(), observation_config(config))
-    return dataset, env, build_networks(config, Bicycle()).policy, config
+    return dataset, env, build_networks(config).policy, config
 
 
 @POINTS

@@ -296,12 +296,13 @@ def test_listing_and_pruning(tmp_path):
     assert latest(tmp_path / "absent") is None
     assert checkpoints(tmp_path) == []
     paths = {step: save_checkpoint(tmp_path, step=step, modules={}) for step in (20, 3, 100, 7)}
-    (tmp_path / "step-000000000999").mkdir()  # without a manifest: not one
+    (tmp_path / "step-000000000999").mkdir()  # without a manifest: not one, but the remains of one
     (tmp_path / "notes.txt").write_text("")
     assert checkpoints(tmp_path) == [paths[step] for step in (3, 7, 20, 100)]
     assert latest(tmp_path) == paths[100]
     assert prune(tmp_path, 1, protect=[7]) == [paths[3], paths[20]]
     assert checkpoints(tmp_path) == [paths[7], paths[100]]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", paths[7].name, paths[100].name]
     assert prune(tmp_path, 5) == []
     with pytest.raises(ValueError, match="at least 1"):
         prune(tmp_path, 0)

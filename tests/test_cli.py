@@ -63,6 +63,8 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ["data", "plot"],
         ["train"],
         ["evaluate"],
+        ["table"],
+        ["figure", "curvature"],
         ["plot", "tree"],
         ["plot", "curves"],
         ["demo"],

@@ -120,7 +120,7 @@ def test_each_method_trains_its_networks(trained: Trained, store: Path, method: 
     run = trained(method)
     settings = config(method, store, run)
     torch.manual_seed(settings.seed)
-    fresh = build_networks(settings, Bicycle()).present()
+    fresh = build_networks(settings).present()
     assert set(fresh) == NETWORKS[method]
     after = weights(run)
     assert {name.split(".")[0] for name in after} == NETWORKS[method]
@@ -204,7 +204,7 @@ def test_a_warm_start_takes_over_what_both_runs_have(trained: Trained, store: Pa
     for name in ("policy", "goals"):
         assert equal(of(name, after), of(name, before))
     torch.manual_seed(9)
-    fresh = build_networks(config("bc_ts_h", store, out, **changes), Bicycle())
+    fresh = build_networks(config("bc_ts_h", store, out, **changes))
     assert fresh.discriminator is not None
     new = {f"discriminator.{k}": v for k, v in fresh.discriminator.state_dict().items()}
     assert equal(of("discriminator", after), new)
@@ -302,7 +302,7 @@ def test_learners_judge_states_up_to_the_end_of_each_scene(store: Path, dataset:
     wide = SearchConfig(branches=4, segments=3, prune_every=4, updates=2, states=8)
     settings = config("bc_ts_h", store, Path(), segments=3, search=wide)
     torch.manual_seed(0)
-    learner = Learner(settings, build_networks(settings, Bicycle()), dataset, torch.device("cpu"))
+    learner = Learner(settings, build_networks(settings), dataset, torch.device("cpu"))
     record = learner.update(0)
     found = learner._found
     assert found is not None
@@ -319,7 +319,7 @@ def test_what_learners_search_is_what_they_imitate(store: Path, dataset: SceneDa
     """Actions of survivors lead from each of their states to the next."""
     settings = config("bc_ts_h", store, Path(), segments=3)
     torch.manual_seed(0)
-    learner = Learner(settings, build_networks(settings, Bicycle()), dataset, torch.device("cpu"))
+    learner = Learner(settings, build_networks(settings), dataset, torch.device("cpu"))
     learner.update(0)
     found = learner._found
     assert found is not None

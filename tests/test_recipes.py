@@ -40,11 +40,24 @@ SEARCH = [
     "--discriminator.states",
     "8",
 ]
+ADVERSARIAL = [
+    *SEARCH,
+    "--mgail.regression",
+    "1",
+    "--mgail.head-start",
+    "1",
+    "--mgail.rollouts",
+    "2",
+]
 ARGUMENTS = {
     "bc.py": COMMON,
     "bc_h.py": COMMON,
     "bc_ts.py": [*COMMON, *SEARCH],
     "bc_ts_h.py": [*COMMON, *SEARCH],
+    "mgail.py": [*COMMON, *ADVERSARIAL],
+    "mgail_h.py": [*COMMON, *ADVERSARIAL],
+    "mgail_ts.py": [*COMMON, *ADVERSARIAL],
+    "mgail_ts_h.py": [*COMMON, *ADVERSARIAL],
 }
 
 
@@ -71,9 +84,10 @@ def test_recipe(
     monkeypatch.setitem(sys.modules, "recipe", module)
     spec.loader.exec_module(module)
     module.main([*data, *ARGUMENTS[recipe]])
-    result = json.loads((tmp_path / "run" / "test.json").read_text())
-    playback, trained = result["rows"]
-    assert playback["ade"] == 0
-    assert trained["ade"] > 0
-    assert len(result["per_segment"]) == 2
-    assert f"{trained['ade']:.2f}" in capsys.readouterr().out
+    (file,) = (tmp_path / "run" / "evaluations").iterdir()
+    found = json.loads(file.read_text())
+    assert found["run"]["method"] == Path(recipe).stem
+    assert found["playback"]["ade"] == 0
+    assert found["ade"] > 0
+    assert len(found["per_segment"]) == 2
+    assert f"{found['ade']:.2f}" in capsys.readouterr().out

@@ -55,9 +55,9 @@ def make_agent(seed: int = 0, method: Any = "bc_ts_h", judge: int = 0) -> Agent:
         search=SEARCH,
     )
     torch.manual_seed(seed)
-    networks = build_networks(config, Bicycle())
+    networks = build_networks(config)
     torch.manual_seed(judge)
-    other = build_networks(config, Bicycle())
+    other = build_networks(config)
     return Agent(
         "tiny",
         networks.policy,

@@ -39,12 +39,15 @@ def _one_of(config: Any, name: str, known: Any) -> None:
         )
 
 
-Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h"]
-"""Rows of the paper's tables: behavioural cloning, with goals (H: hierarchy), with tree search (TS), with both."""
+Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h"]
+"""Rows of the paper's tables: behavioural cloning or adversarial imitation through the model (MGAIL), with goals (H:
+hierarchy), with tree search (TS), with both.
+"""
 
 Features = Literal["clearance", "paper", "foresight"]
 Rule = Literal["best", "systematic"]
 Survivors = Literal["all", "best"]
+Cost = Literal["log_d", "non_saturating", "logit"]
 Search = Literal["agent", "none", "tree", "oracle", "best"]
 
 
@@ -143,11 +146,61 @@ class SearchConfig:
 
 
 @dataclass(frozen=True)
+class MGAILConfig:
+    """How a policy learns from the gradient of the discriminator (methods mgail*)."""
+
+    regression: int = 2000
+    """Updates of plain regression to the log before the adversarial ones (0: none, as in the paper)."""
+    head_start: int = 50
+    """Updates of the discriminator alone after them."""
+    rollouts: int = 16
+    """Rollouts per update that the gradient goes through, drawn from those of the last search."""
+    learning_rate: float = 2e-4
+    """Of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
+    cost: Cost = "log_d"
+    """What the policy lowers, D the probability that a state is simulated: `log_d` (the paper), `non_saturating`
+    -log(1 - D), or the `logit` of D."""
+    expert_weight: float = 0.0
+    """Weight of the regression to the log beside it."""
+    discriminator_updates: int = 1
+    """Updates of the discriminator per update of the policy."""
+    react: bool = False
+    """Let the gradient also pass through the policy's reactions to what earlier actions changed."""
+    truncate: int = 0
+    """Steps after which the gradient is cut (0: never)."""
+    checkpoint: int = 0
+    """Steps simulated twice instead of being kept in memory for the gradient (0: all are kept)."""
+
+    def __post_init__(self) -> None:
+        _one_of(self, "cost", Cost)
+        _positive(self, "rollouts", "learning_rate", "discriminator_updates")
+        _not_negative(self, "regression", "head_start", "expert_weight", "truncate", "checkpoint")
+
+
+@dataclass(frozen=True)
+class ValidationConfig:
+    """How checkpoints are judged while training; the best of them is the agent."""
+
+    data: Path | None = None
+    """Store of run segments to judge them on; without one the last checkpoint is the agent."""
+    every: int = 0
+    """Updates between judgements, a multiple of `checkpoint-every` (0: at every checkpoint)."""
+    segments: int = 200
+    """Run segments of it, evenly spaced (all, if there are fewer)."""
+    rollouts: int = 4
+    """Simulations of each."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "segments", "rollouts")
+        _not_negative(self, "every")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Train agents."""
 
     method: Positional[Method]
-    """What to train: behavioural cloning, with goals (h), with tree search (ts), with both."""
+    """What to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both."""
     data: Path
     """Store of run segments to learn from (see `symphony data convert`)."""
     out: Path
@@ -156,6 +209,8 @@ class TrainConfig:
     """Updates (the paper: 70 000)."""
     seed: int = 0
     """Of the weights and of the order of the data."""
+    duration: int = 0
+    """Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are)."""
     agent: AgentConfig = field(default_factory=AgentConfig)
     """The agent."""
     segments: int = 16
@@ -169,11 +224,15 @@ class TrainConfig:
     clip: float = 1.0
     """Largest norm of the gradient."""
     search: SearchConfig = field(default_factory=SearchConfig)
-    """The beam search (methods with TS)."""
+    """The beam search (methods with TS; MGAIL without TS simulates as many rollouts and keeps all)."""
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
-    """The discriminator (methods with TS)."""
+    """The discriminator (methods with TS, and MGAIL)."""
+    mgail: MGAILConfig = field(default_factory=MGAILConfig)
+    """Adversarial learning (methods mgail*)."""
     warm_start: Path | None = None
     """Folder of a run whose networks training starts from; new ones where that run has none."""
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    """Choice of the best checkpoint: that with the lowest collision rate plus off-road time (the paper)."""
     checkpoint_every: int = 1000
     """Updates between checkpoints."""
     log_every: int = 20
@@ -189,21 +248,43 @@ class TrainConfig:
         _one_of(self, "method", Method)
         _positive(self, "steps", "segments", "states", "goals", "learning_rate", "clip")
         _positive(self, "checkpoint_every", "log_every")
-        if self.searches and self.checkpoint_every % self.search.updates:
+        _not_negative(self, "duration")
+        if self.judged and self.checkpoint_every % self.search.updates:
             raise ConfigError(
                 f"checkpoint-every ({self.checkpoint_every}) must be a multiple of search.updates "
                 f"({self.search.updates}), so that a resumed run repeats no search"
+            )
+        if self.validation.every % self.checkpoint_every:
+            raise ConfigError(
+                f"validation.every ({self.validation.every}) must be a multiple of checkpoint-every "
+                f"({self.checkpoint_every}): only checkpoints are judged"
+            )
+        too_many = self.validation.rollouts > self.search.test_branches
+        if self.validation.data is not None and self.searches and too_many:
+            raise ConfigError(
+                f"validation.rollouts ({self.validation.rollouts}) must not exceed search.test-branches "
+                f"({self.search.test_branches}), the branches of one tree"
             )
 
     @property
     def hierarchical(self) -> bool:
         """Whether agents follow goals."""
-        return self.method in ("bc_h", "bc_ts_h")
+        return self.method.endswith("_h")
 
     @property
     def searches(self) -> bool:
         """Whether rollouts are refined by the search."""
-        return self.method in ("bc_ts", "bc_ts_h")
+        return "_ts" in self.method
+
+    @property
+    def adversarial(self) -> bool:
+        """Whether the policy learns from the gradient of the discriminator."""
+        return self.method.startswith("mgail")
+
+    @property
+    def judged(self) -> bool:
+        """Whether there is a discriminator."""
+        return self.searches or self.adversarial
 
 
 @dataclass(frozen=True)
@@ -225,6 +306,8 @@ class EvaluateConfig:
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
     """Of everything drawn at random in them."""
+    duration: int = 0
+    """Seconds of each run segment that are simulated; 0 takes what the agent was trained with."""
     interactive: int = 0
     """Interactive agents per run segment; 0 takes what the agent was trained with (2 for the baselines)."""
     batch: int = 16
@@ -239,7 +322,7 @@ class EvaluateConfig:
         _positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        _not_negative(self, "interactive", "branches")
+        _not_negative(self, "interactive", "branches", "duration")
 
 
 def to_json(config: Any) -> str:
@@ -272,7 +355,13 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, file: Path | None = No
             close = difflib.get_close_matches(name, fields, 1)
             hint = f", did you mean '{close[0]}'?" if close else ""
             raise ConfigError(f"{where}unknown setting '{name}'{hint}")
-    nested = {"agent": AgentConfig, "search": SearchConfig, "discriminator": DiscriminatorConfig}
+    nested = {
+        "agent": AgentConfig,
+        "search": SearchConfig,
+        "discriminator": DiscriminatorConfig,
+        "mgail": MGAILConfig,
+        "validation": ValidationConfig,
+    }
     built = {}
     for name, value in values.items():
         if name in nested and isinstance(value, dict):

@@ -28,7 +28,7 @@ COLLISION: Key = ("agents", "collision")
 OFFROAD: Key = ("agents", "offroad")
 """[..., N, 1] bool: box centre off the drivable area at this step."""
 NOISE: Key = ("agents", "noise")
-"""[..., N] float in (0, 1): the random number that decides an action."""
+"""[..., N] or [..., N, 2] float in (0, 1): the random numbers that decide an action."""
 LOGITS: Key = ("agents", "logits")
 SCORE: Key = ("agents", "score")
 """[..., N] float: the discriminator's logit; high where a state looks simulated."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, plot, train
+from symphony.cli import data, demo, evaluate, figure, plot, profiles, table, train
 from symphony.errors import ConfigError, SymphonyError
 
 __all__ = ["main"]
@@ -30,6 +30,8 @@ app = tyro.extras.SubcommandApp()
 app.command(data.app, name="data", help=data.__doc__)
 app.command(name="train")(train.Train)
 app.command(name="evaluate")(evaluate.Evaluate)
+app.command(name="table")(table.Table)
+app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
 app.command(name="demo")(demo.Demo)
 
@@ -47,6 +49,8 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         return _guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
+        if args[:1] == ["train"]:
+            args = profiles.expanded(args)
         command = app.cli(
             prog="symphony",
             description=DESCRIPTION,

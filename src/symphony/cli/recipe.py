@@ -1,16 +1,18 @@
-"""What the recipes share: train one method, judge it beside log playback, write the numbers."""
+"""What the recipes share: train one method, judge it beside log playback, keep the numbers."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from symphony.cli.tables import print_metrics, write_json
+from symphony.cli.evaluate import judge as judge_agent
+from symphony.cli.profiles import WORDS, Profile, expanded
+from symphony.cli.tables import print_metrics
 from symphony.config import EvaluateConfig, Method, TrainConfig
 
 
@@ -24,23 +26,20 @@ class Recipe:
     """Store of run segments to judge it on."""
     rollouts: int = 16
     """Simulations per run segment."""
+    profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
 
 
 def parse(method: Method, description: str | None, args: Sequence[str] | None = None) -> Recipe:
     """The recipe of one method from command-line arguments (those of the process by default)."""
     given = list(sys.argv[1:] if args is None else args)
-    return tyro.cli(Recipe, description=description, args=[method, *given])
+    return tyro.cli(Recipe, description=description, args=expanded([method, *given]))
 
 
 def judge(recipe: Recipe, run: Path) -> None:
-    """Evaluate a trained run, print the table and write ``test.json`` into its folder."""
-    from symphony.trainers import evaluate
-
+    """Evaluate a trained run, print its row and keep it where `symphony table` looks for it."""
     config = EvaluateConfig(
         rollouts=recipe.rollouts, seed=recipe.training.seed, device=recipe.training.device
     )
-    judged = evaluate(str(run), recipe.test, config)
-    log = evaluate("playback", recipe.test, replace(config, interactive=judged.interactive))
-    rows = [log.numbers(), judged.numbers()]
-    print_metrics(rows, title=str(recipe.test))
-    write_json(run / "test.json", {"rows": rows, "per_segment": judged.metrics.rows()})
+    found = judge_agent(str(run), recipe.test, config)
+    print_metrics(found.rows, title=str(recipe.test))
+    found.keep()

@@ -68,7 +68,12 @@ def _cell(value: float, error: float | None, digits: int) -> str:
 def write_json(path: Path, result: Any) -> None:
     """Write a result as JSON; numbers that are not finite become null."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(_finite(result), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(json_text(result), encoding="utf-8")
+
+
+def json_text(result: Any) -> str:
+    """A result as JSON; numbers that are not finite become null."""
+    return json.dumps(_finite(result), indent=2, allow_nan=False) + "\n"
 
 
 def _finite(value: Any) -> Any:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from symphony.cli.profiles import WORDS, Profile
 from symphony.config import TrainConfig
 
 
@@ -15,6 +16,7 @@ class Train:
     """Learn agents from a store of run segments."""
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
 
     def run(self) -> None:
         """Train them."""

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.metrics.curvature import curvature_histogram, jensen_shannon
+from symphony.metrics.curvature import BINS, curvature_histogram, jensen_shannon
 from symphony.metrics.kinds import CollisionKind, CollisionKinds
 
 
@@ -145,6 +145,14 @@ class RolloutMetrics:
             }
             for name, s in sorted(self.segments.items())
         ]
+
+    def curvature_histograms(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Counts [201] of the branching regions visited by their average curvature: rollouts, and logs."""
+        visited, visited_log = np.zeros((2, BINS), np.int64)
+        for segment in self.segments.values():
+            visited += segment.histogram
+            visited_log += segment.histogram_log
+        return visited, visited_log
 
     def compute(self) -> dict[str, Any]:
         """The table row.

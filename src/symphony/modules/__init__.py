@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from symphony.modules.discriminator import FORESIGHT, Discriminator, discriminator
+from symphony.modules.displacement import BoundedDisplacement, displacement_policy
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
 from symphony.modules.policy import NoiseSampler, discrete_policy
@@ -12,6 +13,7 @@ from symphony.modules.sampling import inverse_cdf
 
 __all__ = [
     "FORESIGHT",
+    "BoundedDisplacement",
     "Discriminator",
     "ElementGroup",
     "NoiseSampler",
@@ -20,6 +22,7 @@ __all__ = [
     "SceneNetwork",
     "discrete_policy",
     "discriminator",
+    "displacement_policy",
     "drawn_goals",
     "goal_policy",
     "in_blocks",

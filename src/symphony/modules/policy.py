@@ -1,4 +1,4 @@
-"""Policies over discrete actions."""
+"""Policies over discrete actions, and draws decided by given numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
 )
 from tensordict.nn.probabilistic import interaction_type
-from torch.distributions import Categorical
+from torch.distributions import Categorical, Distribution
 
 from symphony.keys import ACTION, LOGITS, NOISE, OWN, VALID
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
@@ -21,34 +21,39 @@ from symphony.modules.sampling import inverse_cdf
 
 
 class NoiseSampler(ProbabilisticTensorDictModule):
-    """A categorical draw decided by a number found in the TensorDict, if there is one.
+    """A draw decided by numbers found in the TensorDict, if there are any.
 
-    With exploration type RANDOM and a uniform number `[...]` under `noise_key`, the action is
-    :func:`symphony.modules.inverse_cdf` of it: the same scene and number give the same action in any batch.
-    Without the number, or with another exploration type, it samples as its base class does.
+    With exploration type RANDOM and uniform numbers under `noise_key`, the action is their quantile
+    (:func:`symphony.modules.inverse_cdf` of one number `[...]` for a categorical, else the distribution's `icdf`):
+    the same scene and numbers give the same action in any batch. Without them, or with another exploration type,
+    it samples as its base class does.
 
     Args:
-        logits_key: `[..., C]`.
-        action_key: `[...]` int64, written.
-        noise_key: `[...]` float in (0, 1), optional in the TensorDict.
+        parameters: key of the logits `[..., C]`, or the keys of all parameters by their names.
+        action_key: written.
+        noise_key: float in (0, 1), optional in the TensorDict.
+        distribution_class: a categorical, or one with an `icdf`.
+        distribution_kwargs: what else it takes.
         return_log_prob: write the action's log-probability `[...]` under `log_prob_key`.
     """
 
     def __init__(
         self,
-        logits_key: NestedKey = LOGITS,
+        parameters: NestedKey | dict[str, NestedKey] = LOGITS,
         action_key: NestedKey = ACTION,
         *,
         noise_key: NestedKey = NOISE,
+        distribution_class: type[Distribution] = Categorical,
+        distribution_kwargs: dict[str, Any] | None = None,
         return_log_prob: bool = False,
         log_prob_key: NestedKey = ("agents", "action_log_prob"),
     ) -> None:
         super().__init__(
-            in_keys={"logits": logits_key},
+            in_keys=parameters if isinstance(parameters, dict) else {"logits": parameters},
             out_keys=[action_key],
-            distribution_class=Categorical,
+            distribution_class=distribution_class,
             # Validation would wait for the device at each draw.
-            distribution_kwargs={"validate_args": False},
+            distribution_kwargs={"validate_args": False, **(distribution_kwargs or {})},
             default_interaction_type=InteractionType.RANDOM,
             return_log_prob=return_log_prob,
             log_prob_key=log_prob_key if return_log_prob else None,
@@ -69,7 +74,7 @@ class NoiseSampler(ProbabilisticTensorDictModule):
             return super().forward(tensordict, tensordict_out, _requires_sample, **kwargs)
         out = tensordict if tensordict_out is None else tensordict_out
         dist = self.get_dist(tensordict)
-        action = inverse_cdf(dist.logits, noise)
+        action = inverse_cdf(dist.logits, noise) if isinstance(dist, Categorical) else dist.icdf(noise)
         out.set(self.dist_sample_keys[0], action)
         if self.return_log_prob:
             out.set(self.log_prob_key, dist.log_prob(action))

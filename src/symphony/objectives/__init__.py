@@ -6,6 +6,7 @@ from symphony.objectives.bc import BCLoss
 from symphony.objectives.discriminator import DiscriminatorLoss
 from symphony.objectives.distillation import DistillationLoss
 from symphony.objectives.goal import GoalLoss
+from symphony.objectives.mgail import MGAILLoss
 from symphony.objectives.statistics import auc
 
-__all__ = ["BCLoss", "DiscriminatorLoss", "DistillationLoss", "GoalLoss", "auc"]
+__all__ = ["BCLoss", "DiscriminatorLoss", "DistillationLoss", "GoalLoss", "MGAILLoss", "auc"]

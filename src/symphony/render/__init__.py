@@ -2,11 +2,13 @@
 
 from symphony.render.curves import plot_curves
 from symphony.render.genealogy import plot_genealogy, plot_search
+from symphony.render.histograms import plot_curvature
 from symphony.render.plots import plot_grid, plot_rollout, plot_segment
 from symphony.render.tree import SearchTree, plot_tree
 
 __all__ = [
     "SearchTree",
+    "plot_curvature",
     "plot_curves",
     "plot_genealogy",
     "plot_grid",

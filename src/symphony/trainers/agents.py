@@ -14,8 +14,9 @@ from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
-from symphony.trainers.checkpoint import latest, load_checkpoint
-from symphony.trainers.networks import build_networks, observation_config
+from symphony.trainers.checkpoint import load_checkpoint
+from symphony.trainers.networks import Networks, build_networks, dynamics_of, observation_config
+from symphony.trainers.selection import choose, split_name
 
 PLAYBACK = "playback"
 """Name of the logged trajectories themselves, judged like an agent."""
@@ -32,8 +33,10 @@ class Agent:
         observation: what it sees.
         interactive: how many agents a segment it was trained with.
         goals: draws routes from first states; None for agents that follow none.
-        discriminator: scores states; None for agents trained without search.
+        discriminator: scores states; None for agents trained without.
         search: how branches are pruned, where there is a discriminator.
+        searches: whether it is meant to be simulated with the search.
+        duration: seconds of a segment it was trained with; 0 for all.
     """
 
     name: str
@@ -44,42 +47,49 @@ class Agent:
     goals: TensorDictModuleBase | None = None
     discriminator: TensorDictModuleBase | None = None
     search: SearchConfig = field(default_factory=SearchConfig)
+    searches: bool = True
+    duration: int = 0
 
 
 def load_agent(name: str, device: str = "cpu") -> Agent:
     """An agent by name.
 
     Args:
-        name: ``playback``, ``constant_velocity``, or the folder of a run (its last checkpoint is taken).
+        name: ``playback``, ``constant_velocity``, or the folder of a run, of which the best checkpoint is taken if
+            it was validated, else the last; ``RUN@last``, ``RUN@best`` or ``RUN@3000`` (a step) names another.
         device: where its weights go.
 
     Raises:
-        ConfigError: if there is no such agent.
+        ConfigError: if there is no such agent or checkpoint.
         CheckpointError: if its weights can't be read.
     """
     if name == PLAYBACK:
         return Agent(name, None, Bicycle(), ObservationConfig(num_points=1))
     if name == "constant_velocity":
         return Agent(name, ConstantVelocity(Bicycle()), Bicycle(), ObservationConfig(num_points=1))
-    folder = Path(name)
+    folder, which = split_name(name)
     config = read_config(folder)
-    newest = latest(folder / "checkpoints")
-    if newest is None:
-        raise ConfigError(f"{folder}: the run has no checkpoint yet")
-    dynamics = Bicycle()
-    networks = build_networks(config, dynamics)
-    load_checkpoint(newest, modules=networks.present(), partial=True, restore_rng=False)
+    checkpoint = choose(folder, which)
+    networks = build_networks(config)
+    load_checkpoint(checkpoint, modules=networks.present(), partial=True, restore_rng=False)
     for module in networks.present().values():
         module.to(torch.device(device)).eval()
+    return assemble(name, config, networks)
+
+
+def assemble(name: str, config: TrainConfig, networks: Networks) -> Agent:
+    """The agent that the networks of a run make, to be simulated as it was trained."""
     return Agent(
         name,
         networks.policy,
-        dynamics,
+        dynamics_of(config),
         observation_config(config),
         config.agent.interactive,
         networks.goals,
         networks.discriminator,
         config.search,
+        config.searches,
+        config.duration,
     )
 
 

@@ -214,6 +214,8 @@ def latest(folder: Path) -> Path | None:
 def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> list[Path]:
     """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`; return them.
 
+    What a kill in an earlier deletion has left goes too.
+
     Raises:
         CheckpointError: if the disk refuses.
     """
@@ -224,8 +226,10 @@ def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> list[Pat
         for path in gone:
             # Without its manifest it counts no longer, however far the deletion gets.
             (path / MANIFEST).unlink()
-            shutil.rmtree(path)
             shutil.rmtree(path.with_name(f".old-{path.name}"), ignore_errors=True)
+        for path in Path(folder).iterdir():
+            if _NAME.fullmatch(path.name) and path.is_dir() and not (path / MANIFEST).is_file():
+                shutil.rmtree(path)
     except OSError as error:
         raise CheckpointError(f"can't delete the checkpoint: {error}", file=folder) from error
     return gone

@@ -19,6 +19,7 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
 from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices, route_table
 from symphony.envs.scene import SceneBatch, collate, scene
+from symphony.errors import DataError
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, lane_of
 
@@ -111,7 +112,11 @@ class SceneDataset:
         dynamics: action space the experts are fitted to.
         indices: rows of the store to use; all by default.
         routes: whether scenes and experts come with their routes.
+        duration: seconds of each segment that are used; 0 for all.
         keep: segments held in memory once they are prepared.
+
+    Raises:
+        DataError: on access, for a segment shorter than the duration.
     """
 
     def __init__(
@@ -122,13 +127,14 @@ class SceneDataset:
         indices: Sequence[int] | None = None,
         *,
         routes: bool = False,
+        duration: float = 0,
         keep: int = KEEP,
     ) -> None:
         self.store = store
         self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
-        self.routes = routes
+        self.routes, self.duration = routes, duration
         self.scene = lru_cache(keep)(self._scene)
         self.experts = lru_cache(keep)(self._experts)
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
@@ -137,8 +143,20 @@ class SceneDataset:
         return len(self.indices)
 
     def segment(self, i: int) -> RunSegment:
-        """The run segment behind item ``i``."""
-        return self.store[self.indices[i]]
+        """The run segment behind item ``i``, up to the duration."""
+        segment = self.store[self.indices[i]]
+        if not self.duration:
+            return segment
+        steps = round(self.duration / segment.dt) + 1
+        if segment.num_steps < steps:
+            has = (segment.num_steps - 1) * segment.dt
+            raise DataError(
+                f"has {has:g} s, {self.duration:g} are asked for",
+                file=self.store.path,
+                segment=segment.segment_id,
+            )
+        timed = ("position", "heading", "velocity", "valid", "signal_state")
+        return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
 
     def graph(self, i: int) -> LaneGraph:
         """The lane graph of item ``i``; segments on one map share it."""
@@ -313,6 +331,7 @@ def expert_batch(
         (keys.POINTS, seen.points),
         (keys.POINTS_MASK, seen.points_mask),
         (keys.VALID, real),
+        (keys.STATE, here),
     ):
         batch.set(key, value)
     if action is not None:

@@ -87,8 +87,34 @@ def evaluate(
         raise DataError("the store holds no run segments", file=store.path)
     interactive = config.interactive or agent.interactive
     dataset = SceneDataset(
-        store, interactive, agent.dynamics, routes=agent.goals is not None, keep=config.batch
+        store,
+        interactive,
+        agent.dynamics,
+        routes=agent.goals is not None,
+        duration=config.duration or agent.duration,
+        keep=config.batch,
     )
+    return judge(agent, dataset, config, progress)
+
+
+def judge(
+    agent: Agent,
+    dataset: SceneDataset,
+    config: EvaluateConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Judge an agent on every run segment of a prepared dataset, as :func:`evaluate` does.
+
+    Args:
+        agent: the agent, on ``config.device``.
+        dataset: in the agent's action space, with routes if it follows goals; it decides how many agents act and
+            for how long.
+        config: how else.
+        progress: called with the segments done and their total.
+
+    Raises:
+        DataError: if a segment has too few agents for so many interactive ones.
+    """
     metrics = RolloutMetrics()
     for first in range(0, len(dataset), config.batch):
         items = list(range(first, min(first + config.batch, len(dataset))))
@@ -96,7 +122,7 @@ def evaluate(
         if progress is not None:
             progress(items[-1] + 1, len(dataset))
     kind = "log" if agent.policy is None else _kind(agent, config)
-    return Evaluation(agent.name, metrics, config, interactive, kind)
+    return Evaluation(agent.name, metrics, config, dataset.interactive, kind)
 
 
 def _evaluate_batch(
@@ -166,7 +192,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         logged_goals=config.logged_goals,
     )
     if _kind(agent, config) == "none":
-        policy = TensorDictSequential(SeededNoise(config.seed), agent.policy)
+        policy = TensorDictSequential(SeededNoise.of(env, config.seed), agent.policy)
         found = simulate(env, policy, start)
     else:
         best = config.search == "best"
@@ -193,7 +219,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
 
 def _kind(agent: Agent, config: EvaluateConfig) -> str:
     if config.search == "agent":
-        return "none" if agent.discriminator is None else "tree"
+        return "tree" if agent.searches and agent.discriminator is not None else "none"
     if config.search in ("tree", "best") and agent.discriminator is None:
         raise ConfigError(
             f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none"

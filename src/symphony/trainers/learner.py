@@ -10,16 +10,18 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from symphony import keys
-from symphony.collectors import BeamSearchResult
+from symphony.collectors import BeamSearchResult, KeepAll
 from symphony.config import TrainConfig
 from symphony.envs.driving import DrivingEnv
-from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, auc
+from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss, auc
 from symphony.streams import fold_in
 from symphony.trainers.dataset import SceneDataset
 from symphony.trainers.networks import Networks, observation_config
 from symphony.trainers.simulate import pruning_rule, search
 
 _SEED_STRIDE = 1_000_003
+_SEEN = (keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE)
+"""What an agent observes and could react to."""
 _POLICY_KEYS = (
     keys.OWN,
     keys.OBJECTS,
@@ -40,7 +42,8 @@ class SearchData:
 
     Attributes:
         env: the environment of the searched scenes.
-        survivors: [B, S, T] state, action and step along the histories of the leaves.
+        start: [B, S] the states it began with.
+        survivors: [B, S, T] state, action, step and random numbers along the histories of the leaves.
         rank: [B, S] place of each leaf in its tree.
         simulated: [B, S, T] states after each step, pruned branches included.
         logged: [B, T, N, 4] states of the log, fitted to the action space.
@@ -49,6 +52,7 @@ class SearchData:
     """
 
     env: DrivingEnv
+    start: TensorDictBase
     survivors: TensorDictBase
     rank: Tensor
     simulated: TensorDictBase
@@ -79,9 +83,10 @@ class Learner:
             DistillationLoss(
                 networks.policy, rollout_weight=search_config.weight, survivors=search_config.survivors
             )
-            if config.searches
+            if config.searches and not config.adversarial
             else BCLoss(networks.policy)
         )
+        self.mgail_loss = None
         self.goal_loss = self.judge_loss = None
         if networks.goals is not None:
             self.goal_loss = GoalLoss(networks.goals)
@@ -92,6 +97,16 @@ class Learner:
                 gradient_penalty=judge.gradient_penalty,
                 instance_noise=judge.instance_noise,
                 noise_keys=[keys.OWN, keys.OBJECTS] if judge.instance_noise else (),
+            )
+        if config.adversarial and networks.discriminator is not None:
+            settings = config.mgail
+            self.mgail_loss = MGAILLoss(
+                networks.policy,
+                networks.discriminator,
+                cost=settings.cost,
+                detach_keys=() if settings.react else [k for k in networks.policy.in_keys if k in _SEEN],
+                truncate=settings.truncate,
+                checkpoint=settings.checkpoint,
             )
         rates = {"discriminator": judge.learning_rate}
         self.rates = {name: rates.get(name, config.learning_rate) for name in networks.present()}
@@ -107,37 +122,80 @@ class Learner:
         items = self.dataset.draw(config.segments, rng)
         self._set_rates(step)
         record: dict[str, Tensor] = {}
-        batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
-        if self.judge_loss is not None:
-            if self._found is None or step % config.search.updates == 0:
-                self._found = self._search(step, rng)
-            record |= self._found.record
-            batch = _joined(batch, self._surviving(self._found, rng))
-            losses = self.judge_loss(self._both_kinds(self._found, rng))
-            record |= self._descend("discriminator", losses, "loss_discriminator")
-        loss = self.policy_loss(batch)
-        record |= self._descend("policy", loss, self.policy_loss.out_keys[0])
+        found = self._searched(step, rng)
+        if found is not None and self.judge_loss is not None:
+            record |= found.record
+            for _ in range(config.mgail.discriminator_updates if config.adversarial else 1):
+                losses = self.judge_loss(self._both_kinds(found, rng))
+                record |= self._descend("discriminator", losses, "loss_discriminator")
+        record |= self._improve_policy(step, items, found, rng)
         if self.goal_loss is not None:
             goals = self.dataset.sample_goals(items, config.goals, self.sees, rng, self.device)
             losses = self.goal_loss(goals)
-            found = self._descend("goals", losses, "loss_goal")
-            record |= {name if "goal" in name else f"goal_{name}": value for name, value in found.items()}
+            values = self._descend("goals", losses, "loss_goal")
+            record |= {name if "goal" in name else f"goal_{name}": value for name, value in values.items()}
         return record
+
+    def _searched(self, step: int, rng: torch.Generator) -> SearchData | None:
+        """The last search, or a new one if it is due; None where there is nothing to judge (yet)."""
+        config = self.config
+        if self.judge_loss is None or (config.adversarial and step < config.mgail.regression):
+            return None
+        if self._found is None or step % config.search.updates == 0:
+            self._found = self._search(step, rng)
+        return self._found
+
+    def _improve_policy(
+        self, step: int, items: list[int], found: SearchData | None, rng: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Towards the log, and the survivors or the discriminator's gradient where there are any."""
+        config, settings = self.config, self.config.mgail
+        if self.mgail_loss is None or found is None:
+            batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
+            if found is not None:
+                batch = _joined(batch, self._surviving(found, rng))
+            return self._descend("policy", self.policy_loss(batch), self.policy_loss.out_keys[0])
+        if step < settings.regression + settings.head_start:
+            return {}
+        self.mgail_loss.env = found.env
+        losses = self.mgail_loss(self._replayed(found, rng))
+        total = losses["loss_mgail"]
+        if settings.expert_weight:
+            batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
+            losses.update(self.policy_loss(batch))
+            total = total + settings.expert_weight * losses["loss_bc"]
+        return self._descend("policy", losses.set("loss_policy", total), "loss_policy")
+
+    def _replayed(self, found: SearchData, rng: torch.Generator) -> TensorDictBase:
+        """First states [rollouts] of survivors, with the random numbers that lead along their histories."""
+        scenes, branches = found.start.shape
+        pick = torch.randperm(scenes * branches, generator=rng)[: self.config.mgail.rollouts]
+        start = found.start.flatten(0, 1)[pick]
+        return start.set("noise_plan", found.survivors.get(keys.NOISE).flatten(0, 1)[pick])
 
     def _descend(self, name: str, losses: TensorDictBase, key: str) -> dict[str, Tensor]:
         optimizer, module = self.optimizers[name], self.networks.present()[name]
         optimizer.zero_grad(set_to_none=True)
         losses[key].backward()
         norm = nn.utils.clip_grad_norm_(module.parameters(), self.config.clip)
-        optimizer.step()
+        if bool(norm.isfinite()):  # else the update is skipped; the training loop counts them
+            optimizer.step()
         return {**{k: v.detach() for k, v in losses.items()}, f"gradient_norm_{name}": norm}
 
     def _set_rates(self, step: int) -> None:
-        """Cosine from the configured rates to a tenth of them."""
-        share = 0.5 * (1 + math.cos(math.pi * step / self.config.steps))
+        """Cosines from the configured rates to a tenth of them: one for all updates, or for MGAIL two."""
+        config, begin, end, rates = self.config, 0, self.config.steps, self.rates
+        if config.adversarial and config.mgail.regression:
+            regressing = step < config.mgail.regression
+            begin, end = (
+                (0, config.mgail.regression) if regressing else (config.mgail.regression, config.steps)
+            )
+        if config.adversarial and step >= config.mgail.regression:
+            rates = {**rates, "policy": config.mgail.learning_rate}
+        share = 0.5 * (1 + math.cos(math.pi * (step - begin) / (end - begin)))
         for name, optimizer in self.optimizers.items():
             for group in optimizer.param_groups:
-                group["lr"] = self.rates[name] * (0.1 + 0.9 * share)
+                group["lr"] = rates[name] * (0.1 + 0.9 * share)
 
     @torch.no_grad()
     def _search(self, step: int, rng: torch.Generator) -> SearchData:
@@ -158,7 +216,7 @@ class Learner:
             self.networks.discriminator,
             start,
             seed=self.config.seed,
-            rule=pruning_rule(settings),
+            rule=pruning_rule(settings) if self.config.searches else KeepAll(),
             prune_every=settings.prune_every,
             keep_tree=True,
         )
@@ -168,7 +226,7 @@ class Learner:
         carried = carried.unsqueeze(-1).expand(*carried.batch_size, steps)
         order = result.leaf_totals[..., -1, :].argsort(dim=-1, stable=True)
         rank = order.argsort(dim=-1, stable=True)
-        survivors = result.trajectories.select(keys.STATE, keys.ACTION, keys.STEP)
+        survivors = result.trajectories.select(keys.STATE, keys.ACTION, keys.STEP, keys.NOISE)
         simulated = result.tree.select(("next", *keys.STATE), keys.STEP)
         simulated = TensorDict(
             {keys.STEP: simulated[keys.STEP] + 1, keys.STATE: simulated[("next", *keys.STATE)]},
@@ -177,6 +235,7 @@ class Learner:
         log, log_valid = self.dataset.fitted(items, scenes)
         return SearchData(
             env,
+            start,
             survivors.update(carried),
             rank,
             simulated.update(carried),

@@ -9,10 +9,17 @@ from torch import nn
 
 from symphony import keys
 from symphony.config import TrainConfig
-from symphony.envs.dynamics import Bicycle
+from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
-from symphony.modules import FORESIGHT, ElementGroup, discrete_policy, discriminator, goal_policy
+from symphony.modules import (
+    FORESIGHT,
+    ElementGroup,
+    discrete_policy,
+    discriminator,
+    displacement_policy,
+    goal_policy,
+)
 
 
 @dataclass
@@ -22,7 +29,7 @@ class Networks:
     Attributes:
         policy: actions from observations, and from a route with H.
         goals: routes from first states; None without H.
-        discriminator: how simulated a state looks; None without TS.
+        discriminator: how simulated a state looks; None for behavioural cloning without TS.
     """
 
     policy: ProbabilisticTensorDictSequential
@@ -37,7 +44,7 @@ class Networks:
 
 def observation_config(config: TrainConfig) -> ObservationConfig:
     """What the networks need to see."""
-    features = config.discriminator.features if config.searches else "paper"
+    features = config.discriminator.features if config.judged else "paper"
     return ObservationConfig(
         num_objects=config.agent.num_objects,
         num_points=config.agent.num_points,
@@ -47,7 +54,12 @@ def observation_config(config: TrainConfig) -> ObservationConfig:
     )
 
 
-def build_networks(config: TrainConfig, dynamics: Bicycle) -> Networks:
+def dynamics_of(config: TrainConfig) -> Bicycle | Displacement:
+    """The action space: MGAIL needs one that its gradient can pass (paper, section V-A)."""
+    return Displacement() if config.adversarial else Bicycle()
+
+
+def build_networks(config: TrainConfig) -> Networks:
     """Freshly initialised networks; seed torch beforehand."""
     groups = (
         ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
@@ -56,25 +68,30 @@ def build_networks(config: TrainConfig, dynamics: Bicycle) -> Networks:
     own_keys = (keys.OWN, keys.ROUTE) if config.hierarchical else (keys.OWN,)
     own = SELF_FEATURES + (ROUTE_FEATURES if config.hierarchical else 0)
     agent, judge = config.agent, config.discriminator
-    networks = Networks(
-        discrete_policy(
+    head, sees, dynamics = (agent.head, agent.head), observation_config(config), dynamics_of(config)
+    if isinstance(dynamics, Bicycle):
+        policy = discrete_policy(
             own,
             groups,
             actions=dynamics.num_actions,
             hidden=agent.hidden,
-            head=(agent.head, agent.head),
+            head=head,
             own_keys=own_keys,
         )
-    )
+    else:
+        policy = displacement_policy(
+            own, groups, hidden=agent.hidden, head=head, size_scale=sees.size_scale, own_keys=own_keys
+        )
+    networks = Networks(policy)
     if config.hierarchical:
         networks.goals = goal_policy(SELF_FEATURES, groups, CHOICE_FEATURES, hidden=agent.hidden)
-    if config.searches:
+    if config.judged:
         networks.discriminator = discriminator(
             own,
             OBJECT_FEATURES,
             POINT_FEATURES,
             own_keys=own_keys,
-            radius=judge.radius / observation_config(config).distance_scale,
+            radius=judge.radius / sees.distance_scale,
             hidden=judge.hidden,
             head=(judge.head,),
             features=judge.features,

@@ -57,21 +57,30 @@ class SeededNoise(TensorDictModuleBase):
 
     Args:
         seed: of the evaluation.
+        numbers: per agent; 0 for a single one without a dimension of its own.
     """
 
     in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
     out_keys = [keys.NOISE]  # noqa: RUF012
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, numbers: int = 0) -> None:
         super().__init__()
-        self.seed = seed
+        self.seed, self.numbers = seed, numbers
+
+    @classmethod
+    def of(cls, env: DrivingEnv, seed: int) -> SeededNoise:
+        """As many numbers as an action of the environment takes."""
+        return cls(seed, 0 if env.dynamics.discrete else 2)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write numbers [..., N] in (0, 1)."""
+        """Write numbers [..., N] or [..., N, numbers] in (0, 1)."""
         agents = tensordict.get(keys.VALID).shape[-1]
         place = torch.arange(agents, device=tensordict.device)
-        stream = fold_in(tensordict.get(keys.STREAM), place)
-        return tensordict.set(keys.NOISE, uniform(self.seed, stream, tensordict.get(keys.STEP)))
+        stream, step = fold_in(tensordict.get(keys.STREAM), place), tensordict.get(keys.STEP)
+        if self.numbers:
+            stream = fold_in(stream[..., None], torch.arange(self.numbers, device=stream.device))
+            step = step[..., None]
+        return tensordict.set(keys.NOISE, uniform(self.seed, stream, step))
 
 
 @torch.no_grad()
@@ -212,7 +221,7 @@ def search(
     following = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
     return beam_search(
         env,
-        TensorDictSequential(SeededNoise(seed), policy),
+        TensorDictSequential(SeededNoise.of(env, seed), policy),
         until_the_end,
         start,
         steps=steps,
@@ -222,7 +231,7 @@ def search(
         leaves=leaves,
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
-        keep=[keys.STATE, keys.ACTION, keys.STEP, *following],
+        keep=[keys.STATE, keys.ACTION, keys.NOISE, keys.STEP, *following],
         keep_tree=keep_tree,
     )
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
+
+from symphony.errors import DataError
 
 
 class Tracker:
@@ -18,6 +22,10 @@ class Tracker:
         wandb: ``offline``, ``online`` or ``disabled``. The environment variable ``WANDB_MODE`` overrides it, as
             it does everywhere else.
         after: keep only records up to this step of an earlier, interrupted run.
+
+    Attributes:
+        path: the file.
+        kept: records of that earlier run.
     """
 
     def __init__(
@@ -28,10 +36,11 @@ class Tracker:
         after: int = 0,
     ) -> None:
         self.path = folder / "metrics.jsonl"
-        kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
-        self._file = self.path.open("w", encoding="utf-8")
-        for record in kept:
-            self._write(record)
+        self.kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
+        # Put in place as a whole, lest a kill meanwhile lose what is kept.
+        write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
+        with _naming(self.path):
+            self._file = self.path.open("a", encoding="utf-8")
         self._run = None
         mode: Any = os.environ.get("WANDB_MODE", wandb)
         if mode != "disabled":
@@ -46,26 +55,32 @@ class Tracker:
                 settings=tracking.Settings(silent=True, console="off"),
             )
 
-    def log(self, step: int, values: dict[str, float]) -> None:
-        """Record numbers at an update."""
-        self._write({"step": step, **values})
-        if self._run is not None:
-            self._run.log(values, step=step)
-
-    def _write(self, record: dict[str, Any]) -> None:
-        # JSON knows no NaN, which stands for statistics of nothing.
+    def log(self, step: int, values: Mapping[str, float | str]) -> None:
+        """Record numbers, and words, at an update. Raises DataError if the disk refuses."""
+        # JSON knows no NaN, which stands for statistics of nothing, and no infinity.
         known = {
-            name: None if isinstance(value, float) and math.isnan(value) else value
-            for name, value in record.items()
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in values.items()
         }
-        self._file.write(json.dumps(known) + "\n")
-        self._file.flush()
+        with _naming(self.path):
+            self._file.write(json.dumps({"step": step, **known}) + "\n")
+            self._file.flush()
+        if self._run is not None:
+            self._run.log(dict(values), step=step)
+
+    def sync(self) -> None:
+        """Wait until all records are on the disk: a checkpoint must not survive a power cut that they don't."""
+        with _naming(self.path):
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Finish the files."""
-        self._file.close()
-        if self._run is not None:
-            self._run.finish()
+        try:
+            with _naming(self.path):
+                self._file.close()
+        finally:
+            if self._run is not None:
+                self._run.finish()
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -80,3 +95,23 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return records
+
+
+def write_file(path: Path, text: str) -> None:
+    """Write a text file that appears complete or not at all. Raises DataError if the disk refuses."""
+    new = path.with_name(f".new-{path.name}")
+    with _naming(path):
+        with new.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of the disk, with the file that they are about."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"can't be written: {error.strerror or error}", file=path) from error

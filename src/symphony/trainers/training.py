@@ -4,33 +4,38 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from symphony.config import TrainConfig, to_json
 from symphony.data.store import SegmentStore
-from symphony.envs.dynamics import Bicycle
 from symphony.errors import ConfigError, DataError
 from symphony.trainers.agents import read_config
+from symphony.trainers.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.trainers.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
 from symphony.trainers.dataset import SceneDataset
 from symphony.trainers.learner import Learner
-from symphony.trainers.networks import Networks, build_networks
-from symphony.trainers.tracking import Tracker
+from symphony.trainers.networks import Networks, build_networks, dynamics_of
+from symphony.trainers.selection import Best, choose, split_name
+from symphony.trainers.tracking import Tracker, write_file
+from symphony.trainers.validation import Validator
 
 KEEP = 3
-"""Checkpoints kept in a run's folder."""
+"""Checkpoints kept in a run's folder, the last ones; the best beside them."""
 
 
 def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
     """Train an agent as configured.
 
     The data of every update is drawn from (seed, update) alone, and checkpoints hold weights and optimiser, so a
-    run that was stopped and resumed ends with the same weights as one that was not.
+    run that was stopped and resumed ends with the same weights as one that was not. With a store to validate on, the
+    checkpoint that does best there is the run's agent.
 
     Args:
         config: what to train.
@@ -41,64 +46,154 @@ def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
 
     Raises:
         ConfigError: if the folder holds another run, or settings can't be used.
-        DataError: if the store can't be read or holds nothing to learn from.
+        DataError: if a store can't be read or holds nothing to learn from, or the disk refuses.
+        TrainingError: if gradients stay infinite or undefined.
     """
     device = _device(config.device)
-    dynamics = Bicycle()
     if dataset is None:
         store = SegmentStore(config.data)
-        dataset = SceneDataset(store, config.agent.interactive, dynamics, routes=config.hierarchical)
+        dataset = SceneDataset(
+            store,
+            config.agent.interactive,
+            dynamics_of(config),
+            routes=config.hierarchical,
+            duration=config.duration,
+        )
     if len(dataset) == 0:
         raise DataError("the store holds no run segments", file=config.data)
     if config.hierarchical and not dataset.routes:
         raise ConfigError(f"method {config.method} needs a dataset with routes")
     done = _find(config)
     torch.manual_seed(config.seed)
-    networks = build_networks(config, dynamics)
+    networks = build_networks(config)
     if config.warm_start is not None and done is None:
         _warm_start(networks, config.warm_start)
     for module in networks.present().values():
         module.to(device)
     learner = Learner(config, networks, dataset, device)
+    validator = None if config.validation.data is None else Validator(config, networks, device)
     config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / "config.json").write_text(to_json(config), encoding="utf-8")
-    step = 0
-    if done is not None:
-        step = load_checkpoint(done, modules=networks.present(), optimizers=learner.optimizers).step
-    tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
-    try:
-        with _progress() as progress:
-            task = progress.add_task("training", total=config.steps, completed=step, loss=math.nan)
-            began, first = time.perf_counter(), step
-            while step < config.steps:
-                values = learner.update(step)
-                step += 1
-                if step % config.log_every == 0 or step == config.steps:
-                    numbers = {name: value.item() for name, value in values.items()}
-                    numbers["updates_per_second"] = (step - first) / (time.perf_counter() - began)
-                    numbers["learning_rate"] = learner.optimizers["policy"].param_groups[0]["lr"]
-                    tracker.log(step, numbers)
-                    progress.update(task, loss=numbers[learner.policy_loss.out_keys[0]])
-                progress.update(task, completed=step)
-                if step % config.checkpoint_every == 0 or step == config.steps:
-                    folder = config.out / "checkpoints"
-                    save_checkpoint(
-                        folder, step=step, modules=networks.present(), optimizers=learner.optimizers
-                    )
-                    prune(folder, KEEP)
-    finally:
-        tracker.close()
-    return config.out
+    write_file(config.out / "config.json", to_json(config))
+    return _Loop(config, learner, validator).run(done)
 
 
-def _warm_start(networks: Networks, folder: Path) -> None:
+class _Loop:
+    """One run: updates, records, judgements and checkpoints, in that order."""
+
+    def __init__(self, config: TrainConfig, learner: Learner, validator: Validator | None) -> None:
+        self.config, self.learner, self.validator = config, learner, validator
+        self.modules = learner.networks.present()
+        self.skips, self.told = Skips(), set[str]()
+        self.best: Best | None = None
+        self.progress = _progress()
+
+    def run(self, done: Path | None) -> Path:
+        """Train from a checkpoint, or from the start, to the end."""
+        config, step = self.config, 0
+        if done is not None:
+            loaded = load_checkpoint(done, modules=self.modules, optimizers=self.learner.optimizers)
+            step = loaded.step
+            self._restore(loaded.extra)
+            # The process before may have died in between.
+            self._prune()
+        self.tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
+        self.alarms = Alarms(self.tracker.kept)
+        try:
+            with self.progress:
+                self.task = self.progress.add_task(
+                    "training", total=config.steps, completed=step, loss="-", speed="-"
+                )
+                self._update_from(step)
+        finally:
+            self.tracker.close()
+        return config.out
+
+    def _update_from(self, step: int) -> None:
+        config, first, began = self.config, step, time.perf_counter()
+        while step < config.steps:
+            values = self.learner.update(step)
+            step += 1
+            last = step == config.steps
+            for network in self.skips.count(values):
+                self._warn(f"{NORM}{network}", f"a gradient of the {network} network is not finite; skipped")
+            numbers: dict[str, float | str] = {}
+            if last or step % config.log_every == 0:
+                numbers = {name: value.item() for name, value in values.items()}
+                numbers["updates_per_second"] = (step - first) / (time.perf_counter() - began)
+                numbers |= self._describe(numbers)
+            self.progress.update(self.task, completed=step)
+            if self.validator is not None and (last or step % _validate_every(config) == 0):
+                paused = time.perf_counter()
+                numbers |= self._validate(self.validator, step)
+                began += time.perf_counter() - paused
+            if numbers:
+                self.tracker.log(step, numbers)
+            if last or step % config.checkpoint_every == 0:
+                self._save(step)
+
+    def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
+        """What the loop adds to a record, and shows."""
+        rate = self.learner.optimizers["policy"].param_groups[0]["lr"]
+        added: dict[str, float | str] = {"learning_rate": rate, "skipped_updates": self.skips.total}
+        loss = loss_of("policy", numbers)
+        if loss is not None:
+            self.progress.update(self.task, loss=f"{numbers[loss]:.3f}")
+        self.progress.update(self.task, speed=f"{numbers['updates_per_second']:.3g}")
+        alarm = self.alarms.check(numbers)
+        if alarm is not None:
+            added["alarm"] = alarm
+            self._warn(alarm, ALARMS[alarm])
+        return added
+
+    def _warn(self, condition: str, message: str) -> None:
+        """Tell the user, once."""
+        if condition not in self.told:
+            self.told.add(condition)
+            self.progress.console.print(f"warning: {message}", style="yellow", soft_wrap=True)
+
+    def _validate(self, validator: Validator, step: int) -> dict[str, float]:
+        def show(done: int, total: int) -> None:
+            self.progress.update(self.task, description=f"validating {done}/{total}")
+
+        numbers = validator(step, show)
+        self.best = validator.best
+        self.progress.update(self.task, description="training")
+        return numbers
+
+    def _save(self, step: int) -> None:
+        """Write a checkpoint; by then all records up to it are on the disk."""
+        self.tracker.sync()
+        folder = self.config.out / "checkpoints"
+        extra = {
+            "best": None if self.best is None else self.best.plain(),
+            "skips": dataclasses.asdict(self.skips),
+        }
+        save_checkpoint(
+            folder, step=step, modules=self.modules, optimizers=self.learner.optimizers, extra=extra
+        )
+        self._prune()
+
+    def _prune(self) -> None:
+        protect = () if self.best is None else (self.best.step,)
+        prune(self.config.out / "checkpoints", KEEP, protect=protect)
+
+    def _restore(self, extra: Mapping[str, Any]) -> None:
+        self.best = Best.of(extra)
+        self.skips = Skips(**extra.get("skips", {}))
+        if self.validator is not None:
+            self.validator.best = self.best
+
+
+def _validate_every(config: TrainConfig) -> int:
+    return config.validation.every or config.checkpoint_every
+
+
+def _warm_start(networks: Networks, name: Path) -> None:
     """Take over the networks that another run has too."""
-    newest = latest(folder / "checkpoints")
-    if newest is None:
-        raise ConfigError(f"{folder}: no run with a checkpoint to start from")
-    there = parts_of(newest)
+    source = choose(*split_name(str(name)))
+    there = parts_of(source)
     shared = {name: module for name, module in networks.present().items() if name in there}
-    load_checkpoint(newest, modules=shared, partial=True, restore_rng=False)
+    load_checkpoint(source, modules=shared, partial=True, restore_rng=False)
 
 
 def _find(config: TrainConfig) -> Path | None:
@@ -112,7 +207,15 @@ def _find(config: TrainConfig) -> Path | None:
             name: getattr(config, name)
             for name in ("out", "data", "steps", "resume", "device", "wandb", "checkpoint_every", "log_every")
         }
-        before = dataclasses.replace(read_config(config.out), **free)
+        before = read_config(config.out)
+        judged = before.validation
+        # Judgements of other segments could not be compared with those so far.
+        free["validation"] = config.validation
+        if judged.data is not None:
+            free["validation"] = dataclasses.replace(
+                judged, data=config.validation.data, every=config.validation.every
+            )
+        before = dataclasses.replace(before, **free)
         changed = [
             f.name for f in dataclasses.fields(config) if getattr(before, f.name) != getattr(config, f.name)
         ]
@@ -136,6 +239,7 @@ def _progress() -> Progress:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]:.3f}"),
+        TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left"),
         TimeRemainingColumn(),
+        console=Console(stderr=True),
     )

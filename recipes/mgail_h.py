@@ -1,0 +1,19 @@
+"""Adversarial imitation through the model with goals: the row "MGAIL+H" of the paper's tables.
+
+python recipes/mgail_h.py --data TRAIN --test TEST --out runs/mgail_h
+"""
+
+from __future__ import annotations
+
+from symphony.cli.recipe import judge, parse
+from symphony.trainers import train
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the recipe."""
+    recipe = parse("mgail_h", __doc__, args)
+    judge(recipe, train(recipe.training))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Draw the paper's figures from runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from symphony.cli.comparison import choose_evaluation, method_name
+from symphony.cli.evaluations import kept_evaluations, read_run
+from symphony.config import EvaluateConfig
+from symphony.errors import ConfigError, DataError
+
+app = tyro.extras.SubcommandApp()
+
+
+@app.command(name="curvature")
+@dataclass(frozen=True)
+class Curvature:
+    """Draw how often the policy, and the log, visit branching regions of each average curvature.
+
+    A panel for each run; left turns are positive (in the paper, right turns). With --data the runs are judged as
+    `symphony evaluate` does, and keep it; without, what they keep already is drawn.
+    """
+
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="RUN ...", help_behavior_hint="(required)"),
+    ]
+    """Folders of runs."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """Picture to write (.png, .pdf or .svg)."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Store of run segments to simulate."""
+    evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Without --data: which evaluation of a run counts, as in `symphony table`."""
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ConfigError("no runs given")
+        if self.data is not None and self.evaluation:
+            raise ConfigError("--evaluation chooses among what runs keep, --data judges them anew: give one")
+        if self.data is None and self.config != EvaluateConfig():
+            raise ConfigError("settings of the simulation need --data, the run segments to simulate")
+
+    def run(self) -> None:
+        """Judge where it is asked for, and draw."""
+        import numpy as np
+
+        from symphony.cli.plot import run_names
+        from symphony.metrics import jensen_shannon
+        from symphony.render import plot_curvature
+        from symphony.render.style import picture_path
+
+        picture_path(self.out)
+        panels = {}
+        for folder, name in zip(self.runs, run_names(self.runs), strict=True):
+            if not (folder / "config.json").is_file():
+                raise ConfigError(f"{folder} is no run: it has no config.json")
+            config = read_run(folder)
+            held = self._record(folder)["curvature"]
+            try:
+                policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
+                divergence = 1000 * float(jensen_shannon(policy, log))
+            except (ValueError, TypeError) as error:
+                raise DataError(f"no histogram ({error})", file=folder, field="curvature") from error
+            title = f"{method_name(config['method'])} ({name}): JSD {divergence:.2f} · 10⁻³"
+            panels[title] = policy, log
+        try:
+            plot_curvature(panels, self.out)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+    def _record(self, folder: Path) -> dict[str, Any]:
+        if self.data is None:
+            return choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]
+        from symphony.cli.evaluate import judge
+
+        judged = judge(str(folder), self.data, self.config)
+        judged.keep()
+        return judged.record

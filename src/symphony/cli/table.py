@@ -1,0 +1,62 @@
+"""Build the paper's tables from evaluated runs."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from symphony.cli.comparison import collect, compare
+from symphony.cli.formats import FORMATS, Format, print_text
+from symphony.cli.paper import Dataset, Setting
+from symphony.errors import ConfigError
+
+NAMED = 5
+"""Runs left out for the same reason that are named."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has judged.
+
+    A row for each method there is, mean and standard error over its seeds, the best of the BC methods and of the
+    MGAIL methods in bold. Runs of other settings are left out.
+    """
+
+    setting: Setting
+    """`main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="(required)")] = ()
+    """Folders of runs, or folders that hold some."""
+    evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Which evaluation of a run counts, where it keeps several (in its folder `evaluations`); * and ? stand for
+    anything. Of several names, the first that fits one decides."""
+    paper: Dataset | None = None
+    """Show the paper's own figures on this data set beside ours."""
+    format: Format = "text"
+    """How it is written."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write it to; otherwise it is printed."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ConfigError("no runs given: --runs DIR ...")
+
+    def run(self) -> None:
+        """Collect, compare and write."""
+        from rich.console import Console
+
+        entries, left_out = collect(self.runs, self.setting, self.evaluation)
+        for reason, folders in left_out.items():
+            more = f" and {len(folders) - NAMED} more" if len(folders) > NAMED else ""
+            sys.stderr.write(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}\n")
+        comparison = compare(entries, self.setting, self.paper)
+        if self.out is not None:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            self.out.write_text(FORMATS[self.format](comparison), encoding="utf-8")
+        elif self.format == "text" and (console := Console()).is_terminal:
+            print_text(comparison, console)
+        else:
+            sys.stdout.write(FORMATS[self.format](comparison))

@@ -1,0 +1,215 @@
+"""Model-based adversarial imitation: the discriminator's verdict, differentiated through the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from symphony.objectives.base import MaskedLoss, Reduction
+
+Cost = Literal["log_d", "non_saturating", "logit"]
+COSTS = {
+    "log_d": functional.logsigmoid,
+    "non_saturating": functional.softplus,
+    "logit": lambda score: score,
+}
+"""Of a state with logit x, D = sigmoid(x) the probability that it is simulated: log D (the paper), whose gradient
+vanishes where D is sure of the log; -log(1 - D), whose gradient vanishes where D is fooled; x, whose never does.
+"""
+
+
+class MGAILLoss(MaskedLoss):
+    """How simulated the states look that an actor drives through, with gradient through the dynamics (paper, III-C;
+    Baram et al. 2017).
+
+    The loss simulates from the states it is given, by the actor's reparameterised draws, and averages a cost of the
+    discriminator's logit over all steps and agents. Only the actor receives a gradient. With given random
+    numbers it repeats a rollout found before, such as the survivors of a beam search: the gradient is then that
+    through the search with its choices held fixed, at the memory of the survivors alone.
+
+    Args:
+        actor_network: draws with gradient (`has_rsample`).
+        discriminator: writes one logit per entry, `[..., N]`, under the `score` key.
+        env: differentiable; steps any batch shape. May be replaced between calls.
+        horizon: T, steps per rollout; given numbers decide it where there are any.
+        cost: of a logit, see :data:`COSTS`.
+        detach_keys: inputs of the actor through which no gradient flows back to earlier states. Without them
+            gradients pass through the actor's reactions too, and explode sooner.
+        truncate: steps after which the gradient is cut; 0: never.
+        checkpoint: steps that are simulated once more in the backward pass instead of being kept; 0: all are
+            kept. Changes no result; memory then grows with T / checkpoint + checkpoint instead of T.
+        reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
+        use_mask: whether the TensorDict holds a mask under the `valid` key.
+
+    Writes `loss_mgail` and, detached, the mean logit `mgail_score`. Steps after the end of an episode do not count.
+
+    Raises:
+        KeyError: at the call, if the mask, `done` or the score is missing.
+        ValueError: for a bad argument, or numbers for no step at all.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set by `.set_keys(name=key)`.
+
+        Attributes:
+            score (NestedKey): float `[..., N]`, the logit the discriminator writes. Defaults to
+                `("agents", "score")`.
+            noise (NestedKey): numbers `[..., N, *]` that the actor draws by. Defaults to `("agents", "noise")`.
+            plan (NestedKey): the same for all steps, `[..., T, N, *]`, optional in the start states. Defaults to
+                `"noise_plan"`.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `("agents", "valid")`.
+            done (NestedKey): bool `[..., 1]`, True where the episode has ended. Defaults to `"done"`.
+        """
+
+        score: NestedKey = ("agents", "score")
+        noise: NestedKey = ("agents", "noise")
+        plan: NestedKey = "noise_plan"
+        valid: NestedKey = ("agents", "valid")
+        done: NestedKey = "done"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    deterministic_sampling_mode = ExplorationType.RANDOM
+    out_keys = ["loss_mgail", "mgail_score"]  # noqa: RUF012 - the type LossModule declares
+
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        discriminator: TensorDictModuleBase,
+        env: EnvBase | None = None,
+        *,
+        horizon: int = 0,
+        cost: Cost = "log_d",
+        detach_keys: Sequence[NestedKey] = (),
+        truncate: int = 0,
+        checkpoint: int = 0,
+        reduction: Reduction | None = None,
+        use_mask: bool = True,
+    ) -> None:
+        super().__init__(reduction, use_mask)
+        if cost not in COSTS:
+            raise ValueError(f"unknown cost {cost!r}, expected one of {', '.join(COSTS)}")
+        for name, value in (("horizon", horizon), ("truncate", truncate), ("checkpoint", checkpoint)):
+            if value < 0:
+                raise ValueError(f"{name} must be at least 0, is {value}")
+        self.convert_to_functional(actor_network, "actor_network")
+        # Neither is trained here, so neither belongs to the loss's parameters or to its state_dict.
+        self.__dict__["discriminator"] = discriminator
+        self.__dict__["env"] = env
+        self.horizon, self.cost, self.truncate, self.checkpoint = horizon, cost, truncate, checkpoint
+        self.detach_keys = list(detach_keys)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "env":
+            # What a state consists of may change with it.
+            self.__dict__.update(env=value, _in_keys=None)
+        else:
+            super().__setattr__(name, value)
+
+    def _read_keys(self) -> list[NestedKey]:
+        state = [] if self.env is None else list(self.env.state_spec.keys(True, True))
+        return [*self.actor_network.in_keys, *state, self.tensor_keys.done, self.tensor_keys.plan]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Simulate from start states `[...]`, as the environment resets to them; the input is left as it is."""
+        if self.env is None:
+            raise ValueError("no environment to simulate in; set `env`")
+        plan = tensordict.get(self.tensor_keys.plan, default=None)
+        done = tensordict.get(self.tensor_keys.done, default=None)
+        if done is None:
+            raise KeyError(f"no end of the episode under {self.tensor_keys.done!r}")
+        # Numbers left behind by whoever drove from here before would decide every step anew.
+        now = tensordict.exclude(self.tensor_keys.plan, self.tensor_keys.noise)
+        # Called with tensors alone, the batch was guessed from them.
+        now.batch_size = done.shape[:-1]
+        batch = now.batch_dims
+        steps = self.horizon if plan is None else plan.shape[batch]
+        if steps < 1:
+            raise ValueError("nothing to simulate: give a horizon, or random numbers for at least one step")
+        valid = self._counted(now, self._shape(now), tensordict.device or torch.device("cpu"))
+        size = self.checkpoint or steps
+        scores, going = [], []
+        for first in range(0, steps, size):
+            length = min(size, steps - first)
+            numbers = None if plan is None else plan.narrow(batch, first, length)
+            if self.checkpoint and torch.is_grad_enabled():
+                score, alive, now = checkpoint(
+                    self._simulate,
+                    now,
+                    numbers,
+                    first,
+                    length,
+                    use_reentrant=False,
+                    # Given numbers leave nothing to chance; otherwise the same must be drawn again.
+                    preserve_rng_state=plan is None,
+                )
+            else:
+                score, alive, now = self._simulate(now, numbers, first, length)
+            scores.append(score)
+            going.append(alive)
+        score = torch.cat(scores, batch)
+        counted = valid.unsqueeze(batch) & torch.cat(going, batch)
+        result = TensorDict(
+            {
+                "loss_mgail": self._reduced(COSTS[self.cost](score), counted),
+                "mgail_score": self._reduced(score.detach(), counted, "mean"),
+            }
+        )
+        self._clear_weakrefs(tensordict, result, "actor_network_params")
+        return result
+
+    def _shape(self, now: TensorDictBase) -> torch.Size:
+        mask = now.get(self.tensor_keys.valid, default=None)
+        if mask is None:
+            if self.use_mask:
+                raise KeyError(f"no mask under {self.tensor_keys.valid!r}; pass use_mask=False")
+            return torch.Size([*now.shape, 1])
+        return mask.shape
+
+    def _simulate(
+        self, now: TensorDictBase, numbers: Tensor | None, first: int, length: int
+    ) -> tuple[Tensor, Tensor, TensorDictBase]:
+        """Logits and whether the episode still ran, `[..., length, N]`, and the state after the last step."""
+        batch, scores, going = now.batch_dims, [], []
+        # Networks and exploration are set here, since a checkpoint calls this again when the loss has returned.
+        frozen = TensorDict.from_module(self.discriminator).detach()
+        with (
+            self.actor_network_params.to_module(self.actor_network),
+            frozen.to_module(self.discriminator),
+            set_exploration_type(ExplorationType.RANDOM),
+        ):
+            for t in range(length):
+                if self.truncate and (first + t) % self.truncate == 0:
+                    now = now.detach()
+                acting = now.copy()
+                for key in self.detach_keys:
+                    acting.set(key, acting.get(key).detach())
+                if numbers is not None:
+                    acting.set(self.tensor_keys.noise, numbers.select(batch, t))
+                acting = self.actor_network(acting)
+                drawn = now.copy()
+                for key in self.env.action_keys:
+                    drawn.set(key, acting.get(key))
+                alive = ~now.get(self.tensor_keys.done)
+                now = self.env.step_mdp(self.env.step(drawn))
+                score = self.discriminator(now.copy()).get(self.tensor_keys.score)
+                scores.append(score)
+                going.append(alive.reshape(alive.shape[:batch] + (1,) * (score.ndim - batch)))
+        score = torch.stack(scores, batch)
+        return score, torch.stack(going, batch).expand_as(score), now

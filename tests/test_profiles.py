@@ -1,0 +1,63 @@
+"""Profiles of training settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from symphony.cli import main
+from symphony.cli.profiles import Profile, expanded
+from symphony.cli.recipe import parse
+from symphony.config import Method, TrainConfig
+from symphony.errors import ConfigError
+
+NEEDED = ["--data", "a", "--out", "b", "--test", "c"]
+
+
+def settings(method: Method, *args: str) -> TrainConfig:
+    return parse(method, None, [*NEEDED, *args]).training
+
+
+@pytest.mark.parametrize("method", get_args(Method))
+@pytest.mark.parametrize("profile", get_args(Profile))
+def test_every_profile_is_a_valid_configuration_of_every_method(method: Method, profile: str) -> None:
+    config = settings(method, "--profile", profile)
+    assert config.method == method
+    assert (config == settings(method)) == (profile == "default")
+
+
+def test_the_paper_is_followed() -> None:
+    config = settings("mgail_ts_h", "--profile=paper")
+    search = config.search
+    assert (config.steps, config.segments, config.checkpoint_every) == (70_000, 16, 2_000)
+    assert (search.branches, search.test_branches, search.prune_every, search.rule) == (4, 16, 10, "best")
+    assert (config.agent.num_points, config.validation.segments) == (1_000, 200)
+    assert config.mgail.regression == 0
+
+
+@pytest.mark.parametrize("given", [["--steps", "7"], ["--steps=7"]])
+@pytest.mark.parametrize("first", [True, False])
+def test_what_is_given_has_precedence(given: list[str], first: bool) -> None:
+    args = [*given, "--profile", "smoke"] if first else ["--profile", "smoke", *given]
+    config = settings("bc", *args)
+    assert config.steps == 7
+    assert config.states == 16
+
+
+def test_adversarial_methods_differ_only_where_they_say() -> None:
+    assert settings("mgail", "--profile", "smoke").mgail.regression == 2
+    assert settings("bc", "--profile", "smoke").mgail == settings("bc").mgail
+
+
+def test_unknown_profiles_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ConfigError, match="did you mean 'laptop'"):
+        expanded(["bc", "--profile", "labtop"])
+    assert main(["train", "bc", "--data", str(tmp_path), "--out", str(tmp_path), "--profile=fast"]) == 2
+    assert "profile is one of default, paper, laptop, smoke" in capsys.readouterr().err
+
+
+def test_without_a_profile_nothing_changes() -> None:
+    args = ["bc", "--steps", "3", "--profile", "default"]
+    assert expanded(args) == args

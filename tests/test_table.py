@@ -1,0 +1,574 @@
+"""Kept evaluations, the paper's tables made of them, and the figure of curvature."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import re
+import shutil
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from helpers_segments import crossing, straight_road
+from symphony.cli import main
+from symphony.cli.comparison import (
+    COLUMNS,
+    ROWS,
+    SETTINGS,
+    Comparison,
+    Entry,
+    collect,
+    compare,
+    family,
+    method_name,
+)
+from symphony.cli.evaluations import evaluation_name, find_runs, keep_evaluation, kept_evaluations
+from symphony.cli.formats import FORMATS, as_json, as_latex, as_markdown, as_text, print_text
+from symphony.cli.paper import METRICS, paper_figures
+from symphony.config import AgentConfig, EvaluateConfig, Method, TrainConfig
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import ConfigError, DataError
+from symphony.metrics import jensen_shannon
+from symphony.render import plot_curvature
+from symphony.trainers import evaluate, train
+
+METHODS = get_args(Method)
+NUMBERS = st.floats(0, 100)
+
+
+def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[str, Any]:
+    numbers = dict.fromkeys(METRICS, 1.0) | (values or {})
+    config = {
+        "search": "none",
+        "trees": 0,
+        "branches": 0,
+        "rule": "",
+        "interactive": 2,
+        "rollouts": 16,
+        "duration": 0,
+        "seed": 0,
+        "logged_goals": False,
+    }
+    counts = [0] * 100 + [3] + [0] * 100
+    return {
+        "format": 1,
+        **numbers,
+        "segments": 4,
+        "run": {"updates": 0, "named": False, "checkpoint": 0},
+        "data": {"name": "test", "checksum": "ab" * 32},
+        "config": config | changes,
+        "playback": {"collision_rate": 0.5, "offroad_time": 0.25},
+        "curvature": {"policy": counts, "log": counts},
+    }
+
+
+def make_entry(method: str, seed: int = 0, **values: float) -> Entry:
+    record = make_record(values, seed=seed)
+    return Entry(Path(f"{method}-{seed}"), {"method": method, "seed": seed}, evaluation_name(record), record)
+
+
+def make_run(folder: Path, method: str, seed: int = 0, *records: dict[str, Any], **config: Any) -> Path:
+    folder.mkdir(parents=True)
+    settings = {"format": 2, "method": method, "seed": seed, "agent": {"interactive": 2}} | config
+    (folder / "config.json").write_text(json.dumps(settings))
+    for record in records:
+        keep_evaluation(folder, record)
+    return folder
+
+
+def full_table(seeds: int = 3, methods: Any = METHODS) -> list[Entry]:
+    rng, top = np.random.default_rng(0), [30, 5, 20, 10, 0.01]
+    return [
+        make_entry(method, seed, **dict(zip(METRICS, rng.uniform(0, top).tolist(), strict=True)))
+        for method in methods
+        for seed in range(seeds)
+    ]
+
+
+def row_of(comparison: Comparison, method: str) -> Any:
+    (row,) = (row for row in comparison.rows if row.method == method)
+    return row
+
+
+# --- what is in a table ---
+
+
+@settings(max_examples=50)
+@given(st.lists(NUMBERS, min_size=1, max_size=6))
+def test_cells_are_mean_and_standard_error_over_seeds(values: list[float]) -> None:
+    comparison = compare([make_entry("bc", k, ade=value) for k, value in enumerate(values)], "main")
+    row = row_of(comparison, "bc")
+    cell = row.cells["ade"]
+    assert row.seeds == tuple(range(len(values)))
+    assert cell.mean == pytest.approx(np.mean(values))
+    if len(values) == 1:
+        assert math.isnan(cell.error)
+        assert f"| BC | 1 | 1.00 | 1.00 | {values[0]:.2f} | 1.00 |" in as_markdown(comparison)
+    else:
+        assert cell.error == pytest.approx(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+@given(st.permutations(full_table(2)))
+@settings(max_examples=4)
+def test_the_order_of_runs_does_not_matter(entries: list[Entry]) -> None:
+    for format_, write in FORMATS.items():
+        assert write(compare(entries, "main", "womd")) == write(compare(full_table(2), "main", "womd")), (
+            format_
+        )
+
+
+@settings(max_examples=50)
+@given(st.dictionaries(st.sampled_from(METHODS), st.tuples(*[NUMBERS] * 5), min_size=1))
+def test_the_lowest_value_of_each_family_is_the_best(table: dict[str, tuple[float, ...]]) -> None:
+    entries = [make_entry(method, **dict(zip(METRICS, row, strict=True))) for method, row in table.items()]
+    comparison = compare(entries, "main")
+    for number, column in enumerate(COLUMNS):
+        for name in ("bc", "mgail"):
+            mine = {method: row[number] for method, row in table.items() if family(method) == name}
+            best = {method for method in mine if row_of(comparison, method).cells[column.key].best}
+            if len(mine) < 2:
+                assert not best
+            else:
+                assert min(mine, key=mine.__getitem__) in best
+                assert len({column.shown(mine[method]) for method in best}) == 1
+                worse = [value for method, value in mine.items() if method not in best]
+                assert all(value > min(mine.values()) for value in worse)
+        assert not row_of(comparison, "playback").cells[column.key].best
+
+
+def test_rows_are_those_of_the_paper_and_missing_methods_are_missing() -> None:
+    assert [row.method for row in compare(full_table(), "main").rows] == list(ROWS)
+    assert [method_name(method) for method in ROWS] == [
+        "Playback",
+        "BC",
+        "BC+H",
+        "BC+TS",
+        "BC+TS+H",
+        "MGAIL",
+        "MGAIL+H",
+        "MGAIL+TS",
+        "MGAIL+TS+H",
+    ]
+    some = compare(full_table(2, ("mgail_ts", "bc_h")), "main", "proprietary")
+    assert [row.method for row in some.rows] == ["playback", "bc_h", "mgail_ts"]
+    for write in FORMATS.values():
+        assert "BC+TS+H" not in write(some).replace(" + ", "+").replace("MGAIL+TS+H", "")
+
+
+def test_playback_has_no_distance_to_itself() -> None:
+    cells = row_of(compare(full_table(), "main"), "playback").cells
+    assert [cells[key].mean for key in METRICS[:2]] == [0.5, 0.25]
+    assert all(math.isnan(cells[key].mean) for key in METRICS[2:])
+
+
+def test_a_mean_over_something_unknown_is_unknown_and_never_the_best() -> None:
+    entries = [make_entry("bc", 0, ade=1.0), make_entry("bc", 1), make_entry("bc_h", 0), make_entry("bc_ts")]
+    entries[1].record["ade"] = None  # type: ignore[index]
+    comparison = compare(entries, "main")
+    cell = row_of(comparison, "bc").cells["ade"]
+    assert math.isnan(cell.mean)
+    assert not cell.best
+    assert row_of(comparison, "bc_h").cells["ade"].best
+    assert json.loads(as_json(comparison))["rows"][1]["ade"]["mean"] is None
+
+
+# --- the paper's own figures ---
+
+BOLD = {
+    ("main", "proprietary"): (("bc_ts_h",) * 5, ("mgail_ts_h",) * 2 + ("mgail_h",) * 3),
+    ("main", "womd"): (
+        ("bc_ts_h", "bc_ts", "bc_ts_h", "bc_ts_h", "bc"),
+        ("mgail_ts", "mgail_ts", "mgail_h", "mgail_h", "mgail_ts_h"),
+    ),
+    ("long", "proprietary"): (("bc_ts", "bc_ts_h", "bc_ts_h", "bc_ts_h", "bc"), ("mgail_ts_h",) * 5),
+    ("many", "proprietary"): (("bc_ts", "bc_ts_h", "bc_ts_h", "bc_h", "bc_ts_h"), ("mgail_ts_h",) * 5),
+}
+"""What the paper prints in bold, by metric."""
+
+
+@pytest.mark.parametrize(("setting", "dataset"), BOLD)
+def test_the_paper_s_bold_figures_are_what_we_call_best(setting: Any, dataset: Any) -> None:
+    comparison = compare(full_table(1), setting, dataset)
+    for number, key in enumerate(METRICS):
+        best = [row.method for row in comparison.rows if row.paper[key].best]
+        assert best == [part[number] for part in BOLD[setting, dataset]]
+
+
+def test_the_paper_s_figures_are_in_our_units() -> None:
+    figures = paper_figures("main", "womd")
+    assert figures is not None
+    assert figures["bc"]["curvature_jsd"] == pytest.approx((0.00132, 0.00028))
+    assert figures["playback"]["collision_rate"][0] == 3.04
+    assert math.isnan(figures["playback"]["ade"][0])
+    assert set(figures) == set(ROWS)
+    with pytest.raises(ConfigError, match="no figures for setting 'long' on womd"):
+        compare(full_table(1), "long", "womd")
+
+
+# --- formats ---
+
+
+def numbers_of(text: str) -> tuple[float, ...]:
+    return tuple(float(number) for number in re.findall(r"\d+\.\d+", text))
+
+
+def expected(comparison: Comparison) -> dict[str, list[tuple[bool, tuple[float, ...]]]]:
+    """Of every cell: whether it is bold, and the numbers in it."""
+    found: dict[str, list[tuple[bool, tuple[float, ...]]]] = {}
+    for row in comparison.rows:
+        found[row.name] = []
+        for column in COLUMNS:
+            for cell in (row.cells[column.key], row.paper.get(column.key)):
+                if cell is not None:
+                    held = [float(column.shown(v)) for v in (cell.mean, cell.error) if not math.isnan(v)]
+                    found[row.name].append((cell.best, tuple(held)))
+    return found
+
+
+@pytest.mark.parametrize("dataset", [None, "proprietary"])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_markdown_and_latex_read_back(seeds: int, dataset: Any) -> None:
+    comparison = compare(full_table(seeds), "main", dataset)
+    wanted = expected(comparison)
+    lines = [line.strip("| ").split(" | ") for line in as_markdown(comparison).splitlines() if "|" in line]
+    assert len({len(line) for line in lines}) == 1
+    assert {name: [("**" in c, numbers_of(c)) for c in cells] for name, _, *cells in lines[2:]} == wanted
+    assert [line[1].strip() for line in lines[3:]] == [str(seeds)] * 8
+    latex = as_latex(comparison)
+    body = [line[:-3].split(" & ") for line in latex.splitlines() if line.endswith(r"\\")]
+    rows = {line[0].replace(" ", ""): line[2:] for line in body[2 if dataset else 1 :]}
+    assert {name: [(r"\textbf" in c, numbers_of(c)) for c in cells] for name, cells in rows.items()} == wanted
+    (columns,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", latex)
+    assert len(columns) == len(body[-1])
+    assert latex.count("{") == latex.count("}")
+    assert not re.search(r"(?<!\\)%", latex.partition(r"\begin{tabular}")[2])
+
+
+def test_json_reads_back_whole() -> None:
+    comparison = compare(full_table(3), "many", "proprietary")
+    read = json.loads(as_json(comparison))
+    assert (read["setting"], read["interactive"], read["duration"]) == ("many", *SETTINGS["many"])
+    for row, found in zip(comparison.rows, read["rows"], strict=True):
+        assert found["method"] == row.method
+        assert tuple(found["seeds"]) == row.seeds
+        for key in METRICS:
+            cell = row.cells[key]
+            assert tuple(found[key]["values"]) == cell.values
+            assert found[key]["best"] is cell.best
+            if not math.isnan(cell.error):
+                assert (found[key]["mean"], found[key]["se"]) == (cell.mean, cell.error)
+                assert found["paper"][key]["mean"] == row.paper[key].mean
+
+
+def test_text_fits_a_terminal_and_shows_the_best_in_bold() -> None:
+    comparison = compare(full_table(3), "main", "proprietary")
+    file = io.StringIO()
+    print_text(comparison, Console(file=file, width=80, force_terminal=True, color_system="standard"))
+    bold = [numbers_of(found) for found in re.findall(r"\x1b\[1(?:;2)?m([\d.±]+)\x1b\[0m", file.getvalue())]
+    wanted = expected(comparison)
+    assert sorted(bold) == sorted(held for row in wanted.values() for best, held in row if best)
+    plain = as_text(comparison)
+    starred = [numbers_of(found) for found in re.findall(r"([\d.±]+)\*", plain)]
+    assert sorted(starred) == sorted(bold)
+    for cells in wanted.values():
+        for _, held in cells:
+            assert not held or "±".join(f"{number:.2f}" for number in held) in plain
+
+
+# --- which runs and evaluations count ---
+
+
+def test_settings_tell_runs_apart(tmp_path: Path) -> None:
+    kinds: dict[str, list[dict[str, Any]]] = {
+        "main": [{}, {"duration": 0}, {"duration": 10}, {"agent": {}}],
+        "long": [{"duration": 20}],
+        "many": [{"agent": {"interactive": 8}}],
+    }
+    strange = [{"duration": 15}, {"duration": 20, "agent": {"interactive": 8}}]
+    for setting, configs in kinds.items():
+        for k, config in enumerate(configs):
+            agents = config.get("agent", {}).get("interactive", 2)
+            record = make_record(interactive=agents, duration=config.get("duration", 0))
+            make_run(tmp_path / "runs" / f"{setting}-{k}", "bc", k, record, **config)
+    for k, config in enumerate(strange):
+        make_run(tmp_path / "runs" / f"strange-{k}", "bc", k, make_record(), **config)
+    make_run(tmp_path / "runs" / "new", "bc", 9)
+    for setting, configs in kinds.items():
+        entries, left_out = collect([tmp_path / "runs"], setting)  # type: ignore[arg-type]
+        assert [entry.folder.name for entry in entries] == [f"{setting}-{k}" for k in range(len(configs))]
+        assert len(entries) + sum(map(len, left_out.values())) == 9
+    assert any("not evaluated" in reason for reason in collect([tmp_path / "runs"], "main")[1])
+
+
+def test_runs_judged_in_another_setting_than_their_own_do_not_count(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "bc", "bc", 0, make_record(interactive=8), make_record(duration=20))
+    assert collect([run], "main")[0] == []
+    keep_evaluation(run, make_record(duration=10))
+    assert len(collect([run], "main")[0]) == 1
+
+
+def test_runs_are_found_below_folders_each_once(tmp_path: Path) -> None:
+    one = make_run(tmp_path / "a" / "one", "bc")
+    two = make_run(tmp_path / "a" / "deeper" / "two", "bc", 1)
+    (one / "checkpoints" / "inner").mkdir(parents=True)
+    (one / "checkpoints" / "inner" / "config.json").write_text("{}")
+    assert sorted(find_runs([tmp_path, one, tmp_path / "a", two])) == sorted([one, two])
+    (tmp_path / "empty").mkdir()
+    for folder in (tmp_path / "empty", tmp_path / "absent"):
+        with pytest.raises(ConfigError, match="holds no run"):
+            find_runs([one, folder])
+
+
+def test_several_evaluations_need_a_choice(tmp_path: Path) -> None:
+    without, tree = make_record(), make_record(search="tree", trees=1, branches=16, rule="best")
+    run = make_run(tmp_path / "ts", "bc_ts", 0, without, tree)
+    make_run(tmp_path / "bc", "bc", 0, without)
+    with pytest.raises(ConfigError) as error:
+        collect([tmp_path], "main")
+    for word in (str(run), evaluation_name(without), evaluation_name(tree), "--evaluation"):
+        assert word in str(error.value)
+    for patterns, wanted in (
+        (["*-tree-*", "*-none-*"], {"bc_ts": tree, "bc": without}),
+        (["*-none-*", "*-tree-*"], {"bc_ts": without, "bc": without}),
+        (["*-tree-1x16-*"], {"bc_ts": tree}),
+        ([evaluation_name(tree)], {"bc_ts": tree}),
+    ):
+        found = {entry.method: entry.record for entry in collect([tmp_path], "main", patterns)[0]}
+        assert found == wanted
+    with pytest.raises(ConfigError, match="several ways"):
+        collect([tmp_path], "main", ["test-*"])
+    entries, left_out = collect([tmp_path], "main", ["*-oracle-*"])
+    assert not entries
+    assert list(map(len, left_out.values())) == [2]
+
+
+def test_two_runs_of_one_method_and_seed_are_refused(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        make_run(tmp_path / name, "bc_h", 3, make_record())
+    with pytest.raises(ConfigError, match=r"two runs of BC\+H with seed 3.*one.*two"):
+        collect([tmp_path], "main")
+
+
+def test_rows_must_be_comparable() -> None:
+    entries = full_table(2)
+    entries[-1].record["data"]["checksum"] = "cd" * 32
+    with pytest.raises(ConfigError, match="different run segments"):
+        compare(entries, "main")
+    entries = full_table(2)
+    entries[-1].record["config"]["rollouts"] = 4
+    with pytest.raises(ConfigError, match=r"seeds of MGAIL\+TS\+H judged in different ways"):
+        compare(entries, "main")
+    entries[-2].record["config"]["rollouts"] = 4
+    assert any("4 rollouts: MGAIL+TS+H" in note for note in compare(entries, "main").notes)
+    with pytest.raises(ConfigError, match="no evaluated runs"):
+        compare([], "main")
+    with pytest.raises(DataError, match="ade"):
+        compare([make_entry("bc", ade="much")], "main")  # type: ignore[arg-type]
+
+
+def test_notes_say_what_differs_and_what_is_outdated(tmp_path: Path) -> None:
+    for seed, steps in ((0, 5), (1, 6)):
+        record = make_record(seed=seed)
+        record["run"]["updates"] = 5
+        search = {"rule": "best" if seed else "systematic"}
+        run = make_run(tmp_path / f"bc-{seed}", "bc", seed, record, steps=steps, out=str(seed), search=search)
+        (run / "checkpoints" / f"step-{steps:012d}").mkdir(parents=True)
+    notes = "\n".join(compare(collect([tmp_path], "main")[0], "main").notes)
+    assert "runs of BC differ in steps, search.rule\n" in notes
+    assert notes.count("was judged after") == 1
+    assert "bc-1 was judged after 5 updates and has 6 now" in notes
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "not a JSON object"),
+        ("{}", "format"),
+        (json.dumps(make_record() | {"format": 99}), "format 99"),
+        (json.dumps(make_record() | {"config": {"search": "none"}}), r"field config\.trees"),
+        (json.dumps(make_record() | {"run": None}), "field run"),
+        (json.dumps(make_record() | {"segments": None}), "field segments"),
+    ],
+)
+def test_damaged_evaluations_are_named(tmp_path: Path, text: str, message: str) -> None:
+    run = make_run(tmp_path / "bc", "bc", 0, make_record())
+    (run / "evaluations" / "bad.json").write_text(text)
+    with pytest.raises(DataError, match=message) as error:
+        collect([run], "main")
+    assert "bad.json" in str(error.value)
+
+
+# --- names ---
+
+CHANGES: dict[str, Any] = {
+    "rollouts": 8,
+    "search": "oracle",
+    "trees": 2,
+    "branches": 8,
+    "rule": "systematic",
+    "logged_goals": True,
+    "seed": 1,
+    "duration": 20,
+    "interactive": 8,
+}
+
+
+def test_names_differ_with_everything_that_changes_results() -> None:
+    same = {"batch", "device"}
+    assert {field.name for field in dataclasses.fields(EvaluateConfig)} == CHANGES.keys() | same
+    base = make_record(search="tree", trees=1, branches=16, rule="best")
+    others = [base | {"config": base["config"] | {name: value}} for name, value in CHANGES.items()]
+    others.append(base | {"data": {"name": "test", "checksum": "cd" * 32}})
+    others.append(base | {"run": {"named": True, "checkpoint": 50}})
+    names = [evaluation_name(record) for record in (base, *others)]
+    assert len(set(names)) == len(names)
+    for record in others[0]["config"] | {"batch": 3}, others[0]["config"] | {"device": "cuda"}:
+        assert evaluation_name(others[0] | {"config": record}) == names[1]
+
+
+@given(st.text(max_size=80))
+def test_names_are_file_names_whatever_the_store_is_called(store: str) -> None:
+    name = evaluation_name(make_record() | {"data": {"name": store, "checksum": "ab" * 32}})
+    assert re.fullmatch(r"[A-Za-z0-9._-]+", name)
+    assert len(name) < 200
+
+
+# --- the commands ---
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A tiny run, and a store to judge it on."""
+    folder = tmp_path_factory.mktemp("table")
+    with StoreWriter(folder / "test") as writer:
+        writer.append(straight_road(4, seed=1, steps=12))
+        writer.append(crossing(4, seed=1, steps=12))
+    small = AgentConfig(hidden=8, head=8, num_points=10)
+    config = TrainConfig("bc", folder / "test", folder / "bc", 2, agent=small, states=8, wandb="disabled")
+    return train(config), folder / "test"
+
+
+def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
+    judged: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, store = tmp_path / "bc", judged[1]
+    shutil.copytree(judged[0], run)
+    file = tmp_path / "numbers.json"
+    command = ["evaluate", str(run), "--data", str(store), "--rollouts", "2"]
+    assert main([*command, "--no-keep", "--json", str(file)]) == 0
+    assert not (run / "evaluations").exists()
+    for _ in range(2):
+        assert main(command) == 0
+    ((name, record),) = kept_evaluations(run).items()
+    assert record == json.loads(file.read_text())
+    assert name == evaluation_name(record)
+    found = evaluate(str(run), store, EvaluateConfig(rollouts=2))
+    assert record["ade"] == found.numbers()["ade"]
+    assert record["playback"]["ade"] == 0
+    assert len(record["per_segment"]) == 2
+    assert record["data"]["checksum"] == SegmentStore(store).checksum()
+    assert (record["run"]["method"], record["run"]["updates"]) == ("bc", 2)
+    visited = [np.array(record["curvature"][part]) for part in ("policy", "log")]
+    assert float(jensen_shannon(*visited)) == pytest.approx(record["curvature_jsd"], nan_ok=True)
+
+    out = tmp_path / "out" / "table.json"
+    assert (
+        main(["table", "--setting", "main", "--runs", str(tmp_path), "--format", "json", "--out", str(out)])
+        == 0
+    )
+    assert json.loads(out.read_text())["rows"][1]["ade"]["mean"] == record["ade"]
+    capsys.readouterr()
+    assert main(["table", "--setting", "main", "--runs", str(run), "--paper", "womd"]) == 0
+    assert f"{record['ade']:.2f}" in capsys.readouterr().out
+    picture = tmp_path / "out" / "curvature.png"
+    assert main(["figure", "curvature", str(run), "--out", str(picture)]) == 0
+    assert picture.stat().st_size > 5_000
+
+    assert main([*command, "--seed", "5"]) == 0
+    assert len(kept_evaluations(run)) == 2
+    assert main(["table", "--setting", "main", "--runs", str(run)]) == 1
+    assert main(["figure", "curvature", str(run), "--out", str(picture)]) == 1
+    assert capsys.readouterr().err.count("choose one with --evaluation") == 2
+    chosen = ["--evaluation", "*-seed5"]
+    assert main(["table", "--setting", "main", "--runs", str(run), *chosen]) == 0
+    assert main(["figure", "curvature", str(run), "--out", str(picture), *chosen]) == 0
+    again = ["--data", str(store), "--rollouts", "2", "--seed", "6"]
+    assert main(["figure", "curvature", str(run), "--out", str(picture), *again]) == 0
+    assert len(kept_evaluations(run)) == 3
+    assert not list((run / "evaluations").glob(".*"))
+
+
+def test_baselines_leave_nothing_behind(
+    judged: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("playback", "constant_velocity"):
+        assert main(["evaluate", name, "--data", str(judged[1]), "--rollouts", "1"]) == 0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("args", "status"),
+    [
+        (["table", "--setting", "main"], 2),
+        (["table", "--setting", "short", "--runs", "x"], 2),
+        (["table", "--setting", "main", "--runs", "absent"], 1),
+        (["figure", "curvature", "--out", "x.png"], 2),
+        (["figure", "curvature", "absent", "--out", "x.png"], 1),
+        (["figure", "curvature", "absent", "--out", "x.doc"], 1),
+        (["figure", "curvature", "absent", "--out", "x.png", "--rollouts", "3"], 2),
+        (["figure", "curvature", "absent", "--out", "x.png", "--data", "x", "--evaluation", "y"], 2),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else str(value),
+)
+def test_wrong_usage_is_said(
+    args: list[str], status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(args) == status
+    assert capsys.readouterr().err.strip()
+    assert not list(tmp_path.iterdir())
+
+
+# --- the figure ---
+
+
+@given(st.lists(st.integers(0, 50), min_size=41, max_size=41).filter(any), st.integers(2, 9))
+@settings(max_examples=4)
+def test_bars_are_shares_of_all_visits(tmp_path_factory: Any, counts: list[int], times: int) -> None:
+    path = tmp_path_factory.mktemp("figure") / "curvature.svg"
+    policy, log = np.array(counts), np.array(counts[::-1]) * times
+    (axes,) = plot_curvature({"BC": (policy, log)}, path).axes
+    drawn = {patch.get_gid(): patch.get_data() for patch in axes.patches}
+    assert drawn["policy"].values == pytest.approx(policy / policy.sum())
+    assert drawn["log"].values == pytest.approx(drawn["policy"].values[::-1])
+    centres = (drawn["log"].edges[1:] + drawn["log"].edges[:-1]) / 2
+    assert centres == pytest.approx(np.linspace(-1, 1, 41))
+    left, right = axes.get_xlim()
+    assert left < centres[policy > 0].min()
+    assert right > centres[policy > 0].max()
+    assert axes.get_ylim()[1] > max(drawn["policy"].values.max(), drawn["log"].values.max())
+
+
+def test_figures_of_nothing_are_refused(tmp_path: Path) -> None:
+    some, none = np.ones(21, int), np.zeros(21, int)
+    for panels, message in (
+        ({}, "no panels"),
+        ({"BC": (some, none)}, "BC: no branching region"),
+        ({"BC": (some, some), "BC+H": (np.ones(11), np.ones(11))}, "differ in their number"),
+        ({"BC": (some, -some)}, "not negative"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plot_curvature(panels, tmp_path / "x.png")
+    with pytest.raises(ConfigError, match="must end in"):
+        plot_curvature({"BC": (some, some)}, tmp_path / "x.doc")
+    assert not list(tmp_path.iterdir())

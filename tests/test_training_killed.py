@@ -1,0 +1,208 @@
+"""Training that dies at any moment, or meets a disk that refuses, and is taken up again."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import helpers_killed
+from helpers_runs import same_weights, tiny, weights
+from helpers_segments import crossing, straight_road
+from symphony.cli import main
+from symphony.data.store import StoreWriter
+from symphony.errors import ConfigError, DataError, SymphonyError
+from symphony.trainers import train
+from symphony.trainers.checkpoint import CheckpointError, checkpoints, latest
+from symphony.trainers.selection import choose
+from symphony.trainers.tracking import Tracker, read_metrics, write_file
+
+METHODS = ("bc", "bc_ts")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        writer.append(straight_road(4, seed=0, steps=10))
+        writer.append(crossing(4, seed=0, steps=9))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Never written to."""
+    return train(tiny("bc", store, tmp_path_factory.mktemp("runs") / "run"))
+
+
+def learned(run: Path) -> dict[str, bytes]:
+    """Files of weights and optimizers of all checkpoints."""
+    files = sorted((run / "checkpoints").glob("step-*/[mo]*.safetensors"))
+    return {str(file.relative_to(run)): file.read_bytes() for file in files}
+
+
+def records(run: Path) -> list[dict[str, Any]]:
+    """All but the one number that is a matter of the clock."""
+    return [{k: v for k, v in r.items() if k != "updates_per_second"} for r in read_metrics(run)]
+
+
+@pytest.fixture(scope="module")
+def killed(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of several methods, each once in one go and once in many."""
+    out = tmp_path_factory.mktemp("killed")
+    command = [sys.executable, helpers_killed.__file__, str(store), str(out), *METHODS]
+    # A child does not survive the fork of a process that computes with several threads.
+    alone = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=alone)
+    assert done.returncode == 0, done.stdout + done.stderr[-2000:]
+    assert done.stdout.split() == [name for name, _ in helpers_killed.DEATHS] * len(METHODS)
+    return out
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_that_was_killed_at_many_a_moment_ends_like_one_that_was_not(killed: Path, method: str) -> None:
+    part, whole = killed / method / "killed", killed / method / "whole"
+    assert len(checkpoints(whole / "checkpoints")) >= 2
+    assert learned(part) == learned(whole)
+    assert records(part) == records(whole)
+    assert [r["step"] for r in records(whole)] == list(range(1, helpers_killed.STEPS + 1))
+    assert choose(part, "best").name == choose(whole, "best").name
+    left = [p.relative_to(part) for p in part.rglob("*") if p.name.startswith(".")]
+    assert left == []
+
+
+def test_a_full_disk_stops_training_and_leaves_the_last_checkpoint(
+    run: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever file it is that finds no room."""
+    part = shutil.copytree(run, tmp_path / "part")
+    shutil.rmtree(choose(part, "4"))
+    before, settings = learned(part), tiny("bc", store, part, resume=True)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size, error, what in (
+        (5000, CheckpointError, "can't write the checkpoint"),
+        (900, DataError, "json"),
+    ):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            with pytest.raises(error, match=what):
+                train(settings)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert learned(part) == before
+    train(settings)
+    assert learned(part) == learned(run)
+    assert records(part) == records(run)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is read-only to root")
+def test_a_folder_that_is_read_only_is_named(run: Path, store: Path, tmp_path: Path) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    before = learned(part)
+    part.chmod(0o555)
+    try:
+        with pytest.raises(DataError, match=r"config\.json: can't be written: Permission denied"):
+            train(tiny("bc", store, part, resume=True, steps=6))
+    finally:
+        part.chmod(0o755)
+    assert learned(part) == before
+
+
+def test_a_run_whose_files_cannot_be_made_ends_with_one_line(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["train", "bc", "--data", str(store), "--out", str(tmp_path / "file" / "run")]) == 1
+    printed = capsys.readouterr().err.strip()
+    assert printed.startswith("symphony: error: ")
+    assert printed.count("\n") == 0
+
+
+@pytest.mark.parametrize("file", ["config.json", "checkpoints/step-000000000004/checkpoint.json"])
+def test_files_of_another_version_are_refused_and_left_alone(
+    run: Path, store: Path, tmp_path: Path, file: str
+) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    changed = {**json.loads((part / file).read_text()), "format": 99}
+    (part / file).write_text(json.dumps(changed))
+    before = learned(part)
+    with pytest.raises(SymphonyError, match=r"format.*(expected|reads) \d"):
+        train(tiny("bc", store, part, resume=True, steps=6))
+    assert learned(part) == before
+    assert json.loads((part / file).read_text()) == changed
+    assert records(part) == records(run)
+
+
+def test_a_damaged_last_checkpoint_is_named_and_the_one_before_it_can_be_used(
+    run: Path, store: Path, tmp_path: Path
+) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    last = latest(part / "checkpoints")
+    assert last is not None
+    file = last / "module.policy.safetensors"
+    file.write_bytes(file.read_bytes()[:-1])
+    settings = tiny("bc", store, part, resume=True)
+    with pytest.raises(CheckpointError, match=r"step-0+4/module\.policy\.safetensors.*checksum"):
+        train(settings)
+    shutil.rmtree(last)
+    assert same_weights(weights(train(settings)), weights(run))
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_starts_over(
+    run: Path, store: Path, tmp_path: Path
+) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    shutil.rmtree(part / "checkpoints")
+    with pytest.raises(ConfigError, match="holds a run already"):
+        train(tiny("bc", store, part))
+    train(tiny("bc", store, part, resume=True))
+    assert learned(part) == learned(run)
+    assert records(part) == records(run)
+
+
+def test_records_are_kept_up_to_the_checkpoint_and_never_lost_in_between(tmp_path: Path) -> None:
+    first = Tracker(tmp_path, {}, "disabled")
+    for step in range(1, 6):
+        first.log(step, {"loss": float(step), "ratio": float("nan"), "norm": float("inf"), "word": "x"})
+    first.close()
+    text = (tmp_path / "metrics.jsonl").read_text()
+    assert '"ratio": null, "norm": null' in text
+    (tmp_path / "metrics.jsonl").write_text(text[:-30])
+    again = Tracker(tmp_path, {}, "disabled", after=3)
+    assert (tmp_path / "metrics.jsonl").read_text() == "".join(text.splitlines(keepends=True)[:3])
+    assert again.kept == read_metrics(tmp_path)
+    again.log(4, {"loss": 0.0})
+    again.sync()
+    again.close()
+    assert [r["step"] for r in read_metrics(tmp_path)] == [1, 2, 3, 4]
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    write_file(file, "old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        with pytest.raises(DataError, match=r"a\.json: can't be written: File too large"):
+            write_file(file, "new" * 100)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert file.read_text() == "old"
+
+
+def test_finished_runs_are_left_as_they_are(run: Path, store: Path, tmp_path: Path) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    train(tiny("bc", store, part, resume=True))
+    assert learned(part) == learned(run)
+    assert [p.name for p in checkpoints(part / "checkpoints")] == [
+        p.name for p in checkpoints(run / "checkpoints")
+    ]
+    assert (part / "metrics.jsonl").read_text() == (run / "metrics.jsonl").read_text()

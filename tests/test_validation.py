@@ -1,0 +1,284 @@
+"""Runs that are validated while they train, and the checkpoints that become their agents."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from helpers_runs import same_weights, tiny, weights
+from helpers_segments import crossing, straight_road
+from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import Bicycle
+from symphony.errors import ConfigError, DataError
+from symphony.trainers import evaluate, load_agent, train
+from symphony.trainers.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
+from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.evaluation import judge
+from symphony.trainers.networks import build_networks
+from symphony.trainers.selection import Best, choose, split_name
+from symphony.trainers.tracking import read_metrics
+from symphony.trainers.validation import METRICS, Validator
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "train"
+    with StoreWriter(path) as writer:
+        writer.append(straight_road(4, seed=0, steps=14))
+        writer.append(crossing(4, seed=0, steps=12))
+    return path
+
+
+@pytest.fixture(scope="module")
+def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "held_out"
+    with StoreWriter(path) as writer:
+        for seed in range(4):
+            writer.append(crossing(6, seed=10 + seed, steps=16))
+    return path
+
+
+def config(store: Path, out: Path, held_out: Path | None, method: Any = "bc", **changes: Any) -> TrainConfig:
+    return tiny(method, store, out, **{"validation": ValidationConfig(held_out, rollouts=2), **changes})
+
+
+@pytest.fixture(scope="module")
+def run(store: Path, held_out: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(config(store, tmp_path_factory.mktemp("runs") / "bc", held_out, "bc_ts", steps=5))
+
+
+def steps(run: Path) -> list[int]:
+    return [int(path.name[-12:]) for path in checkpoints(run / "checkpoints")]
+
+
+def test_every_checkpoint_and_the_last_weights_are_judged(run: Path) -> None:
+    judged = [r["step"] for r in read_metrics(run) if "validation_infractions" in r]
+    assert judged == [2, 4, 5]
+    for record in read_metrics(run):
+        if record["step"] in judged:
+            assert {f"validation_{name}" for name in METRICS} <= record.keys()
+            total = record["validation_collision_rate"] + record["validation_offroad_time"]
+            assert record["validation_infractions"] == total
+
+
+def test_the_log_says_what_the_evaluator_says(run: Path, held_out: Path) -> None:
+    """With search, as the agent is simulated."""
+    for record in read_metrics(run):
+        if record["step"] in (2, 5):
+            found = evaluate(f"{run}@{record['step']}", held_out, EvaluateConfig(rollouts=2))
+            assert found.search == "tree"
+            numbers = found.numbers()
+            assert {f"validation_{name}": numbers[name] for name in METRICS}.items() <= record.items()
+
+
+@pytest.mark.parametrize("method", ["bc", "bc_ts"])
+def test_being_watched_changes_nothing(store: Path, held_out: Path, tmp_path: Path, method: str) -> None:
+    noisy = replace(tiny(method, store, tmp_path).discriminator, instance_noise=0.1)
+    runs = [
+        train(config(store, tmp_path / str(k), data, method, discriminator=noisy))
+        for k, data in enumerate((None, held_out))
+    ]
+    assert same_weights(*(weights(f"{run}@last") for run in runs))
+
+
+Scripted = Callable[..., None]
+
+
+@pytest.fixture
+def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
+    """Let the evaluator find given infractions at the judgements to come."""
+
+    class Found:
+        def __init__(self, value: float) -> None:
+            self.metrics, self.value = self, value
+
+        def compute(self) -> dict[str, float]:
+            return {**dict.fromkeys(METRICS, 1.0), "collision_rate": self.value, "offroad_time": 0.0}
+
+    def script(*values: float) -> None:
+        left = iter(values)
+        monkeypatch.setattr("symphony.trainers.validation.judge", lambda *_: Found(next(left)))
+
+    return script
+
+
+def test_the_best_checkpoint_stays_and_is_the_agent(
+    store: Path, held_out: Path, tmp_path: Path, scripted: Scripted
+) -> None:
+    scripted(30.0, 20.0, math.nan, 20.0, 25.0, 21.0)
+    out = train(config(store, tmp_path / "run", held_out, steps=12))
+    assert steps(out) == [4, 8, 10, 12]
+    assert choose(out) == choose(out, "best") == choose(out, "4") == choose(out, "step-000000000004")
+    assert choose(out).name == "step-000000000004"
+    assert choose(out, "last").name == "step-000000000012"
+    assert same_weights(weights(out), weights(f"{out}@4"))
+    assert not same_weights(weights(out), weights(f"{out}@last"))
+    assert load_agent(f"{out}@last").name == f"{out}@last"
+
+
+def test_a_warm_start_takes_the_best_too(
+    store: Path, held_out: Path, tmp_path: Path, scripted: Scripted
+) -> None:
+    scripted(1.0, 2.0)
+    source = train(config(store, tmp_path / "source", held_out, steps=4))
+    for name, step in ((str(source), 2), (f"{source}@last", 4)):
+        still = config(store, tmp_path / str(step), None, warm_start=Path(name), learning_rate=1e-30, steps=2)
+        assert same_weights(weights(train(still)), weights(f"{source}@{step}"))
+
+
+def test_a_resumed_run_remembers_the_best(
+    store: Path, held_out: Path, tmp_path: Path, scripted: Scripted
+) -> None:
+    whole = config(store, tmp_path / "run", held_out, steps=12)
+    scripted(30.0, 10.0, 20.0, 20.0, 20.0, 20.0)
+    train(whole)
+    shutil.rmtree(choose(whole.out, "12"))
+    shutil.rmtree(choose(whole.out, "10"))
+    scripted(15.0, 15.0)
+    train(replace(whole, resume=True))
+    assert steps(whole.out) == [4, 8, 10, 12]
+    assert choose(whole.out).name.endswith("4")
+    scripted(9.0)
+    train(replace(whole, resume=True, steps=14))
+    assert steps(whole.out) == [10, 12, 14]
+    assert choose(whole.out).name.endswith("14")
+    # And without judgements from here on.
+    train(replace(whole, resume=True, steps=24, validation=ValidationConfig(rollouts=2)))
+    assert steps(whole.out) == [14, 20, 22, 24]
+    assert choose(whole.out).name.endswith("14")
+
+
+def test_what_is_judged_stays_the_same_when_a_run_goes_on(
+    store: Path, held_out: Path, tmp_path: Path
+) -> None:
+    short = config(store, tmp_path / "run", held_out, steps=2)
+    train(short)
+    for other in ({"rollouts": 3}, {"segments": 2}):
+        with pytest.raises(ConfigError, match="another validation"):
+            train(replace(short, resume=True, steps=4, validation=replace(short.validation, **other)))
+    moved = shutil.copytree(held_out, tmp_path / "moved")
+    train(replace(short, resume=True, steps=4, validation=replace(short.validation, data=moved, every=4)))
+    # A run that was not judged so far may be from now on.
+    plain = config(store, tmp_path / "plain", None, steps=2)
+    train(plain)
+    train(replace(plain, resume=True, steps=4, validation=ValidationConfig(held_out, rollouts=1)))
+    assert choose(plain.out, "best").name.endswith("4")
+
+
+def test_segments_are_spread_over_the_store(store: Path, held_out: Path, tmp_path: Path) -> None:
+    settings = config(store, tmp_path, held_out)
+
+    def indices(count: int) -> list[int]:
+        some = replace(settings, validation=replace(settings.validation, segments=count))
+        return Validator(some, build_networks(some), torch.device("cpu")).dataset.indices
+
+    assert [indices(count) for count in (1, 2, 3, 9)] == [[0], [0, 2], [0, 1, 2], [0, 1, 2, 3]]
+
+
+def test_networks_and_random_numbers_are_left_as_they_were(
+    store: Path, held_out: Path, tmp_path: Path
+) -> None:
+    settings = config(store, tmp_path, held_out, "bc_ts")
+    networks = build_networks(settings)
+    validator = Validator(settings, networks, torch.device("cpu"))
+    modules = networks.present()
+    modules["discriminator"].eval()
+    before = {name: [t.clone() for t in m.state_dict().values()] for name, m in modules.items()}
+    state = torch.get_rng_state()
+    first = validator(3)
+    assert validator.best == Best(3, first["validation_infractions"])
+    assert {name: module.training for name, module in modules.items()} == {
+        "policy": True,
+        "discriminator": False,
+    }
+    assert torch.equal(state, torch.get_rng_state())
+    for name, module in modules.items():
+        assert all(torch.equal(a, b) for a, b in zip(before[name], module.state_dict().values(), strict=True))
+    # As good is no better; and it is the weights of the moment that are judged.
+    assert validator(4) == first
+    assert validator.best.step == 3
+    with torch.no_grad():
+        for parameter in modules["policy"].parameters():
+            parameter.mul_(-3)
+    assert validator(5) != first
+
+
+def test_an_agent_is_judged_without_its_folder(store: Path, held_out: Path, run: Path) -> None:
+    agent = load_agent(str(run))
+    dataset = SceneDataset(SegmentStore(held_out), 2, Bicycle(), [1])
+    done: list[tuple[int, int]] = []
+    found = judge(agent, dataset, EvaluateConfig(rollouts=2), lambda *at: done.append(at))
+    assert done == [(1, 1)]
+    rows = evaluate(str(run), held_out, EvaluateConfig(rollouts=2)).metrics.rows()
+    assert found.metrics.rows() == [rows[1]]
+
+
+def test_stores_that_cannot_be_used_are_found_before_training(store: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    with StoreWriter(few) as writer:
+        writer.append(straight_road(4, steps=14))
+        writer.append(straight_road(1, seed=1, steps=14))
+    empty = tmp_path / "empty"
+    with StoreWriter(empty):
+        pass
+    for data, message in ((few, "interactive"), (empty, "no run segments"), (tmp_path / "none", "none")):
+        with pytest.raises(DataError, match=message):
+            train(config(store, tmp_path / "run", data))
+        assert not (tmp_path / "run").exists()
+
+
+def test_settings_that_do_not_fit_are_refused(store: Path, held_out: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"validation\.every \(3\) must be a multiple of checkpoint-every \(2\)"
+    ):
+        config(store, tmp_path, held_out, validation=ValidationConfig(held_out, every=3))
+    with pytest.raises(ConfigError, match=r"must not exceed search\.test-branches \(2\)"):
+        config(store, tmp_path, held_out, "bc_ts", validation=ValidationConfig(held_out, rollouts=3))
+    config(store, tmp_path, held_out, "bc", validation=ValidationConfig(held_out, rollouts=3))
+    for bad in ({"segments": 0}, {"rollouts": 0}, {"every": -1}):
+        with pytest.raises(ConfigError):
+            ValidationConfig(**bad)
+
+
+def made(folder: Path, best: dict[int, Best | None]) -> Path:
+    """A run's folder with empty checkpoints, each of which knows the best so far."""
+    for step, known in best.items():
+        extra = {"best": None if known is None else known.plain()}
+        save_checkpoint(folder / "checkpoints", step=step, modules={"m": nn.Linear(1, 1)}, extra=extra)
+    return folder
+
+
+def test_names_of_checkpoints(tmp_path: Path) -> None:
+    run = made(tmp_path / "a@home", {2: None, 4: Best(4, 1.0), 6: Best(4, 1.0)})
+    assert split_name(str(run)) == (run, "")
+    assert split_name(f"{run}@last") == (run, "last")
+    assert split_name("somewhere") == (Path("somewhere"), "")
+    assert [choose(run, w).name[-1] for w in ("", "best", "last", "2", "step-6")] == ["4", "4", "6", "2", "6"]
+    with pytest.raises(ConfigError, match="no checkpoint of step 3, it has those of the steps 2, 4, 6"):
+        choose(run, "3")
+    with pytest.raises(ConfigError, match="'first' is no checkpoint; name best, last or a step"):
+        choose(run, "first")
+    shutil.rmtree(choose(run))
+    with pytest.raises(CheckpointError, match="best checkpoint, of step 4, is gone; it has"):
+        choose(run)
+    assert choose(run, "last").name[-1] == "6"
+    plain = made(tmp_path / "plain", {2: None})
+    assert choose(plain) == choose(plain, "last")
+    with pytest.raises(ConfigError, match="not validated"):
+        choose(plain, "best")
+    with pytest.raises(ConfigError, match="no checkpoint yet"):
+        choose(tmp_path / "none")
+
+
+def test_checkpoints_from_before_there_was_validation_can_be_used(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "checkpoints", step=3, modules={})
+    assert Best.of(load_checkpoint(choose(tmp_path)).extra) is None
