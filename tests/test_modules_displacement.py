@@ -79,7 +79,6 @@ def test_latent_numbers_come_back(pace, slope, first, second):
 
 @given_bounds
 def test_displacements_within_the_bounds_come_back(pace, slope, first, second):
-    """A displacement between the outermost ones is met exactly, also next to standstill."""
     dist = make(pace, slope)
     low, high = (dist.displacement(double([u, 0.0])[0])[0] for u in (-INNER, INNER))
     forward = low + (high - low) * (0.5 + 0.5 * first / INNER)

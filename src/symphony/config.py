@@ -230,7 +230,8 @@ class TrainConfig:
     mgail: MGAILConfig = field(default_factory=MGAILConfig)
     """Adversarial learning (methods mgail*)."""
     warm_start: Path | None = None
-    """Folder of a run whose networks training starts from; new ones where that run has none."""
+    """Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its last
+    (`RUN@last` or `RUN@3000` names another); new ones where that run has none."""
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     """Choice of the best checkpoint: that with the lowest collision rate plus off-road time (the paper)."""
     checkpoint_every: int = 1000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -23,7 +24,13 @@ class MaskedLoss(LossModule):
         reduction: `"mean"` (also for None), `"sum"` or `"none"`.
         use_mask: whether the TensorDict holds a mask under the `valid` key. A mask that is expected but
             absent is an error: training on padding would go unnoticed.
+
+    Attributes:
+        share_count: set where processes train together: takes a count of this process to the mean over all, so that
+            the mean of their losses is the loss of the joint batch, however uneven its shards are.
     """
+
+    share_count: Callable[[Tensor], Tensor] | None = None
 
     def __init__(self, reduction: Reduction | None, use_mask: bool) -> None:
         super().__init__()
@@ -99,7 +106,14 @@ class MaskedLoss(LossModule):
         values = torch.where(counted, values, torch.zeros_like(values))
         if reduction == "none":
             return values
-        return values.sum() / counted.sum().clamp_min(1) if reduction == "mean" else values.sum()
+        if reduction == "sum":
+            return values.sum()
+        number = self._number(counted)
+        return values.sum() / torch.where(number > 0, number, 1)
+
+    def _number(self, counted: Tensor) -> Tensor:
+        """How many entries count, or what stands for it where processes train together."""
+        return counted.sum() if self.share_count is None else self.share_count(counted.sum())
 
 
 class Fit(NamedTuple):

@@ -143,7 +143,7 @@ class DiscriminatorLoss(MaskedLoss):
             counted = self._counted(tensordict, logit.shape, logit.device)
             fake, real = counted & simulated, counted & ~simulated
             loss = self._cross_entropy(logit, fake, real)
-            statistics = _statistics(logit.detach(), fake, real)
+            statistics = self._statistics(logit.detach(), fake, real)
             if penalised:
                 where = {"data": real, "simulated": fake, "both": counted}[self.penalty_on]
                 squared = _squared_norm(logit, leaves, where, create_graph=training)
@@ -187,6 +187,18 @@ class DiscriminatorLoss(MaskedLoss):
             return self._reduced(entropy, fake | real)
         return 0.5 * (self._reduced(entropy, fake) + self._reduced(entropy, real))
 
+    def _statistics(self, logit: Tensor, fake: Tensor, real: Tensor) -> dict[str, Tensor]:
+        def mean(values: Tensor, where: Tensor) -> Tensor:
+            return torch.where(where, values, 0.0).sum() / self._number(where)
+
+        return {
+            "accuracy_simulated": mean((logit > 0).to(logit.dtype), fake),
+            "accuracy_data": mean((logit < 0).to(logit.dtype), real),
+            "score_simulated": mean(logit, fake),
+            "score_data": mean(logit, real),
+            "auc": auc(logit, fake, fake | real),
+        }
+
 
 def _squared_norm(logit: Tensor, leaves: list[Tensor], where: Tensor, *, create_graph: bool) -> Tensor:
     """Squared norm `[..., N]` of each logit's gradient with respect to its own entry's inputs."""
@@ -202,16 +214,3 @@ def _squared_norm(logit: Tensor, leaves: list[Tensor], where: Tensor, *, create_
             )
         squared = squared + gradient.reshape(*logit.shape, -1).square().sum(-1)
     return squared
-
-
-def _statistics(logit: Tensor, fake: Tensor, real: Tensor) -> dict[str, Tensor]:
-    def mean(values: Tensor, where: Tensor) -> Tensor:
-        return torch.where(where, values, 0.0).sum() / where.sum()
-
-    return {
-        "accuracy_simulated": mean((logit > 0).to(logit.dtype), fake),
-        "accuracy_data": mean((logit < 0).to(logit.dtype), real),
-        "score_simulated": mean(logit, fake),
-        "score_data": mean(logit, real),
-        "auc": auc(logit, fake, fake | real),
-    }

@@ -10,8 +10,9 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
+from torch.func import functional_call
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
+from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -108,18 +109,28 @@ class MGAILLoss(MaskedLoss):
             if value < 0:
                 raise ValueError(f"{name} must be at least 0, is {value}")
         self.convert_to_functional(actor_network, "actor_network")
-        # Neither is trained here, so neither belongs to the loss's parameters or to its state_dict.
-        self.__dict__["discriminator"] = discriminator
-        self.__dict__["env"] = env
+        # Neither is trained here: in a container they are neither saved nor reset with the loss.
+        self._held: dict[str, Any] = {"discriminator": discriminator, "env": env}
         self.horizon, self.cost, self.truncate, self.checkpoint = horizon, cost, truncate, checkpoint
         self.detach_keys = list(detach_keys)
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "env":
-            # What a state consists of may change with it.
-            self.__dict__.update(env=value, _in_keys=None)
+            self._held["env"] = value
+            # What a state consists of may have changed with it.
+            self._in_keys = None
         else:
             super().__setattr__(name, value)
+
+    @property
+    def discriminator(self) -> TensorDictModuleBase:
+        """The judge, which is not trained here."""
+        return self._held["discriminator"]
+
+    @property
+    def env(self) -> EnvBase | None:
+        """What is simulated in."""
+        return self._held["env"]
 
     def _read_keys(self) -> list[NestedKey]:
         state = [] if self.env is None else list(self.env.state_spec.keys(True, True))
@@ -142,23 +153,25 @@ class MGAILLoss(MaskedLoss):
         steps = self.horizon if plan is None else plan.shape[batch]
         if steps < 1:
             raise ValueError("nothing to simulate: give a horizon, or random numbers for at least one step")
-        valid = self._counted(now, self._shape(now), tensordict.device or torch.device("cpu"))
+        valid = self._counted(now, self._shape(now), done.device)
         size = self.checkpoint or steps
         scores, going = [], []
         for first in range(0, steps, size):
             length = min(size, steps - first)
             numbers = None if plan is None else plan.narrow(batch, first, length)
             if self.checkpoint and torch.is_grad_enabled():
-                score, alive, now = checkpoint(
-                    self._simulate,
-                    now,
-                    numbers,
-                    first,
-                    length,
-                    use_reentrant=False,
-                    # Given numbers leave nothing to chance; otherwise the same must be drawn again.
-                    preserve_rng_state=plan is None,
-                )
+                # An early stop leaves the networks by an exception, and their weights exchanged.
+                with set_checkpoint_early_stop(False):
+                    score, alive, now = checkpoint(
+                        self._simulate,
+                        now,
+                        numbers,
+                        first,
+                        length,
+                        use_reentrant=False,
+                        # Given numbers leave nothing to chance; otherwise the same must be drawn again.
+                        preserve_rng_state=plan is None,
+                    )
             else:
                 score, alive, now = self._simulate(now, numbers, first, length)
             scores.append(score)
@@ -187,11 +200,10 @@ class MGAILLoss(MaskedLoss):
     ) -> tuple[Tensor, Tensor, TensorDictBase]:
         """Logits and whether the episode still ran, `[..., length, N]`, and the state after the last step."""
         batch, scores, going = now.batch_dims, [], []
-        # Networks and exploration are set here, since a checkpoint calls this again when the loss has returned.
-        frozen = TensorDict.from_module(self.discriminator).detach()
+        frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
+        # Entered here, since a checkpoint calls this again when the loss has returned.
         with (
             self.actor_network_params.to_module(self.actor_network),
-            frozen.to_module(self.discriminator),
             set_exploration_type(ExplorationType.RANDOM),
         ):
             for t in range(length):
@@ -208,7 +220,10 @@ class MGAILLoss(MaskedLoss):
                     drawn.set(key, acting.get(key))
                 alive = ~now.get(self.tensor_keys.done)
                 now = self.env.step_mdp(self.env.step(drawn))
-                score = self.discriminator(now.copy()).get(self.tensor_keys.score)
+                judged = functional_call(self.discriminator, frozen, (now.copy(),))
+                score = judged.get(self.tensor_keys.score, default=None)
+                if score is None:
+                    raise KeyError(f"the discriminator writes no score under {self.tensor_keys.score!r}")
                 scores.append(score)
                 going.append(alive.reshape(alive.shape[:batch] + (1,) * (score.ndim - batch)))
         score = torch.stack(scores, batch)

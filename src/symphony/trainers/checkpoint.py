@@ -227,7 +227,7 @@ def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> list[Pat
             # Without its manifest it counts no longer, however far the deletion gets.
             (path / MANIFEST).unlink()
             shutil.rmtree(path.with_name(f".old-{path.name}"), ignore_errors=True)
-        for path in Path(folder).iterdir():
+        for path in Path(folder).iterdir() if Path(folder).is_dir() else []:
             if _NAME.fullmatch(path.name) and path.is_dir() and not (path / MANIFEST).is_file():
                 shutil.rmtree(path)
     except OSError as error:

@@ -20,6 +20,7 @@ from symphony.trainers.agents import read_config
 from symphony.trainers.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.trainers.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
 from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.distributed import Processes, processes
 from symphony.trainers.learner import Learner
 from symphony.trainers.networks import Networks, build_networks, dynamics_of
 from symphony.trainers.selection import Best, choose, split_name
@@ -49,7 +50,13 @@ def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
         DataError: if a store can't be read or holds nothing to learn from, or the disk refuses.
         TrainingError: if gradients stay infinite or undefined.
     """
-    device = _device(config.device)
+    with processes(_device(config.device)) as world:
+        folder = _train(config, dataset, world)
+        world.wait()
+    return folder
+
+
+def _train(config: TrainConfig, dataset: SceneDataset | None, world: Processes) -> Path:
     if dataset is None:
         store = SegmentStore(config.data)
         dataset = SceneDataset(
@@ -69,23 +76,32 @@ def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
     if config.warm_start is not None and done is None:
         _warm_start(networks, config.warm_start)
     for module in networks.present().values():
-        module.to(device)
-    learner = Learner(config, networks, dataset, device)
-    validator = None if config.validation.data is None else Validator(config, networks, device)
-    config.out.mkdir(parents=True, exist_ok=True)
-    write_file(config.out / "config.json", to_json(config))
-    return _Loop(config, learner, validator).run(done)
+        module.to(world.device)
+    drawing = dataclasses.replace(config, seed=world.seed(config.seed))
+    learner = Learner(drawing, networks, dataset, world.device)
+    validator = None
+    if world.leads and config.validation.data is not None:
+        validator = Validator(config, networks, world.device)
+    # No process writes before all have looked at what there is.
+    world.wait()
+    if world.leads:
+        config.out.mkdir(parents=True, exist_ok=True)
+        write_file(config.out / "config.json", to_json(config))
+    return _Loop(config, learner, validator, world).run(done)
 
 
 class _Loop:
     """One run: updates, records, judgements and checkpoints, in that order."""
 
-    def __init__(self, config: TrainConfig, learner: Learner, validator: Validator | None) -> None:
-        self.config, self.learner, self.validator = config, learner, validator
+    def __init__(
+        self, config: TrainConfig, learner: Learner, validator: Validator | None, world: Processes
+    ) -> None:
+        self.config, self.learner, self.validator, self.world = config, learner, validator, world
         self.modules = learner.networks.present()
         self.skips, self.told = Skips(), set[str]()
         self.best: Best | None = None
-        self.progress = _progress()
+        self.progress = _progress(shown=world.leads)
+        self.tracker: Tracker | None = None
 
     def run(self, done: Path | None) -> Path:
         """Train from a checkpoint, or from the start, to the end."""
@@ -94,10 +110,13 @@ class _Loop:
             loaded = load_checkpoint(done, modules=self.modules, optimizers=self.learner.optimizers)
             step = loaded.step
             self._restore(loaded.extra)
-            # The process before may have died in between.
+        self.world.share(self.learner)
+        self.alarms = Alarms()
+        if self.world.leads:
+            # The process before may have died between a checkpoint and the removal of old ones.
             self._prune()
-        self.tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
-        self.alarms = Alarms(self.tracker.kept)
+            self.tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
+            self.alarms = Alarms(self.tracker.kept)
         try:
             with self.progress:
                 self.task = self.progress.add_task(
@@ -105,12 +124,14 @@ class _Loop:
                 )
                 self._update_from(step)
         finally:
-            self.tracker.close()
+            if self.tracker is not None:
+                self.tracker.close()
         return config.out
 
     def _update_from(self, step: int) -> None:
         config, first, began = self.config, step, time.perf_counter()
         while step < config.steps:
+            self.world.reseed(config.seed, step)
             values = self.learner.update(step)
             step += 1
             last = step == config.steps
@@ -118,7 +139,7 @@ class _Loop:
                 self._warn(f"{NORM}{network}", f"a gradient of the {network} network is not finite; skipped")
             numbers: dict[str, float | str] = {}
             if last or step % config.log_every == 0:
-                numbers = {name: value.item() for name, value in values.items()}
+                numbers = {name: value.item() for name, value in self.world.mean(values).items()}
                 numbers["updates_per_second"] = (step - first) / (time.perf_counter() - began)
                 numbers |= self._describe(numbers)
             self.progress.update(self.task, completed=step)
@@ -126,9 +147,12 @@ class _Loop:
                 paused = time.perf_counter()
                 numbers |= self._validate(self.validator, step)
                 began += time.perf_counter() - paused
+            if self.tracker is None:
+                continue
             if numbers:
                 self.tracker.log(step, numbers)
             if last or step % config.checkpoint_every == 0:
+                self.tracker.sync()
                 self._save(step)
 
     def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
@@ -147,7 +171,7 @@ class _Loop:
 
     def _warn(self, condition: str, message: str) -> None:
         """Tell the user, once."""
-        if condition not in self.told:
+        if condition not in self.told and self.world.leads:
             self.told.add(condition)
             self.progress.console.print(f"warning: {message}", style="yellow", soft_wrap=True)
 
@@ -161,12 +185,12 @@ class _Loop:
         return numbers
 
     def _save(self, step: int) -> None:
-        """Write a checkpoint; by then all records up to it are on the disk."""
-        self.tracker.sync()
+        """Write a checkpoint; by now all records up to it are on the disk."""
         folder = self.config.out / "checkpoints"
         extra = {
             "best": None if self.best is None else self.best.plain(),
             "skips": dataclasses.asdict(self.skips),
+            "processes": self.world.count,
         }
         save_checkpoint(
             folder, step=step, modules=self.modules, optimizers=self.learner.optimizers, extra=extra
@@ -178,6 +202,11 @@ class _Loop:
         prune(self.config.out / "checkpoints", KEEP, protect=protect)
 
     def _restore(self, extra: Mapping[str, Any]) -> None:
+        before = extra.get("processes", 1)
+        if before != self.world.count:
+            raise ConfigError(
+                f"{self.config.out}: trained by {before} processes so far, can't be resumed by {self.world.count}"
+            )
         self.best = Best.of(extra)
         self.skips = Skips(**extra.get("skips", {}))
         if self.validator is not None:
@@ -234,7 +263,7 @@ def _device(name: str) -> torch.device:
     return device
 
 
-def _progress() -> Progress:
+def _progress(*, shown: bool) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -242,4 +271,5 @@ def _progress() -> Progress:
         TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left"),
         TimeRemainingColumn(),
         console=Console(stderr=True),
+        disable=not shown,
     )

@@ -1,0 +1,204 @@
+"""Two processes that train together: run as a program, with STORE OUT; writes what they found to OUT."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from helpers_runs import tiny
+from symphony import keys
+from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, ValidationConfig
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError
+from symphony.trainers import learner as learning
+from symphony.trainers import train
+from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.distributed import Processes, processes
+from symphony.trainers.learner import Learner
+from symphony.trainers.networks import build_networks, dynamics_of
+from symphony.trainers.selection import choose
+
+WORLD = 2
+LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "judge": "judge_loss"}
+TRAINED = ("bc", "bc_ts_h", "mgail_ts")
+CPU = torch.device("cpu")
+
+
+def config(method: Any, store: Path, out: Path) -> TrainConfig:
+    """Of a run with all that is random, and as much of MGAIL as there is."""
+    return tiny(
+        method,
+        store,
+        out,
+        steps=6,
+        validation=ValidationConfig(store, segments=1, rollouts=1),
+        discriminator=DiscriminatorConfig(hidden=8, head=8, states=8, instance_noise=0.1),
+        mgail=MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5),
+    )
+
+
+def fresh(method: str, store: Path, dataset: SceneDataset) -> Learner:
+    """Networks that are the same at every call."""
+    settings = tiny(method, store, Path())
+    torch.manual_seed(0)
+    return Learner(settings, build_networks(settings), dataset, CPU)
+
+
+def batch_for(kind: str, learner: Learner) -> TensorDictBase:
+    """A batch that is the same at every call, whose first half has far fewer entries that count."""
+    rng, dataset, sees = torch.Generator().manual_seed(1), learner.dataset, learner.sees
+    if kind == "goals":
+        batch = dataset.sample_goals([0, 1], 32, sees, rng)
+    elif kind == "judge":
+        batch = learner._both_kinds(learner._search(0, rng), rng)
+        # Simulated states come before logged ones.
+        batch = batch[torch.arange(len(batch)).reshape(2, 2, -1).transpose(0, 1).flatten()]
+    else:
+        batch = dataset.sample_states([0, 1], 32, sees, rng)
+        if kind == "distillation":
+            batch.set(keys.ROLLOUT, torch.rand(32, 1, generator=rng) < 0.5)
+    valid = batch.get(keys.VALID)
+    chance = torch.where(torch.arange(len(valid)) < len(valid) // 2, 0.3, 0.9)[:, None]
+    return batch.set(keys.VALID, valid & (torch.rand(valid.shape, generator=rng) < chance))
+
+
+def descended(learner: Learner, loss: Any, batch: TensorDictBase) -> tuple[dict[str, Tensor], Tensor]:
+    """What a loss reports, and its gradient."""
+    values = loss(batch)
+    next(values[key] for key in loss.out_keys if key.startswith("loss_")).backward()
+    parameters = [p for module in learner.networks.present().values() for p in module.parameters()]
+    grads = [p.grad.flatten() for p in parameters if p.grad is not None]
+    return {name: value.detach() for name, value in values.items()}, torch.cat(grads)
+
+
+def compare(kind: str, store: Path, dataset: SceneDataset, world: Processes) -> dict[str, Any]:
+    """The loss of one half of a batch in each process beside that of all of it in one."""
+    method = {"bc": "bc", "distillation": "bc_ts", "goals": "bc_h", "judge": "bc_ts"}[kind]
+    alone, together = fresh(method, store, dataset), fresh(method, store, dataset)
+    batch = batch_for(kind, alone)
+    half = len(batch) // WORLD
+    own = batch[world.rank * half : (world.rank + 1) * half]
+    values, gradient = descended(alone, getattr(alone, LOSSES[kind]), batch)
+    _, lone_gradient = descended(alone, getattr(alone, LOSSES[kind]), own)
+    world.share(together)
+    part, shared_gradient = descended(together, getattr(together, LOSSES[kind]), own)
+    shared = world.mean(part)
+    return {
+        "counts": int(own.get(keys.VALID).sum()),
+        "values": {name: value.item() for name, value in values.items()},
+        "shared": {name: value.item() for name, value in shared.items()},
+        "gradient": gradient.norm().item(),
+        "gradient_off": (shared_gradient - gradient).abs().max().item(),
+        "gradient_off_alone": (lone_gradient - 2 * gradient).abs().max().item(),
+    }
+
+
+def of_run(method: str, store: Path, out: Path, dataset: SceneDataset, rank: int) -> dict[str, Any]:
+    """Train, and take the last updates up again; with what this process drew, and where its weights got to."""
+    drawn, at_end = [], []
+    draw, descend = SceneDataset.draw, learning.Learner._descend
+
+    def spy(self: SceneDataset, count: int, rng: torch.Generator) -> list[int]:
+        drawn.append(rng.initial_seed())
+        return draw(self, count, rng)
+
+    def watch(self: Learner, *args: Any) -> dict[str, Tensor]:
+        record = descend(self, *args)
+        at_end[:] = [float(p.detach().double().sum()) for p in self.networks.policy.parameters()]
+        return record
+
+    SceneDataset.draw, learning.Learner._descend = spy, watch  # type: ignore[method-assign]
+    settings = config(method, store, out / method)
+    train(settings, dataset)
+    found = {"drawn": list(drawn), "weights": list(at_end)}
+    if rank == 0:
+        shutil.copytree(settings.out, out / f"{method}-part")
+        shutil.rmtree(choose(out / f"{method}-part", "6"))
+    resumed = replace(settings, out=out / f"{method}-part", resume=True)
+    with processes(CPU) as world:
+        world.wait()
+    train(resumed, dataset)
+    SceneDataset.draw, learning.Learner._descend = draw, descend  # type: ignore[method-assign]
+    return {**found, "resumed": list(at_end)}
+
+
+def main(rank: int, store: Path, out: Path) -> None:
+    """What one process does."""
+    sets = {
+        method: SceneDataset(SegmentStore(store), 2, dynamics_of(config(method, store, out)), routes=True)
+        for method in ("bc", "mgail")
+    }
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
+    found: dict[str, Any] = {}
+    with processes(CPU) as world:
+        found["world"] = [world.rank, world.count, world.leads]
+        found["mean"] = {
+            name: value.item()
+            for name, value in world.mean(
+                {
+                    "both": torch.tensor(float(rank)),
+                    "one": torch.tensor(3.0 if rank else float("nan")),
+                    "none": torch.tensor(float("nan")),
+                    "infinite": torch.tensor(float("inf") if rank else 1.0),
+                }
+            ).items()
+        }
+        found["losses"] = {kind: compare(kind, store, sets["bc"], world) for kind in LOSSES}
+        found["runs"] = {
+            method: of_run(method, store, out, sets["mgail" if "mgail" in method else "bc"], rank)
+            for method in TRAINED
+        }
+    (out / f"rank{rank}.json").write_text(json.dumps(found))
+
+
+def alone(store: Path, out: Path) -> None:
+    """Take up what two processes began."""
+    try:
+        train(replace(config("bc", store, out / "bc"), resume=True, steps=8))
+    except ConfigError as error:
+        (out / "alone.txt").write_text(str(error))
+
+
+def fork(action: Callable[..., None], *args: Any) -> int:
+    """Do something in a process of its own; returns its number."""
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        action(*args)
+        status = 0
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
+if __name__ == "__main__":
+    where = (Path(sys.argv[1]), Path(sys.argv[2]))
+    lone = dict(os.environ)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    # As torchrun does.
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(WORLD)}
+    os.environ["TORCHELASTIC_RUN_ID"] = "test"
+    children = [fork(main, rank, *where) for rank in range(WORLD)]
+    codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    del os.environ["TORCHELASTIC_RUN_ID"]
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(fork(alone, *where), 0)[1]))
+    raise SystemExit(int(any(codes)))

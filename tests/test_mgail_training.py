@@ -1,0 +1,305 @@
+"""Training by MGAIL: its phases, what each of them changes, and what comes out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from helpers_runs import same_weights, tiny, weights
+from helpers_segments import crossing, hide, straight_road
+from symphony import keys
+from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import Displacement
+from symphony.errors import ConfigError, DataError, SymphonyError
+from symphony.trainers import evaluate, load_agent, train
+from symphony.trainers.checkpoint import latest
+from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.learner import Learner
+from symphony.trainers.networks import build_networks
+from symphony.trainers.tracking import read_metrics
+
+METHODS = ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h")
+SHORT = MGAILConfig(regression=2, head_start=2, rollouts=3)
+STILL = MGAILConfig(regression=0, head_start=9, rollouts=3)
+"""Keeps a policy as it is."""
+JUDGED = EvaluateConfig(rollouts=2)
+Trained = Callable[..., Path]
+
+
+def config(method: Any, store: Path, out: Path = Path(), **changes: Any) -> TrainConfig:
+    """Two updates of regression, two of the discriminator alone, two of both."""
+    return replace(tiny(method, store, out, steps=6, mgail=SHORT), **changes)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Segments of 2, 2 and 2.4 s; one vehicle comes into sight after the start."""
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        writer.append(straight_road(4, seed=0, steps=11))
+        writer.append(crossing(4, seed=0, steps=11))
+        writer.append(hide(crossing(5, seed=1, steps=13), 3, slice(0, 4)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def dataset(store: Path) -> SceneDataset:
+    return SceneDataset(SegmentStore(store), 2, Displacement(), routes=True)
+
+
+@pytest.fixture(scope="module")
+def trained(store: Path, dataset: SceneDataset, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """Runs made once each; never written to again."""
+    runs: dict[str, Path] = {}
+
+    def get(method: str) -> Path:
+        if method not in runs:
+            runs[method] = train(config(method, store, tmp_path_factory.mktemp("runs") / method), dataset)
+        return runs[method]
+
+    return get
+
+
+def make(settings: TrainConfig, dataset: SceneDataset) -> Learner:
+    torch.manual_seed(settings.seed)
+    return Learner(settings, build_networks(settings), dataset, torch.device("cpu"))
+
+
+def copies(learner: Learner) -> dict[str, list[Tensor]]:
+    present = learner.networks.present()
+    return {name: [p.detach().clone() for p in module.parameters()] for name, module in present.items()}
+
+
+def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> set[str]:
+    """Networks of which most weights changed; none may have changed in part of them only."""
+    shares = {
+        name: sum(not torch.equal(*pair) for pair in zip(before[name], after[name], strict=True))
+        / len(before[name])
+        for name in before
+    }
+    assert all(share == 0 or share > 0.7 for share in shares.values()), shares
+    return {name for name, share in shares.items() if share}
+
+
+@pytest.mark.parametrize("checkpoint", [0, 3])
+@pytest.mark.parametrize("method", METHODS)
+def test_each_phase_changes_the_networks_it_is_for(
+    store: Path, dataset: SceneDataset, method: str, checkpoint: int
+) -> None:
+    learner = make(config(method, store, mgail=replace(SHORT, checkpoint=checkpoint)), dataset)
+    goals = {"goals"} if method.endswith("_h") else set()
+    phases = ({"policy"}, {"policy"}, {"discriminator"}, {"discriminator"}) + (
+        {"policy", "discriminator"},
+    ) * 2
+    rates = []
+    for step, phase in enumerate(phases):
+        before = copies(learner)
+        record = learner.update(step)
+        assert moved(before, copies(learner)) == phase | goals
+        assert ("loss_bc" in record) == (step < 2)
+        assert ("loss_discriminator" in record) == ("search_auc_collision" in record) == (step >= 2)
+        assert ("loss_mgail" in record) == ("loss_policy" in record) == (step >= 4)
+        assert all(not value.requires_grad for value in record.values())
+        assert all(math.isfinite(v) for k, v in record.items() if k.startswith(("loss", "gradient")))
+        rates.append(learner.optimizers["policy"].param_groups[0]["lr"])
+    # The policy's rate starts anew with the second phase, at one of its own.
+    assert rates[0] == learner.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[5]
+
+
+@pytest.mark.parametrize("method", ["mgail_h", "mgail_ts_h"])
+def test_goals_and_discriminator_learn_nothing_from_the_loss_of_the_policy(
+    store: Path, dataset: SceneDataset, method: str
+) -> None:
+    learner = make(config(method, store), dataset)
+    for step in range(5):
+        learner.update(step)
+    found = learner._found
+    assert learner.mgail_loss is not None
+    assert found is not None
+    for module in learner.networks.present().values():
+        module.zero_grad(set_to_none=True)
+    learner.mgail_loss(learner._replayed(found, torch.Generator()))["loss_mgail"].backward()
+    for name, module in learner.networks.present().items():
+        with_gradient = [p.grad is not None for p in module.parameters()]
+        assert all(with_gradient) if name == "policy" else not any(with_gradient)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_gradient_goes_along_what_survived(store: Path, dataset: SceneDataset, method: str) -> None:
+    """Rollouts that are simulated again lead through the very states that the search found."""
+    learner = make(config(method, store, mgail=replace(SHORT, rollouts=99)), dataset)
+    found = learner._search(4, torch.Generator().manual_seed(0))
+    assert (found.start.shape, found.survivors.shape[:2]) == ((2, 2), (2, 2))
+    begin = learner._replayed(found, torch.Generator().manual_seed(0))
+    assert begin.shape == (4,)
+    paths, policy = found.survivors.flatten(0, 1), learner.networks.policy
+    now, states = begin.exclude("noise_plan"), []
+    with torch.no_grad():
+        for noise in begin["noise_plan"].unbind(1):
+            states.append(now[keys.STATE])
+            now = found.env.step(policy(now.copy().set(keys.NOISE, noise)))["next"]
+    replayed = torch.stack(states, 1)
+    # In an order of their own.
+    same = (replayed[:, None] == paths[keys.STATE][None]).flatten(2).all(-1)
+    assert same.any(1).all()
+    assert same.any(0).all()
+    followed = found.env.scenes.route_logged[begin[keys.SCENE].squeeze(-1)]
+    expected = followed if method.endswith("_h") else torch.full_like(followed, -1)
+    assert torch.equal(begin[keys.GOAL], expected)
+
+
+def test_settings_of_the_configuration_reach_the_loss(store: Path, dataset: SceneDataset) -> None:
+    settings = MGAILConfig(cost="logit", truncate=4, checkpoint=2, react=True)
+    loss = make(config("mgail", store, mgail=settings), dataset).mgail_loss
+    assert loss is not None
+    assert (loss.cost, loss.truncate, loss.checkpoint, loss.detach_keys) == ("logit", 4, 2, [])
+    learner = make(config("mgail_h", store), dataset)
+    assert learner.mgail_loss is not None
+    assert set(learner.mgail_loss.detach_keys) == {keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE}
+    # Regression beside it, and more updates of the discriminator.
+    both = MGAILConfig(regression=0, head_start=0, rollouts=3, expert_weight=0.5, discriminator_updates=2)
+    learner, steps = make(config("mgail", store, mgail=both), dataset), []
+    learner.optimizers["discriminator"].register_step_post_hook(lambda *_: steps.append(1))
+    record = learner.update(0)
+    torch.testing.assert_close(record["loss_policy"], record["loss_mgail"] + 0.5 * record["loss_bc"])
+    assert len(steps) == 2
+
+
+@pytest.mark.parametrize(("method", "dies_at"), [("mgail", 3), ("mgail_ts_h", 3), ("mgail_ts_h", 5)])
+def test_a_killed_run_ends_like_an_unbroken_one(
+    store: Path,
+    dataset: SceneDataset,
+    trained: Trained,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    method: str,
+    dies_at: int,
+) -> None:
+    whole = trained(method)
+    update = Learner.update
+
+    def deadly(self: Learner, step: int) -> dict[str, Tensor]:
+        if step == dies_at:
+            raise KeyboardInterrupt
+        return update(self, step)
+
+    settings = config(method, store, tmp_path / "run", resume=True)
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Learner, "update", deadly)
+        train(settings, dataset)
+    done = latest(settings.out / "checkpoints")
+    assert done is not None
+    assert int(done.name.removeprefix("step-")) == dies_at - 1
+    train(settings, dataset)
+    assert same_weights(weights(settings.out), weights(whole))
+    assert [r["step"] for r in read_metrics(settings.out)] == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_agent_is_judged_as_it_was_trained(trained: Trained, store: Path, method: str) -> None:
+    agent = load_agent(str(trained(method)))
+    assert agent.dynamics == Displacement()
+    assert (agent.goals is None) == (not method.endswith("_h"))
+    assert agent.discriminator is not None
+    usual = evaluate(agent, store, JUDGED).numbers()
+    assert usual["search"] == ("tree" if "_ts" in method else "none")
+    assert all(math.isfinite(float(usual[name])) for name in ("ade", "collision_rate", "offroad_time"))
+    kinds = {
+        kind: evaluate(agent, store, replace(JUDGED, search=kind)).numbers() for kind in ("none", "tree")
+    }
+    assert kinds[str(usual["search"])] == pytest.approx(usual, nan_ok=True)
+    assert kinds["none"]["ade"] != kinds["tree"]["ade"]
+    alone = evaluate(agent, store, replace(JUDGED, batch=1)).numbers()
+    assert alone == pytest.approx(usual, nan_ok=True)
+
+
+def test_adversarial_training_starts_from_a_regression(
+    store: Path, dataset: SceneDataset, tmp_path: Path
+) -> None:
+    plain = train(config("mgail", store, tmp_path / "plain", steps=2), dataset)
+    fresh = weights(plain)
+    out = train(config("mgail_ts", store, tmp_path / "warm", warm_start=plain, steps=2, mgail=STILL), dataset)
+    after = weights(out)
+    assert after.keys() == fresh.keys()
+    for name, value in after.items():
+        assert torch.equal(value, fresh[name]) == name.startswith("policy.") or value.numel() < 2
+    with pytest.raises(SymphonyError):  # a policy over other actions
+        source = train(tiny("bc", store, tmp_path / "bc", steps=2))
+        train(config("mgail", store, tmp_path / "other", warm_start=source), dataset)
+
+
+def test_the_duration_cuts_segments(store: Path) -> None:
+    data = SegmentStore(store)
+    short = SceneDataset(data, 2, Displacement(), routes=True, duration=1)
+    learner = make(config("mgail_h", store, duration=1), short)
+    for step in range(5):
+        learner.update(step)
+    found = learner._found
+    assert found is not None
+    assert found.survivors.shape == (2, 2, 5)
+    assert (found.env.scenes.last_step == 5).all()
+    assert found.logged.shape[1] == found.env.scenes.log_state.shape[1] == 6
+    whole = SceneDataset(data, 2, Displacement())
+    for item in range(3):
+        cut, full = short.segment(item), whole.segment(item)
+        assert (cut.position == full.position[:, :6]).all()
+        assert cut.signal_state.shape[1] == cut.valid.shape[1] == cut.num_steps == 6
+        assert short.experts(item).states.shape[1] == 6
+
+
+def test_a_segment_too_short_for_the_duration_is_named(store: Path, tmp_path: Path) -> None:
+    settings = config("mgail", store, tmp_path / "run", duration=2, segments=3)
+    train(replace(settings, steps=1))
+    for fails in (
+        lambda: train(replace(settings, out=tmp_path / "long", duration=3)),
+        lambda: evaluate("constant_velocity", store, EvaluateConfig(rollouts=1, duration=3)),
+    ):
+        with pytest.raises(DataError, match="3 s are asked for") as caught:
+            fails()
+        assert caught.value.file == store
+        assert caught.value.segment in ("straight-0", "crossing-0", "crossing-1")
+    with pytest.raises(ConfigError, match="duration"):
+        config("mgail", store, duration=-1)
+
+
+def test_an_agent_is_judged_for_the_duration_it_was_trained_with(
+    trained: Trained, store: Path, dataset: SceneDataset, tmp_path: Path
+) -> None:
+    run = train(config("mgail", store, tmp_path / "run", duration=1, steps=1))
+    agent = load_agent(str(run))
+    assert agent.duration == 1
+
+    def numbers(of: int, asked: int, where: Path = store) -> Any:
+        judged = replace(JUDGED, duration=asked)
+        return pytest.approx(evaluate(replace(agent, duration=of), where, judged).numbers(), nan_ok=True)
+
+    assert numbers(1, 0) == numbers(0, 1).expected
+    assert numbers(2, 1) == numbers(1, 0).expected
+    assert numbers(2, 0) != numbers(1, 0).expected
+    # All of it is no cut.
+    with StoreWriter(tmp_path / "even") as writer:
+        for seed in range(2):
+            writer.append(crossing(4, seed=seed, steps=11))
+    assert numbers(0, 0, tmp_path / "even") == numbers(0, 2, tmp_path / "even").expected
+
+
+def test_eight_agents_train(tmp_path: Path) -> None:
+    with StoreWriter(tmp_path / "store") as writer:
+        writer.append(straight_road(9, seed=0, steps=7))
+        writer.append(hide(crossing(10, seed=1, steps=9), 2, slice(5, 9)))
+    settings = config("mgail_ts_h", tmp_path / "store", tmp_path / "run")
+    run = train(replace(settings, agent=replace(settings.agent, interactive=8)))
+    records = read_metrics(run)
+    assert all(math.isfinite(r["gradient_norm_policy"]) for r in (*records[:2], *records[4:]))
+    assert records[-1]["skipped_updates"] == 0
+    found = evaluate(str(run), tmp_path / "store", JUDGED)
+    assert found.interactive == 8
+    assert math.isfinite(float(found.numbers()["ade"]))
