@@ -12,7 +12,7 @@ DEV := $(VENV)/.dev
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format clean
+.PHONY: help setup demo table test lint format clean
 
 help:  ## what there is
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -21,6 +21,9 @@ setup: $(DEV)  ## create .venv with everything for development
 
 demo: $(CORE)  ## learn from the built-in data and write pictures and numbers to out/demo
 	$(BIN)/symphony demo --out out/demo
+
+table: $(CORE)  ## train, judge and compare all eight methods, tiny, in out/table
+	$(BIN)/python scripts/make_table.py --out out/table
 
 test: $(DEV)  ## run the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

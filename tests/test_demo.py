@@ -3,21 +3,53 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from helpers_segments import crossing, straight_road
 from symphony.cli import main
+from symphony.config import Method
+from symphony.data.store import StoreWriter
 
 
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["demo", "--out", str(tmp_path / "demo"), "--steps", "2", "--rollouts", "1"]
     assert main(command) == 0
     rows = json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]
-    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC"]
+    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC", "pretrained BC+TS+H"]
     assert all(row["segments"] == 24 for row in rows)
     assert rows[0]["ade"] == rows[0]["collision_rate"] == 0
     assert rows[1]["ade"] > 1
+    # Whatever two updates make of BC, an agent that has learned to drive stays on the road.
+    assert rows[3]["search"] == "tree"
+    assert rows[3]["offroad_time"] < rows[1]["offroad_time"]
     assert (tmp_path / "demo" / "rollouts.png").stat().st_size > 50_000
     assert f"{rows[1]['ade']:.2f}" in capsys.readouterr().out
     assert main(command) == 0  # an earlier demo is replaced
+
+
+def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table of all eight methods, on a store of two segments."""
+    for split, seed in (("train", 0), ("test", 1)):
+        with StoreWriter(tmp_path / split) as writer:
+            writer.append(straight_road(4, seed=seed, steps=11))
+            writer.append(crossing(4, seed=seed, steps=11))
+    path = Path(__file__).resolve().parents[1] / "scripts" / "make_table.py"
+    script = runpy.run_path(str(path))
+    monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)
+    sizes = "--steps 4 --states 8 --agent.hidden 8 --agent.head 8 --agent.num-points 8 --search.updates 2 "
+    sizes += "--checkpoint-every 2 --search.segments 1 --search.branches=2 --rollouts 2 --duration 2"
+    out = tmp_path / "out"
+    status = script["main"](["--out", str(out), *sizes.split()])
+    shown = capsys.readouterr()
+    assert status == 0, shown.err
+    lines = (out / "table.md").read_text().splitlines()
+    for method in get_args(Method):
+        name = method.upper().replace("_", "+")
+        assert sum(line.strip("| *").startswith(f"{name} ") for line in lines) == 1, name
+        config = json.loads((out / method / "config.json").read_text())
+        assert (config["method"], config["steps"], config["search"]["branches"]) == (method, 4, 2)
+    assert "MGAIL+TS+H" in shown.out

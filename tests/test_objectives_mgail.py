@@ -262,13 +262,17 @@ def test_without_given_numbers_it_draws_anew(env):
     assert first == loss(used)["loss_mgail"] != second
 
 
-def test_the_environment_may_change_between_calls(env):
-    other, loss = world(3, 3), make(env)
-    loss(planned(env))
+@pytest.mark.parametrize("checkpoint", [0, 2])
+def test_the_environment_may_change_between_calls(env, checkpoint):
+    other, loss = world(3, 3), make(env, checkpoint=checkpoint)
+    expected = value_and_gradient(make(env), planned(env))
+    value = loss(planned(env))["loss_mgail"]
     loss.env = other
-    td = planned(other, 1, 0, 1)
-    assert torch.equal(loss(td)["loss_mgail"], make(other)(td)["loss_mgail"])
     assert loss.env is other
+    # Also before the gradient is asked for.
+    assert_same((value.detach(), torch.autograd.grad(value, list(loss.parameters()))), expected)
+    td = planned(other, 1, 0, 1)
+    assert_same(value_and_gradient(loss, td), value_and_gradient(make(other), td))
 
 
 def numbers(x, step, stream):

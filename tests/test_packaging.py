@@ -97,6 +97,7 @@ def test_without_any_python_the_message_says_what_is_needed(tmp_path: Path) -> N
     ("target", "commands"),
     [
         ("demo", ["bin/symphony demo --out out/demo"]),
+        ("table", ["bin/python scripts/make_table.py --out out/table"]),
         ("test", ["bin/python -m pytest"]),
         ("lint", ["ruff check", "ruff format --check", "mypy", "lint-imports", "scripts/lint_length.py"]),
     ],
@@ -104,7 +105,7 @@ def test_without_any_python_the_message_says_what_is_needed(tmp_path: Path) -> N
 def test_targets_set_themselves_up_once(target: str, commands: list[str], tmp_path: Path) -> None:
     first = make("--dry-run", target, f"VENV={tmp_path}").stdout
     assert [line for line in first.splitlines() if "-c constraints.txt -e" in line]
-    assert ("[dev]" in first) == (target != "demo")
+    assert ("[dev]" in first) == (target not in {"demo", "table"})
     (tmp_path / ".core").touch()
     (tmp_path / ".dev").touch()
     again = make("--dry-run", target, f"VENV={tmp_path}").stdout

@@ -157,9 +157,9 @@ class MGAILConfig:
     """Rollouts per update that the gradient goes through, drawn from those of the last search."""
     learning_rate: float = 2e-4
     """Of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
-    cost: Cost = "log_d"
-    """What the policy lowers, D the probability that a state is simulated: `log_d` (the paper), `non_saturating`
-    -log(1 - D), or the `logit` of D."""
+    cost: Cost = "non_saturating"
+    """What the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient vanishes
+    in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
     expert_weight: float = 0.0
     """Weight of the regression to the log beside it."""
     discriminator_updates: int = 1

@@ -13,7 +13,10 @@ from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 
 @dataclass(frozen=True)
 class Demo:
-    """Learn from the built-in data, evaluate, and draw what came out: some minutes on a laptop."""
+    """Learn from the built-in data, evaluate, and draw what came out: some minutes on a laptop.
+
+    An agent that comes with the package is judged beside it.
+    """
 
     out: Path = Path("out/demo")
     """Folder for the trained agent, the picture and the numbers; an earlier demo there is replaced."""
@@ -30,7 +33,7 @@ class Demo:
 
         from rich.console import Console
 
-        from symphony.cli.pictures import draw_rollouts
+        from symphony.cli.pictures import draw_compared
         from symphony.data.builtin import builtin_store
         from symphony.trainers import load_agent, train
 
@@ -50,17 +53,23 @@ class Demo:
         )
         console.print(f"Simulating {judge}, which it has not seen")
         config = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
-        results = [
-            evaluate_with_bar(name, judge, config) for name in ("playback", "constant_velocity", str(run))
-        ]
+        agents = ["playback", "constant_velocity", str(run), PRETRAINED]
+        results = [evaluate_with_bar(name, judge, config) for name in agents]
         rows = [{**result.numbers(), "agent": name} for result, name in zip(results, NAMES, strict=True)]
         print_metrics(rows, title="Built-in test segments")
+        console.print(
+            f"{NAMES[-1]} is {PRETRAINED}, which learned from far more data of another set and is simulated with its "
+            "tree search.",
+            style="dim",
+        )
         seconds = time.perf_counter() - began
         write_json(numbers, {"rows": rows, "steps": self.steps, "seconds": round(seconds, 1)})
-        draw_rollouts(load_agent(str(run)), judge, picture, results[-1].interactive, seed=self.seed)
+        drawn = {NAMES[i]: load_agent(agents[i]) for i in (2, 3)}
+        draw_compared(drawn, judge, picture, results[-1].interactive, seed=self.seed)
         console.print(f"Done in {seconds:.0f} s.")
         for what, where in (("picture of rollouts", picture), ("numbers", numbers), ("trained agent", run)):
             console.print(f"{what + ':':21}{where}", soft_wrap=True)
 
 
-NAMES = ("log playback", "constant velocity", "BC")
+PRETRAINED = "pretrained:bc_ts_h"
+NAMES = ("log playback", "constant velocity", "BC", "pretrained BC+TS+H")

@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 class Evaluate:
     """Simulate the interactive agents of every run segment and compare them with the log.
 
-    The log itself is judged beside the agent: what the data would score. The run keeps what was found in its folder,
+    The log itself is judged beside the agent: what the data would score. A run keeps what was found in its folder,
     as evaluations/NAME.json, where `symphony table` looks for it; the same evaluation made again replaces it.
     """
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="playback|RUN")]
-    """Folder of a run (see `symphony train`), `playback` (the log itself) or `constant_velocity`."""
+    """Folder of a run (see `symphony train`), `pretrained:NAME` (an agent that comes with the package), `playback`
+    (the log itself) or `constant_velocity`."""
     data: Path
     """Store of run segments to simulate."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -69,10 +70,15 @@ class Judged:
     record: dict[str, Any]
 
     def keep(self) -> Path | None:
-        """Keep the record in the folder of the run and return the file; None for a baseline, which has no folder."""
+        """Keep the record in the folder of the run and return the file.
+
+        None for a baseline, which has no folder, and for an agent that comes with the package, whose folder is not
+        the user's.
+        """
+        from symphony.trainers.pretrained import is_pretrained
         from symphony.trainers.selection import split_name
 
-        if self.record["run"] is None:
+        if self.record["run"] is None or is_pretrained(self.agent.name):
             return None
         return keep_evaluation(split_name(self.agent.name)[0], self.record)
 

@@ -154,10 +154,15 @@ def kept_evaluations(run: Path) -> dict[str, dict[str, Any]]:
     Raises:
         DataError: one that can't be read.
     """
-    return {file.stem: _read_evaluation(file) for file in sorted((run / FOLDER).glob("[!.]*.json"))}
+    return {file.stem: read_evaluation(file) for file in sorted((run / FOLDER).glob("[!.]*.json"))}
 
 
-def _read_evaluation(file: Path) -> dict[str, Any]:
+def read_evaluation(file: Path) -> dict[str, Any]:
+    """A kept evaluation (see :func:`evaluation_record`).
+
+    Raises:
+        DataError: it can't be read or lacks something.
+    """
     record = _read_object(file)
     if record.get("format") != FORMAT:
         raise DataError(

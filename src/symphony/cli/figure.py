@@ -29,7 +29,7 @@ class Curvature:
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="RUN ...", help_behavior_hint="(required)"),
     ]
-    """Folders of runs."""
+    """Folders of runs, or `pretrained:NAME`."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -54,14 +54,16 @@ class Curvature:
         from symphony.metrics import jensen_shannon
         from symphony.render import plot_curvature
         from symphony.render.style import picture_path
+        from symphony.trainers.pretrained import run_folder
 
         picture_path(self.out)
         panels = {}
-        for folder, name in zip(self.runs, run_names(self.runs), strict=True):
+        for run, name in zip(self.runs, run_names(self.runs), strict=True):
+            folder = run_folder(run)
             if not (folder / "config.json").is_file():
                 raise ConfigError(f"{folder} is no run: it has no config.json")
             config = read_run(folder)
-            held = self._record(folder)["curvature"]
+            held = self._record(run, folder)["curvature"]
             try:
                 policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
                 divergence = 1000 * float(jensen_shannon(policy, log))
@@ -74,11 +76,11 @@ class Curvature:
         except ValueError as error:
             raise ConfigError(str(error)) from error
 
-    def _record(self, folder: Path) -> dict[str, Any]:
+    def _record(self, run: Path, folder: Path) -> dict[str, Any]:
         if self.data is None:
             return choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]
         from symphony.cli.evaluate import judge
 
-        judged = judge(str(folder), self.data, self.config)
+        judged = judge(str(run), self.data, self.config)
         judged.keep()
         return judged.record

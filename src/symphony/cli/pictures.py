@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +28,40 @@ def draw_rollouts(
         seed: of the rollouts.
         panels: how many segments.
     """
+    from symphony.render import plot_grid
+
+    found = _panels(agent, data, interactive, seed, panels)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_grid(found, path)
+
+
+def draw_compared(
+    agents: Mapping[str, Agent], data: Path, path: Path, interactive: int, *, seed: int = 0, panels: int = 3
+) -> None:
+    """The same for several agents on the same segments: a row for each, which its panels name.
+
+    Args:
+        agents: by the names they get in the picture.
+        data: the store.
+        path: picture to write.
+        interactive: agents per segment that are driven.
+        seed: of the rollouts.
+        panels: how many segments.
+    """
+    from symphony.render import plot_grid
+
+    rows = [_panels(agent, data, interactive, seed, panels, f"{name}: ") for name, agent in agents.items()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_grid([panel for row in rows for panel in row], path, columns=len(rows[0]))
+
+
+def _panels(
+    agent: Agent, data: Path, interactive: int, seed: int, panels: int, label: str = ""
+) -> list[Callable[[Any], Any]]:
+    """What draws the rollouts of each of some segments."""
     from symphony.config import EvaluateConfig
     from symphony.data.store import SegmentStore
-    from symphony.render import plot_grid, plot_rollout
+    from symphony.render import plot_rollout
     from symphony.trainers.dataset import SceneDataset
     from symphony.trainers.evaluation import playback, simulated
 
@@ -60,9 +91,9 @@ def draw_rollouts(
                 valid=flags["counted"],
                 collision=flags["collision"],
                 offroad=flags["offroad"],
+                title=f"{label}{segment.segment_id}",
             )
 
         return draw
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_grid([panel(i) for i in chosen], path)
+    return [panel(i) for i in chosen]

@@ -27,7 +27,7 @@ class Tree:
     """
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
-    """Folder of a run that was trained with search (see `symphony train`)."""
+    """Folder of a run that was trained with search (see `symphony train`), or `pretrained:NAME`."""
     data: Path
     """Store of run segments."""
     segment: str

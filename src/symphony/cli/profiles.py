@@ -59,7 +59,12 @@ _EVERY: dict[str, Flags] = {
     },
 }
 _MGAIL: dict[str, Flags] = {
-    "paper": {"--mgail.regression": "0", "--mgail.head-start": "0", "--mgail.rollouts": "64"},
+    "paper": {
+        "--mgail.cost": "log_d",
+        "--mgail.regression": "0",
+        "--mgail.head-start": "0",
+        "--mgail.rollouts": "64",
+    },
     "laptop": {
         "--steps": "3000",
         "--search.segments": "8",

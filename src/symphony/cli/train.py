@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -25,6 +26,8 @@ class Train:
         from symphony.trainers import train
 
         folder = train(self.config)
-        Console().print(
-            f"Trained agent in {folder}; judge it: symphony evaluate {folder} --data DIR", soft_wrap=True
-        )
+        # Of the processes that torchrun starts, one speaks.
+        if os.environ.get("RANK", "0") == "0":
+            Console().print(
+                f"Trained agent in {folder}; judge it: symphony evaluate {folder} --data DIR", soft_wrap=True
+            )

@@ -79,9 +79,13 @@ class BoundedDisplacement(Distribution):
     ) -> BoundedDisplacement:
         """The same distribution for a larger batch."""
         shape = torch.Size(batch_shape)
-        wide = (part.expand(*shape, 2) for part in (self.loc, self.scale))
         return BoundedDisplacement(
-            *wide, self.pace.expand(shape), self.slope.expand(shape), self.reach, validate_args=False
+            self.loc.expand(*shape, 2),
+            self.scale.expand(*shape, 2),
+            self.pace.expand(shape),
+            self.slope.expand(shape),
+            self.reach,
+            validate_args=False,
         )
 
     def displacement(self, u: Tensor) -> Tensor:

@@ -116,9 +116,8 @@ class MGAILLoss(MaskedLoss):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "env":
-            self._held["env"] = value
-            # What a state consists of may have changed with it.
-            self._in_keys = None
+            # Past torch, which would make a part of the loss of it.
+            object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
 
@@ -132,6 +131,12 @@ class MGAILLoss(MaskedLoss):
         """What is simulated in."""
         return self._held["env"]
 
+    @env.setter
+    def env(self, value: EnvBase | None) -> None:
+        self._held["env"] = value
+        # What a state consists of may have changed with it.
+        self._in_keys = None
+
     def _read_keys(self) -> list[NestedKey]:
         state = [] if self.env is None else list(self.env.state_spec.keys(True, True))
         return [*self.actor_network.in_keys, *state, self.tensor_keys.done, self.tensor_keys.plan]
@@ -139,7 +144,8 @@ class MGAILLoss(MaskedLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Simulate from start states `[...]`, as the environment resets to them; the input is left as it is."""
-        if self.env is None:
+        env = self.env
+        if env is None:
             raise ValueError("no environment to simulate in; set `env`")
         plan = tensordict.get(self.tensor_keys.plan, default=None)
         done = tensordict.get(self.tensor_keys.done, default=None)
@@ -160,10 +166,11 @@ class MGAILLoss(MaskedLoss):
             length = min(size, steps - first)
             numbers = None if plan is None else plan.narrow(batch, first, length)
             if self.checkpoint and torch.is_grad_enabled():
-                # An early stop leaves the networks by an exception, and their weights exchanged.
+                # An early stop would leave the actor by an exception, its weights still in place.
                 with set_checkpoint_early_stop(False):
                     score, alive, now = checkpoint(
                         self._simulate,
+                        env,
                         now,
                         numbers,
                         first,
@@ -173,7 +180,7 @@ class MGAILLoss(MaskedLoss):
                         preserve_rng_state=plan is None,
                     )
             else:
-                score, alive, now = self._simulate(now, numbers, first, length)
+                score, alive, now = self._simulate(env, now, numbers, first, length)
             scores.append(score)
             going.append(alive)
         score = torch.cat(scores, batch)
@@ -196,7 +203,7 @@ class MGAILLoss(MaskedLoss):
         return mask.shape
 
     def _simulate(
-        self, now: TensorDictBase, numbers: Tensor | None, first: int, length: int
+        self, env: EnvBase, now: TensorDictBase, numbers: Tensor | None, first: int, length: int
     ) -> tuple[Tensor, Tensor, TensorDictBase]:
         """Logits and whether the episode still ran, `[..., length, N]`, and the state after the last step."""
         batch, scores, going = now.batch_dims, [], []
@@ -216,10 +223,10 @@ class MGAILLoss(MaskedLoss):
                     acting.set(self.tensor_keys.noise, numbers.select(batch, t))
                 acting = self.actor_network(acting)
                 drawn = now.copy()
-                for key in self.env.action_keys:
+                for key in env.action_keys:
                     drawn.set(key, acting.get(key))
                 alive = ~now.get(self.tensor_keys.done)
-                now = self.env.step_mdp(self.env.step(drawn))
+                now = env.step_mdp(env.step(drawn))
                 judged = functional_call(self.discriminator, frozen, (now.copy(),))
                 score = judged.get(self.tensor_keys.score, default=None)
                 if score is None:

@@ -16,6 +16,7 @@ from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
 from symphony.trainers.checkpoint import load_checkpoint
 from symphony.trainers.networks import Networks, build_networks, dynamics_of, observation_config
+from symphony.trainers.pretrained import PREFIX
 from symphony.trainers.selection import choose, split_name
 
 PLAYBACK = "playback"
@@ -55,8 +56,9 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     """An agent by name.
 
     Args:
-        name: ``playback``, ``constant_velocity``, or the folder of a run, of which the best checkpoint is taken if
-            it was validated, else the last; ``RUN@last``, ``RUN@best`` or ``RUN@3000`` (a step) names another.
+        name: ``playback``, ``constant_velocity``, ``pretrained:NAME`` (an agent that comes with the package), or the
+            folder of a run, of which the best checkpoint is taken if it was validated, else the last; ``RUN@last``,
+            ``RUN@best`` or ``RUN@3000`` (a step) names another.
         device: where its weights go.
 
     Raises:
@@ -98,8 +100,8 @@ def read_config(folder: Path) -> TrainConfig:
     path = folder / "config.json"
     if not path.is_file():
         raise ConfigError(
-            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity' or the folder of a run "
-            f"(one with a config.json)"
+            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', '{PREFIX}NAME' or the folder of a "
+            f"run (one with a config.json)"
         )
     try:
         values = json.loads(path.read_text(encoding="utf-8"))

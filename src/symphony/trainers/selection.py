@@ -10,6 +10,7 @@ from typing import Any
 
 from symphony.errors import ConfigError
 from symphony.trainers.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from symphony.trainers.pretrained import is_pretrained, pretrained_folder
 
 _STEP = re.compile(r"(?:step-)?(\d+)")
 
@@ -38,7 +39,14 @@ class Best:
 
 
 def split_name(name: str) -> tuple[Path, str]:
-    """From ``RUN[@WHICH]``, the folder of a run and which of its checkpoints is meant ("" if it doesn't say)."""
+    """From ``RUN[@WHICH]``, the folder of a run and which of its checkpoints is meant ("" if it doesn't say).
+
+    Raises:
+        ConfigError: for ``pretrained:NAME``, if there is no such agent.
+    """
+    if is_pretrained(name):
+        known, _, which = name.partition("@")
+        return pretrained_folder(known), which
     run, at, which = name.rpartition("@")
     # A folder's own name may hold the sign.
     return (Path(run), which) if at and not Path(name).is_dir() else (Path(name), "")

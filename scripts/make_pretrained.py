@@ -1,0 +1,371 @@
+"""Make an agent that comes with the package from a run: ``python scripts/make_pretrained.py RUN NAME``.
+
+Writes ``src/symphony/pretrained/NAME`` anew: configuration, the weights of the checkpoint that is the run's agent,
+the evaluation that was given, and a model card made of these. The same run and evaluation give the same bytes.
+
+    symphony evaluate RUN --data town-small/test
+    python scripts/make_pretrained.py RUN NAME --scores RUN/evaluations/test-....json
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import torch
+
+from symphony.cli.comparison import choose_evaluation, method_name
+from symphony.cli.evaluations import FOLDER as EVALUATIONS
+from symphony.cli.evaluations import evaluation_name, kept_evaluations, read_evaluation
+from symphony.cli.tables import COLUMNS, write_json
+from symphony.config import Rule, TrainConfig, to_json
+from symphony.data.generate import PRESETS
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError, SymphonyError
+from symphony.trainers.agents import read_config
+from symphony.trainers.checkpoint import load_checkpoint, save_checkpoint
+from symphony.trainers.networks import build_networks
+from symphony.trainers.pretrained import FOLDER, PREFIX, run_folder
+from symphony.trainers.selection import choose, split_name
+
+SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A run and what is known of it.
+
+    Attributes:
+        config: as the run has it.
+        step: updates after which its agent was saved.
+        before: what it started from, in words; empty for new networks.
+        data: checksum of what it learned from.
+        scores: the record of an evaluation; None if there is none.
+    """
+
+    config: TrainConfig
+    step: int
+    before: str
+    data: str
+    scores: dict[str, Any] | None
+
+
+def make(
+    run: str, name: str, scores: Path | None = None, rule: Rule | None = None, folder: Path = FOLDER
+) -> Path:
+    """Write the folder of an agent and return it.
+
+    Args:
+        run: ``RUN`` or ``RUN@WHICH`` (see :func:`symphony.trainers.load_agent`).
+        name: of the agent.
+        scores: an evaluation of the run as ``symphony evaluate`` writes it; by default the one that the run keeps.
+        rule: how the agent's trees are pruned from now on; by default as it was trained.
+        folder: of all these agents.
+
+    Raises:
+        ConfigError: if the run has no such checkpoint, its data is unknown, or the evaluation is of something else.
+        DataError: if one of the files can't be read.
+    """
+    source, which = split_name(run)
+    config, checkpoint = read_config(source), choose(source, which)
+    step = int(checkpoint.name[-12:])
+    record = _read_scores(source, scores)
+    known = Source(config, step, _before(source, config), _checksum(config.data), record)
+    out = replace(config, search=replace(config.search, rule=rule or config.search.rule))
+    if record is not None:
+        _check_scores(record, out, step)
+    networks = build_networks(out)
+    load_checkpoint(checkpoint, modules=networks.present(), partial=True, restore_rng=False)
+
+    place = folder / name
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    (place / "config.json").write_text(to_json(plain(out)), encoding="utf-8")
+    # A checkpoint holds random states too: always the same ones here, as nobody goes on from it.
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    torch.manual_seed(0)
+    save_checkpoint(place / "checkpoints", step=step, modules=networks.present())
+    if record is not None:
+        record = {key: value for key, value in record.items() if key != "per_segment"}
+        record |= {"agent": PREFIX + name, "run": {**record["run"], "updates": step, "named": False}}
+        (place / EVALUATIONS).mkdir()
+        write_json(place / EVALUATIONS / f"{evaluation_name(record)}.json", record)
+    parameters = {
+        part: sum(weights.numel() for weights in module.parameters())
+        for part, module in networks.present().items()
+    }
+    (place / "README.md").write_text(card(name, known, out, parameters), encoding="utf-8")
+    return place
+
+
+def plain(config: TrainConfig) -> TrainConfig:
+    """The configuration with names in place of paths of the machine it was used on."""
+    judged = config.validation
+    if judged.data is not None:
+        judged = replace(judged, data=Path(data_name(judged.data)))
+    before = config.warm_start
+    return replace(
+        config,
+        data=Path(data_name(config.data)),
+        out=Path(config.out.name),
+        # The last part also where a checkpoint is named.
+        warm_start=None if before is None else Path(before.name),
+        validation=judged,
+        resume=False,
+        wandb="disabled",
+        device="cpu",
+    )
+
+
+def data_name(path: Path) -> str:
+    """A store's name: that of its folder, after the name of the set if it is a split of one."""
+    parts = [part for part in path.parts if part not in ("/", ".", "..")]
+    return "/".join(parts[-2:] if parts[-1] in SPLITS else parts[-1:])
+
+
+def _checksum(data: Path) -> str:
+    if (data / "store.json").is_file():
+        return SegmentStore(data).checksum()
+    name, _, split = data_name(data).partition("/")
+    if name in PRESETS and split in PRESETS[name].checksums:
+        return PRESETS[name].checksums[split]
+    raise ConfigError(f"{data}: neither there nor a standard set, so that its checksum is unknown")
+
+
+def _before(run: Path, config: TrainConfig) -> str:
+    """What a run started from, as far as the runs beside it tell."""
+    if config.warm_start is None:
+        return ""
+    words = f"the networks of the run `{config.warm_start.name}`"
+    beside = run.resolve().parent / config.warm_start.name
+    folder = beside if (beside / "config.json").is_file() else run_folder(config.warm_start)
+    if not (folder / "config.json").is_file():
+        return words
+    earlier = read_config(folder)
+    further = _before(folder, earlier)
+    origin = f", itself from {further}" if further else ""
+    return f"{words} ({method_name(earlier.method)}, {_count(earlier.steps)} updates{origin})"
+
+
+def _read_scores(run: Path, file: Path | None) -> dict[str, Any] | None:
+    if file is not None:
+        return read_evaluation(file)
+    kept = kept_evaluations(run)
+    return choose_evaluation(run, kept)[1] if kept else None
+
+
+def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> None:
+    """Refuse an evaluation of something else."""
+    found, how = record["run"], record["config"]
+    pairs: list[tuple[str, Any, Any]] = [
+        ("method", found["method"], config.method),
+        ("seed", found.get("seed"), config.seed),
+        ("checkpoint", found.get("checkpoint", step), step),
+    ]
+    if how["search"] == "tree":
+        pairs.append(("rule", how["rule"], config.search.rule))
+    for what, judged, own in pairs:
+        if judged != own:
+            raise ConfigError(f"the evaluation is of another agent: {what} {judged}, not {own}")
+
+
+def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, int]) -> str:
+    """The model card.
+
+    Args:
+        name: of the agent.
+        source: the run.
+        config: what the agent is simulated with from now on.
+        parameters: number of weights of each network.
+    """
+    method = method_name(config.method)
+    parts = [
+        f"# {PREFIX}{name}",
+        f"{method} (see the table of methods in the README of Symphony): {_method_words(config)} It drives "
+        f"{config.agent.interactive} vehicles of a run segment at 5 Hz while all others follow their log.",
+        f"```sh\nsymphony evaluate {PREFIX}{name} --data DIR\n```",
+        "## Training",
+        _training(source, config),
+        _settings(config, parameters),
+        "## Scores",
+        _scores(PREFIX + name, source.scores),
+        "## Limits",
+        _limits(source.config, method),
+        "## Files",
+        "`config.json`: all settings, with names in place of paths. `checkpoints/`: the weights as safetensors, each "
+        "with its checksum in `checkpoint.json`, without the state of the optimizers. "
+        + ("`evaluations/`: the scores above. " if source.scores else "")
+        + "Licence: that of the package, Apache-2.0. Made by `scripts/make_pretrained.py`.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _method_words(config: TrainConfig) -> str:
+    words = "adversarial imitation through the model" if config.adversarial else "behavioural cloning"
+    extras = []
+    if config.hierarchical:
+        extras.append("routes that a goal policy draws from the first state")
+    if config.searches:
+        extras.append("a beam search that a discriminator prunes")
+    return words + (f", with {' and '.join(extras)}." if extras else ".")
+
+
+def _training(source: Source, config: TrainConfig) -> str:
+    own = source.config
+    text = (
+        f"Learned from `{data_name(own.data)}` (checksum `{source.data}`) with seed {own.seed}: "
+        f"{_count(source.step)} updates of {own.segments} run segments "
+        f"and {_count(own.states)} expert states"
+        + (f", starting from {source.before}." if source.before else ", starting from new networks.")
+    )
+    if source.step != own.steps:
+        text += f" The run went on to {_count(own.steps)} updates."
+    if own.validation.data is not None:
+        text += (
+            f" The checkpoint was chosen by {own.validation.segments} segments of "
+            f"`{data_name(own.validation.data)}`."
+        )
+    if own.searches:
+        text += (
+            f" Searches in training had {own.search.branches} branches, pruned every {own.search.prune_every} "
+            f"steps by rule `{own.search.rule}`."
+        )
+        if config.search.rule != own.search.rule:
+            text += (
+                f" From now on it is simulated with rule `{config.search.rule}`"
+                + (f" (temperature {config.search.temperature:g})" if config.search.rule != "best" else "")
+                + ", which it was not trained with."
+            )
+    return text
+
+
+def _settings(config: TrainConfig, parameters: dict[str, int]) -> str:
+    rows: list[tuple[str, Any]] = [
+        (f"weights of the {part}", _count(number)) for part, number in parameters.items()
+    ]
+    rows += [(f"`agent.{key}`", value) for key, value in asdict(config.agent).items()]
+    rows += [("`learning_rate`", config.learning_rate)]
+    if config.judged:
+        rows += [
+            (f"`discriminator.{key}`", getattr(config.discriminator, key)) for key in ("features", "radius")
+        ]
+    if config.adversarial:
+        rows += [
+            (f"`mgail.{key}`", getattr(config.mgail, key))
+            for key in ("regression", "rollouts", "learning_rate", "cost", "expert_weight")
+        ]
+    if config.searches:
+        rows += [
+            (f"`search.{key}`", getattr(config.search, key))
+            for key in ("test_branches", "prune_every", "rule", "survivors")
+        ]
+    lines = ["| setting | value |", "| --- | --- |", *(f"| {key} | {value} |" for key, value in rows)]
+    return "\n".join(lines)
+
+
+def _scores(name: str, record: dict[str, Any] | None) -> str:
+    if record is None:
+        return "It has not been judged."
+    how, data = record["config"], record["data"]
+    trees = "one search tree" if how["trees"] == 1 else f"{how['trees']} search trees"
+    ways = {
+        "none": f"{how['rollouts']} independent rollouts",
+        "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned by "
+        f"rule `{how['rule']}`",
+        "oracle": "trees pruned by the true collision and off-road flags",
+        "best": f"the best of {how['branches']} independent rollouts by the discriminator",
+    }
+    lines = [
+        "| " + " | ".join(["agent", *(heading.replace("\n", " ") for _, heading, _ in COLUMNS)]) + " |",
+        "| --- " * (len(COLUMNS) + 1) + "|",
+        _row(name, record),
+        _row("log playback", record["playback"]),
+    ]
+    test = data["name"]
+    standard = [
+        f"{preset}/{split}"
+        for preset, made in PRESETS.items()
+        for split, checksum in made.checksums.items()
+        if checksum == data["checksum"]
+    ]
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"{record['segments']} run segments of `{standard[0] if standard else test}` (checksum "
+            f"`{data['checksum']}`), {how['interactive']} interactive agents each; per segment "
+            f"{ways[how['search']]}; ± standard error over segments; seed {how['seed']}.",
+        ]
+    )
+
+
+def _row(name: str, numbers: dict[str, Any]) -> str:
+    cells = []
+    for key, _, digits in COLUMNS:
+        value, error = numbers.get(key), numbers.get(f"{key}_se")
+        if value is None:
+            cells.append("–")
+        else:
+            cells.append(f"{value:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}"))
+    return f"| {' | '.join([name, *cells])} |"
+
+
+def _limits(config: TrainConfig, method: str) -> str:
+    made = data_name(config.data).partition("/")[0] in PRESETS
+    source = (
+        "It knows only simulated towns: rule-made driving below about 13 m/s without freeways, pedestrians, "
+        "cyclists, parked cars or mistakes. On real logs it has to be trained further, and even then it is no "
+        "safe driver."
+        if made
+        else "It knows only driving and maps like those it learned from."
+    )
+    parts = [
+        source,
+        f"It is one run of one seed, much smaller than the paper's {method}, and no figure of the paper.",
+    ]
+    if config.searches:
+        parts.append(
+            "It is meant to be simulated with its search, which runs many branches at once and keeps those that look "
+            "most like the log. Leaves of one tree share ancestors and are less diverse than independent rollouts, "
+            "so minSADE is not comparable between the two."
+        )
+    parts.append("It is meant for research on traffic simulation, not for driving a vehicle.")
+    return " ".join(parts)
+
+
+def _count(number: int) -> str:
+    return f"{number:,}".replace(",", " ")
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Write one agent and say how large it is."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", help="folder of a run, or RUN@WHICH")
+    parser.add_argument("name", help="of the agent, such as bc_ts_h")
+    parser.add_argument(
+        "--scores", type=Path, help="an evaluation of it (default: the one that the run keeps)"
+    )
+    parser.add_argument(
+        "--rule", choices=get_args(Rule), help="prune its trees so (default: as it was trained)"
+    )
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="of all these agents")
+    arguments = parser.parse_args(args)
+    try:
+        place = make(arguments.run, arguments.name, arguments.scores, arguments.rule, arguments.folder)
+    except SymphonyError as error:
+        parser.exit(1, f"error: {error}\n")
+    size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+    print(f"{place}: {size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()

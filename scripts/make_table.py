@@ -1,0 +1,68 @@
+"""The whole way to a table of the paper, small: ``python scripts/make_table.py --out out/table``.
+
+Runs the eight recipes on the run segments that come with the package and prints the table of what they score, some
+minutes in all. What it shows is that everything works; agents as small as these have hardly learned to drive. Every
+further argument goes to every recipe, such as ``--steps 1000 --rollouts 16``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import runpy
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+from symphony.cli import main as symphony
+from symphony.config import Method
+from symphony.data.builtin import builtin_store
+
+RECIPES = Path(__file__).resolve().parents[1] / "recipes"
+SIZES = {
+    "--steps": "120",
+    "--segments": "8",
+    "--states": "256",
+    "--agent.num-points": "64",
+    "--agent.hidden": "32",
+    "--agent.head": "32",
+    "--checkpoint-every": "60",
+    "--search.segments": "4",
+    "--search.branches": "4",
+    "--search.test-branches": "4",
+    "--search.updates": "10",
+    "--search.states": "64",
+    "--discriminator.states": "64",
+    "--rollouts": "4",
+}
+"""In place of those of the profile ``smoke``."""
+ADVERSARIAL = {"--mgail.regression": "80", "--mgail.head-start": "10", "--mgail.rollouts": "4"}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Train and judge every method, then print the table; returns the exit status of ``symphony table``."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/table"), help="folder of the runs and the table"
+    )
+    arguments, further = parser.parse_known_args(args)
+    out: Path = arguments.out
+    for method in get_args(Method):
+        run = out / method
+        if (run / "config.json").is_file():
+            shutil.rmtree(run)
+        sizes = {**SIZES, **(ADVERSARIAL if method.startswith("mgail") else {})}
+        given = {word.partition("=")[0] for word in further}
+        places = {"--data": builtin_store("train"), "--test": builtin_store("test"), "--out": run}
+        flags = {**places, "--profile": "smoke", **sizes}
+        recipe = runpy.run_path(str(RECIPES / f"{method}.py"))
+        kept = [str(word) for flag, value in flags.items() if flag not in given for word in (flag, value)]
+        recipe["main"]([*kept, *further])
+    table = ["table", "--setting", "main", "--runs", str(out)]
+    return symphony([*table, "--format", "markdown", "--out", str(out / "table.md")]) or symphony(table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
