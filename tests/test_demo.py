@@ -41,7 +41,7 @@ def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     script = runpy.run_path(str(path))
     monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)
     sizes = "--steps 4 --states 8 --agent.hidden 8 --agent.head 8 --agent.num-points 8 --search.updates 2 "
-    sizes += "--checkpoint-every 2 --search.segments 1 --search.branches=2 --rollouts 2 --duration 2"
+    sizes += "--checkpoint-every 2 --search.segments 1 --search.branches=2 --rollouts 2"
     out = tmp_path / "out"
     status = script["main"](["--out", str(out), *sizes.split()])
     shown = capsys.readouterr()

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 import torch
@@ -20,7 +20,6 @@ from symphony.cli import main
 from symphony.config import (
     AgentConfig,
     DiscriminatorConfig,
-    Method,
     SearchConfig,
     TrainConfig,
     from_dict,
@@ -37,13 +36,13 @@ from symphony.trainers.learner import Learner
 from symphony.trainers.networks import build_networks
 from symphony.trainers.tracking import read_metrics
 
-METHODS: tuple[Any, ...] = get_args(Method)
 NETWORKS = {
     "bc": {"policy"},
     "bc_h": {"policy", "goals"},
     "bc_ts": {"policy", "discriminator"},
     "bc_ts_h": {"policy", "goals", "discriminator"},
 }
+METHODS: tuple[Any, ...] = tuple(NETWORKS)
 ROUTED = ObservationConfig(num_objects=4, num_points=12, route=True)
 Trained = Callable[..., Path]
 
