@@ -219,10 +219,15 @@ def _method_words(config: TrainConfig) -> str:
 
 def _training(source: Source, config: TrainConfig) -> str:
     own = source.config
+    update = f"{own.segments} run segments and {_count(own.states)} expert states"
+    if own.adversarial:
+        regression = min(own.mgail.regression, source.step)
+        update = f"regression ({update}) in {_count(regression)} of them" if regression else ""
+        rollouts = f"{own.mgail.rollouts} rollouts"
+        update = f"{update}, {rollouts} in the rest" if update else rollouts
     text = (
         f"Learned from `{data_name(own.data)}` (checksum `{source.data}`) with seed {own.seed}: "
-        f"{_count(source.step)} updates of {own.segments} run segments "
-        f"and {_count(own.states)} expert states"
+        f"{_count(source.step)} updates of {update}"
         + (f", starting from {source.before}." if source.before else ", starting from new networks.")
     )
     if source.step != own.steps:

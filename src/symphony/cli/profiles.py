@@ -73,8 +73,8 @@ _MGAIL: dict[str, Flags] = {
     "smoke": {"--mgail.regression": "2", "--mgail.head-start": "0", "--mgail.rollouts": "2"},
 }
 WORDS = (
-    "default: the values shown; paper: the protocol of the paper (70 000 updates, 1 000 points, batch 16, S 4 and 16, "
-    "200 validation segments); laptop: a useful agent on two cores within an hour (3 000 updates, 128 points, 48 "
+    "default: the values shown; paper: the protocol of the paper (70 000 updates, 1 000 points, batch 16, S 4 and "
+    "16, 200 validation segments); laptop: meant for two cores and about an hour (3 000 updates, 128 points, 48 "
     "validation segments of 4 rollouts); smoke: seconds, to see that all runs. What is given beside it has "
     "precedence; the best checkpoint is chosen where --validation.data is given."
 )
