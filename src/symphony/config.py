@@ -231,7 +231,7 @@ class TrainConfig:
     """Adversarial learning (methods mgail*)."""
     warm_start: Path | None = None
     """Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its last
-    (`RUN@last` or `RUN@3000` names another); new ones where that run has none."""
+    (`RUN@last` or `RUN@3000` names another), or `pretrained:NAME`; new ones where that run has none."""
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     """Choice of the best checkpoint: that with the lowest collision rate plus off-road time (the paper)."""
     checkpoint_every: int = 1000
