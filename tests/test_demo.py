@@ -19,7 +19,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["demo", "--out", str(tmp_path / "demo"), "--steps", "2", "--rollouts", "1"]
     assert main(command) == 0
     rows = json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]
-    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC", "pretrained BC+TS+H"]
+    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC", "included BC+TS+H"]
     assert all(row["segments"] == 24 for row in rows)
     assert rows[0]["ade"] == rows[0]["collision_rate"] == 0
     assert rows[1]["ade"] > 1

@@ -72,4 +72,4 @@ class Demo:
 
 
 PRETRAINED = "pretrained:bc_ts_h"
-NAMES = ("log playback", "constant velocity", "BC", "pretrained BC+TS+H")
+NAMES = ("log playback", "constant velocity", "BC", "included BC+TS+H")
