@@ -43,6 +43,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "trees4": {"search": "tree", "trees": 4},
     "tree64": {"search": "tree", "branches": 64},
     "systematic": {"search": "tree", "rule": "systematic"},
+    "often": {"search": "tree", "rule": "systematic", "prune_every": 2, "temperature": 0.6},
     "small": {"search": "tree", "rule": "systematic", "trees": 4, "branches": 4},
     "best": {"search": "best", "rollouts": 1},
     "oracle": {"search": "oracle"},

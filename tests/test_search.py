@@ -297,6 +297,20 @@ def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, kin
     assert same(few, part(many, slice(None), slice(0, 4)))
 
 
+@pytest.mark.parametrize("changes", [{"rule": "systematic"}, {"prune_every": 2}, {"temperature": 0.01}])
+def test_the_evaluation_decides_the_pruning(
+    dataset: SceneDataset, agent: Agent, changes: dict[str, Any]
+) -> None:
+    scenes, config = dataset.scenes(range(4)), EvaluateConfig(search="tree", rollouts=4)
+    agent = replace(
+        agent, search=replace(agent.search, rule="systematic" if "temperature" in changes else "best")
+    )
+    trained = replace(agent, search=replace(agent.search, **changes))
+    found = simulated(agent, scenes, replace(config, **changes))
+    assert same(found, simulated(trained, scenes, config))
+    assert not same(found, simulated(agent, scenes, config))
+
+
 def test_trees_differ_from_each_other(dataset: SceneDataset, agent: Agent) -> None:
     found = simulated(agent, dataset.scenes([0]), EvaluateConfig(search="tree", rollouts=4, trees=4))
     assert len({tuple(x.flatten().tolist()) for x in found.state[0]}) == 4

@@ -419,6 +419,8 @@ CHANGES: dict[str, Any] = {
     "seed": 1,
     "duration": 20,
     "interactive": 8,
+    "prune_every": 2,
+    "temperature": 0.6,
 }
 
 

@@ -303,6 +303,10 @@ class EvaluateConfig:
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: Literal["agent"] | Rule = "agent"
     """How trees are pruned: `agent` as it was trained, else see `search.rule` of training."""
+    prune_every: int = 0
+    """Steps between prunings; 0: as the agent was trained."""
+    temperature: float = 0.0
+    """Of rule `systematic`; 0: as the agent was trained."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
@@ -323,7 +327,16 @@ class EvaluateConfig:
         _positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        _not_negative(self, "interactive", "branches", "duration")
+        _not_negative(self, "interactive", "branches", "duration", "prune_every", "temperature")
+
+    def pruning(self, trained: SearchConfig) -> SearchConfig:
+        """How branches are pruned: as in training, but for what is set here."""
+        return dataclasses.replace(
+            trained,
+            rule=trained.rule if self.rule == "agent" else self.rule,
+            prune_every=self.prune_every or trained.prune_every,
+            temperature=self.temperature or trained.temperature,
+        )
 
 
 def to_json(config: Any) -> str:

@@ -29,6 +29,8 @@ FOLDER = "evaluations"
 _MEMORY = ("batch", "device")
 """Settings that change no result."""
 _NAMED = ("search", "trees", "branches", "rule", "interactive", "rollouts", "duration", "seed")
+_PRUNING = ("prune_every", "temperature")
+"""Part of the name of the simulation; evaluations from before they could be set have none."""
 _PARTS: dict[str, tuple[str, ...]] = {
     "run": ("updates",),
     "data": ("name", "checksum"),
@@ -99,12 +101,16 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "branches": 0,
         "trees": 0,
         "rule": "",
+        "prune_every": 0,
+        "temperature": 0.0,
     }
     if result.search not in ("none", "log"):
         filled["branches"] = config.branches or settings.test_branches
     if result.search in ("tree", "oracle"):
         filled["trees"] = config.trees
-        filled["rule"] = settings.rule if config.rule == "agent" else config.rule
+        used = config.pruning(settings)
+        filled["rule"], filled["prune_every"] = used.rule, used.prune_every
+        filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
     return {name: value for name, value in filled.items() if name not in _MEMORY}
 
 
@@ -120,18 +126,23 @@ def evaluation_name(record: dict[str, Any]) -> str:
         parts.append(f"step{record['run']['checkpoint']}")
     for field in dataclasses.fields(EvaluateConfig):
         value = config.get(field.name, field.default)
-        if field.name not in (*_NAMED, *_MEMORY) and value != field.default:
+        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY) and value != field.default:
             parts.append(field.name if value is True else f"{field.name}={value}")
     return "-".join(parts)
 
 
 def simulation_name(config: dict[str, Any]) -> str:
-    """How rollouts came about, such as ``none`` or ``tree-1x16-best``."""
+    """How rollouts came about, such as ``none`` or ``tree-1x16-best-every10``."""
     if config["search"] == "best":
         return f"best-of-{config['branches']}"
-    if config["search"] in ("tree", "oracle"):
-        return f"{config['search']}-{config['trees']}x{config['branches']}-{config['rule']}"
-    return config["search"]
+    if config["search"] not in ("tree", "oracle"):
+        return config["search"]
+    words = [config["search"], f"{config['trees']}x{config['branches']}", config["rule"]]
+    if config.get("prune_every"):
+        words.append(f"every{config['prune_every']}")
+    if config.get("temperature"):
+        words.append(f"at{config['temperature']:g}")
+    return "-".join(words)
 
 
 def keep_evaluation(run: Path, record: dict[str, Any]) -> Path:

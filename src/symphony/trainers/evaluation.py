@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -196,9 +196,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         found = simulate(env, policy, start)
     else:
         best = config.search == "best"
-        settings = agent.search
-        if config.rule != "agent":
-            settings = replace(settings, rule=config.rule)
+        settings = config.pruning(agent.search)
         with torch.no_grad():
             result = search(
                 env,
