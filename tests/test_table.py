@@ -421,6 +421,8 @@ CHANGES: dict[str, Any] = {
     "interactive": 8,
     "prune_every": 2,
     "temperature": 0.6,
+    "retries": 1,
+    "retry_above": 2.0,
 }
 
 

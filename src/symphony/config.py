@@ -307,6 +307,11 @@ class EvaluateConfig:
     """Steps between prunings; 0: as the agent was trained."""
     temperature: float = 0.0
     """Of rule `systematic`; 0: as the agent was trained."""
+    retries: int = 0
+    """How often the steps between two prunings are simulated again for branches that end them with a score above
+    `retry-above` (each time costs as much as the whole search)."""
+    retry_above: float = 0.0
+    """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
@@ -327,7 +332,7 @@ class EvaluateConfig:
         _positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        _not_negative(self, "interactive", "branches", "duration", "prune_every", "temperature")
+        _not_negative(self, "interactive", "branches", "duration", "prune_every", "temperature", "retries")
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
         """How branches are pruned: as in training, but for what is set here."""

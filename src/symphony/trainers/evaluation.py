@@ -207,6 +207,8 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
                 rule=KeepAll() if best else pruning_rule(settings),
                 prune_every=settings.prune_every,
                 leaves=None if best else taken,
+                retries=0 if best else config.retries,
+                retry_above=config.retry_above,
             )
         found = rollouts_of(env, start, result.trajectories)
         if best:

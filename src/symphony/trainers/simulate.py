@@ -31,7 +31,8 @@ equally on all branches.
 """
 _GOALS = 1 << 40
 _PRUNING = (1 << 40) + 1
-"""Numbers of the streams that goals and prunings draw from, far above those of rollouts and agents."""
+_RETRIES = (1 << 40) + 2
+"""Numbers of the streams that goals, prunings and repeated periods draw from, far above those of rollouts and agents."""
 
 
 class Rollouts(NamedTuple):
@@ -192,6 +193,8 @@ def search(
     prune_every: int,
     leaves: int | None = None,
     keep_tree: bool = False,
+    retries: int = 0,
+    retry_above: float = 0.0,
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S] to the last logged step (paper, section IV-A).
 
@@ -205,6 +208,9 @@ def search(
         prune_every: T_p.
         leaves: return only so many of each tree, the best of the last period; by default all.
         keep_tree: also return the pruned branches.
+        retries: how often a period is simulated again, from its start, for branches that end it with a total above
+            ``retry_above``.
+        retry_above: that total.
     """
     score: Callable[[TensorDictBase], Tensor] = flag_score
     if discriminator is not None:
@@ -233,7 +239,14 @@ def search(
         slot_keys=(keys.STREAM,),
         keep=[keys.STATE, keys.ACTION, keys.NOISE, keys.STEP, *following],
         keep_tree=keep_tree,
+        retries=retries,
+        retry_above=retry_above if retries else None,
+        reseed=_reseed,
     )
+
+
+def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:
+    return state.set(keys.STREAM, fold_in(state.get(keys.STREAM), _RETRIES + attempt))
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
