@@ -37,21 +37,20 @@ from symphony.trainers.networks import dynamics_of
 
 METHODS: tuple[Method, ...] = get_args(Method)
 BEFORE = {"bc_ts": "bc", "bc_ts_h": "bc_h", "mgail_ts": "mgail", "mgail_ts_h": "mgail_h"}
+OFTEN = {"search": "tree", "rule": "systematic", "prune_every": 2, "temperature": 0.6}
 KINDS: dict[str, dict[str, Any]] = {
     "none": {"search": "none"},
     "tree": {"search": "tree"},
-    "trees4": {"search": "tree", "trees": 4},
-    "tree64": {"search": "tree", "branches": 64},
     "systematic": {"search": "tree", "rule": "systematic"},
-    "often": {"search": "tree", "rule": "systematic", "prune_every": 2, "temperature": 0.6},
+    "often": OFTEN,
+    "forest": {**OFTEN, "trees": 16, "branches": 4},
     "small": {"search": "tree", "rule": "systematic", "trees": 4, "branches": 4},
     "best": {"search": "best", "rollouts": 1},
     "oracle": {"search": "oracle"},
 }
-"""Ways to simulate: independent rollouts; the leaves of one tree; the best quarter of the leaves of four trees; the
-best sixteen leaves of a tree of 64 branches; the leaves of a tree resampled instead of halved; those of four such
-trees of four branches; the best of sixteen independent rollouts by the discriminator; one tree pruned by the true
-flags.
+"""Ways to simulate: independent rollouts; the leaves of one tree, halved every two seconds; resampled instead of
+halved; that more often; one leaf each of sixteen such trees of four branches; the leaves of four trees of four branches;
+the best of sixteen independent rollouts by the discriminator; one tree pruned by the true flags.
 """
 DEFAULT_KINDS = dict.fromkeys(("bc", "bc_h", "mgail", "mgail_h"), ("none",))
 COLUMNS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
