@@ -49,8 +49,8 @@ KINDS: dict[str, dict[str, Any]] = {
     "oracle": {"search": "oracle"},
 }
 """Ways to simulate: independent rollouts; the leaves of one tree, halved every two seconds; resampled instead of
-halved; that more often; one leaf each of sixteen such trees of four branches; the leaves of four trees of four branches;
-the best of sixteen independent rollouts by the discriminator; one tree pruned by the true flags.
+halved; that more often; one leaf each of sixteen such trees of four branches; the leaves of four trees of four
+branches; the best of sixteen independent rollouts by the discriminator; one tree pruned by the true flags.
 """
 DEFAULT_KINDS = dict.fromkeys(("bc", "bc_h", "mgail", "mgail_h"), ("none",))
 COLUMNS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
