@@ -228,6 +228,26 @@ def test_nearest_elements_are_the_ones_seen() -> None:
         torch.testing.assert_close(seen, true, atol=1e-3, rtol=1e-4)
 
 
+def test_padding_does_not_decide_between_equally_near_points() -> None:
+    one, tied = scene(crossing(6), [0, 1]), 0
+    distance = (one.point[0] - one.log_state[0, 0, 0, :2]).square().sum(-1)[one.point_valid[0]].sort().values
+    for count in range(8, 200, 5):
+        tied += bool(distance[count - 1] == distance[count])
+        config = ObservationConfig(num_objects=3, num_points=count)
+        seen = []
+        for extra in (0, 57, 1300):
+            wide = one.clone()
+            for name in ("point", "point_direction", "point_speed", "point_type", "point_light", "point_valid"):
+                value = getattr(one, name)
+                filler = value.new_zeros(1, extra, *value.shape[2:])
+                setattr(wide, name, torch.cat([value, filler], 1))
+            env = DrivingEnv(wide, Bicycle(), config)
+            seen.append(env.start(torch.tensor([0]))[keys.POINTS][0, 0])
+        for other in seen[1:]:
+            assert sorted(other.tolist()) == sorted(seen[0].tolist())
+    assert tied > 3
+
+
 def test_what_is_not_valid_is_not_seen() -> None:
     segment = crossing(6)
     gone = hide(segment, 3, slice(0, 10))

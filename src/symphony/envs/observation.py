@@ -138,8 +138,8 @@ def observe(
 ) -> Observation:
     """Observation of the agents ``index`` among ``objects``.
 
-    Nearness is the distance between centres; ties go to whichever the sort leaves first, which max-pooling over
-    elements makes irrelevant unless the tie is at the cut.
+    Nearness is the distance between centres. Lanes share their end points, so ties are common: on the CPU they go to
+    the elements that come first, whatever the padding.
     """
     own = _take(objects.state, index)
     own_size = _take(objects.size, index)
@@ -279,12 +279,18 @@ def _light_states(scenes: SceneBatch, scene: Tensor, step: Tensor, light: Tensor
 
 
 def _nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The ``count`` smallest of the last dimension and their indices, padded with infinity at index 0."""
+    """The ``count`` smallest of the last dimension, in any order, and their indices, padded with infinity at index 0."""
     available = min(count, squared.shape[-1])
     if squared.device.type == "cpu" and available < squared.shape[-1]:
         # On the CPU NumPy's selection takes less than half the time of topk.
         index = torch.from_numpy(np.argpartition(squared.numpy(), available, axis=-1)[..., :available])
         values = squared.gather(-1, index)
+        # Which of equal elements the selection takes depends on how many there are, hence on the batch.
+        cut = values.amax(-1, keepdim=True)
+        tied = ((squared <= cut).sum(-1) > available) & cut.isfinite().squeeze(-1)
+        if bool(tied.any()):
+            order = squared[tied].sort(dim=-1, stable=True)
+            values[tied], index[tied] = order.values[..., :available], order.indices[..., :available]
     else:
         values, index = squared.topk(available, dim=-1, largest=False, sorted=False)
     if available < count:
