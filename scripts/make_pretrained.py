@@ -24,7 +24,7 @@ from symphony.cli.comparison import choose_evaluation, method_name
 from symphony.cli.evaluations import FOLDER as EVALUATIONS
 from symphony.cli.evaluations import evaluation_name, kept_evaluations, read_evaluation
 from symphony.cli.tables import COLUMNS, write_json
-from symphony.config import Rule, TrainConfig, to_json
+from symphony.config import EvaluateConfig, Rule, TrainConfig, to_json
 from symphony.data.generate import PRESETS
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, SymphonyError
@@ -57,7 +57,11 @@ class Source:
 
 
 def make(
-    run: str, name: str, scores: Path | None = None, rule: Rule | None = None, folder: Path = FOLDER
+    run: str,
+    name: str,
+    scores: Path | None = None,
+    pruning: EvaluateConfig = EvaluateConfig(),  # noqa: B008  (frozen)
+    folder: Path = FOLDER,
 ) -> Path:
     """Write the folder of an agent and return it.
 
@@ -65,7 +69,8 @@ def make(
         run: ``RUN`` or ``RUN@WHICH`` (see :func:`symphony.trainers.load_agent`).
         name: of the agent.
         scores: an evaluation of the run as ``symphony evaluate`` writes it; by default the one that the run keeps.
-        rule: how the agent's trees are pruned from now on; by default as it was trained.
+        pruning: its `rule`, `prune_every` and `temperature` say how the agent's trees are pruned from now on; by
+            default as it was trained.
         folder: of all these agents.
 
     Raises:
@@ -77,7 +82,7 @@ def make(
     step = int(checkpoint.name[-12:])
     record = _read_scores(source, scores)
     known = Source(config, step, _before(source, config), _checksum(config.data), record)
-    out = replace(config, search=replace(config.search, rule=rule or config.search.rule))
+    out = replace(config, search=pruning.pruning(config.search))
     if record is not None:
         _check_scores(record, out, step)
     networks = build_networks(out)
@@ -170,7 +175,10 @@ def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> Non
         ("checkpoint", found.get("checkpoint", step), step),
     ]
     if how["search"] == "tree":
-        pairs.append(("rule", how["rule"], config.search.rule))
+        search = config.search
+        pairs += [(name, how[name], getattr(search, name)) for name in ("rule", "prune_every")]
+        if search.rule == "systematic":
+            pairs.append(("temperature", how["temperature"], search.temperature))
     for what, judged, own in pairs:
         if judged != own:
             raise ConfigError(f"the evaluation is of another agent: {what} {judged}, not {own}")
@@ -238,17 +246,18 @@ def _training(source: Source, config: TrainConfig) -> str:
             f"`{data_name(own.validation.data)}`."
         )
     if own.searches:
-        text += (
-            f" Searches in training had {own.search.branches} branches, pruned every {own.search.prune_every} "
-            f"steps by rule `{own.search.rule}`."
-        )
-        if config.search.rule != own.search.rule:
+        text += f" Searches in training had {own.search.branches} branches, pruned {_pruning(asdict(own.search))}."
+        if config.search != own.search:
             text += (
-                f" From now on it is simulated with rule `{config.search.rule}`"
-                + (f" (temperature {config.search.temperature:g})" if config.search.rule != "best" else "")
-                + ", which it was not trained with."
+                f" From now on its trees are pruned {_pruning(asdict(config.search))}, which it was not trained "
+                "with."
             )
     return text
+
+
+def _pruning(search: dict[str, Any]) -> str:
+    words = f"every {search['prune_every']} steps by rule `{search['rule']}`"
+    return words + (f" (temperature {search['temperature']:g})" if search["rule"] == "systematic" else "")
 
 
 def _settings(config: TrainConfig, parameters: dict[str, int]) -> str:
@@ -282,8 +291,8 @@ def _scores(name: str, record: dict[str, Any] | None) -> str:
     trees = "one search tree" if how["trees"] == 1 else f"{how['trees']} search trees"
     ways = {
         "none": f"{how['rollouts']} independent rollouts",
-        "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned by "
-        f"rule `{how['rule']}`",
+        "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned "
+        f"{_pruning(how) if how['trees'] else ''}",
         "oracle": "trees pruned by the true collision and off-road flags",
         "best": f"the best of {how['branches']} independent rollouts by the discriminator",
     }
@@ -360,12 +369,20 @@ def main(args: Sequence[str] | None = None) -> None:
         "--scores", type=Path, help="an evaluation of it (default: the one that the run keeps)"
     )
     parser.add_argument(
-        "--rule", choices=get_args(Rule), help="prune its trees so (default: as it was trained)"
+        "--rule",
+        choices=get_args(Rule),
+        default="agent",
+        help="prune its trees so (default: as it was trained)",
     )
+    parser.add_argument("--prune-every", type=int, default=0, help="steps between prunings, likewise")
+    parser.add_argument("--temperature", type=float, default=0.0, help="of rule systematic, likewise")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="of all these agents")
     arguments = parser.parse_args(args)
     try:
-        place = make(arguments.run, arguments.name, arguments.scores, arguments.rule, arguments.folder)
+        pruning = EvaluateConfig(
+            rule=arguments.rule, prune_every=arguments.prune_every, temperature=arguments.temperature
+        )
+        place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder)
     except SymphonyError as error:
         parser.exit(1, f"error: {error}\n")
     size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())

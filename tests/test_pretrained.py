@@ -19,7 +19,7 @@ from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from symphony.cli import main
 from symphony.cli.train import Train
-from symphony.config import MGAILConfig, ValidationConfig
+from symphony.config import EvaluateConfig, MGAILConfig, ValidationConfig
 from symphony.data.generate import PRESETS
 from symphony.data.store import StoreWriter
 from symphony.errors import ConfigError
@@ -31,6 +31,7 @@ from symphony.trainers.selection import choose
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = pretrained.pretrained_names()
 METHODS = ("bc_ts_h", "mgail_ts_h")
+PRUNING = EvaluateConfig(rule="systematic", prune_every=3)
 
 
 def load_script(name: str) -> Any:
@@ -71,7 +72,18 @@ def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.Te
         **adversarial,
     )
     out = train(second)
-    judge = ["evaluate", str(out), "--data", str(store), "--rollouts", "2", "--rule", "systematic"]
+    judge = [
+        "evaluate",
+        str(out),
+        "--data",
+        str(store),
+        "--rollouts",
+        "2",
+        "--rule",
+        "systematic",
+        "--prune-every",
+        "3",
+    ]
     assert main(judge) == 0
     return out
 
@@ -80,7 +92,7 @@ def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.Te
 def made(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An agent `tiny` made from the run, in place of those that come with the package."""
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "pretrained")
-    return make_pretrained.make(str(run), "tiny", rule="systematic", folder=tmp_path / "pretrained")
+    return make_pretrained.make(str(run), "tiny", pruning=PRUNING, folder=tmp_path / "pretrained")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -95,7 +107,7 @@ def test_an_agent_is_its_run_without_what_only_training_needs(run: Path, made: P
     assert not [name for name in contents(made) if "optimizer" in name]
     own, theirs = load_agent(str(run)), load_agent("pretrained:tiny")
     assert own.search.rule == "best"
-    assert dataclasses.replace(own.search, rule="systematic") == theirs.search
+    assert dataclasses.replace(own.search, rule="systematic", prune_every=3) == theirs.search
     assert (own.observation, own.dynamics) == (theirs.observation, theirs.dynamics)
     # Nothing tells on which machine it was made.
     for name, content in contents(made).items():
@@ -108,7 +120,7 @@ def test_an_agent_is_its_run_without_what_only_training_needs(run: Path, made: P
 
 def test_the_same_run_gives_the_same_bytes(run: Path, made: Path, tmp_path: Path) -> None:
     torch.manual_seed(5)
-    again = make_pretrained.make(str(run), "tiny", rule="systematic", folder=tmp_path / "again")
+    again = make_pretrained.make(str(run), "tiny", pruning=PRUNING, folder=tmp_path / "again")
     assert contents(again) == contents(made)
 
 
@@ -125,7 +137,7 @@ def test_the_card_says_what_was_done_and_found(run: Path, made: Path, store: Pat
         "with seed 0",
         f"the run `{read_config(run).warm_start.name}`",  # type: ignore[union-attr]
         "2 updates",
-        "rule `systematic`",
+        "every 3 steps by rule `systematic` (temperature 0.3)",
         "which it was not trained with",
         "## Limits",
     ):
@@ -142,7 +154,7 @@ def test_scores_of_another_agent_are_refused(run: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.json"
     wrong.write_text(json.dumps(record))
     with pytest.raises(ConfigError, match="of another agent: seed 7, not 0"):
-        make_pretrained.make(str(run), "x", scores=wrong, rule="systematic", folder=folder)
+        make_pretrained.make(str(run), "x", scores=wrong, pruning=PRUNING, folder=folder)
     assert not folder.exists()
 
 
