@@ -237,7 +237,14 @@ def test_padding_does_not_decide_between_equally_near_points() -> None:
         seen = []
         for extra in (0, 57, 1300):
             wide = one.clone()
-            for name in ("point", "point_direction", "point_speed", "point_type", "point_light", "point_valid"):
+            for name in (
+                "point",
+                "point_direction",
+                "point_speed",
+                "point_type",
+                "point_light",
+                "point_valid",
+            ):
                 value = getattr(one, name)
                 filler = value.new_zeros(1, extra, *value.shape[2:])
                 setattr(wide, name, torch.cat([value, filler], 1))

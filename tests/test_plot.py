@@ -26,7 +26,7 @@ from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, Se
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError
 from symphony.render import SearchTree, plot_curves, plot_genealogy, plot_search, plot_tree
-from symphony.render.curves import panels_of, read_curves, run_colors, smoothed
+from symphony.render.curves import DASHES, PANELS, panels_of, read_curves, run_colors, smoothed
 from symphony.render.genealogy import rows
 from symphony.render.style import AGENT_COLORS, new_figure
 from symphony.render.tree import FATES, STROKES, score_colors
@@ -417,6 +417,23 @@ def test_panels_hold_each_metric_once() -> None:
     present = ["step_time", "accuracy_data", "auc", "nll_expert", "nll_rollout"]
     names = [name for _, metrics in panels_of(present) for name in metrics]
     assert sorted(names) == sorted(present)
+
+
+def test_what_belongs_together_shares_a_panel_and_how_it_ran_comes_last() -> None:
+    names = {name: title for title, metrics in PANELS for name in metrics}
+    for group in (
+        ["validation_collision_rate", "validation_offroad_time", "validation_infractions"],
+        ["validation_ade", "validation_min_sade"],
+        ["loss_mgail", "loss_policy"],
+        [f"gradient_norm_{name}" for name in ("policy", "discriminator", "goals")],
+        [f"show_speed_log_p{q}" for q in (10, 50, 90)],
+    ):
+        assert len({names[name] for name in group}) == 1
+    # More lines could not be told apart.
+    assert max(len(metrics) for _, metrics in PANELS) <= len(DASHES)
+    present = ["skipped_updates", "updates_per_second", "mine", "learning_rate", "auc"]
+    order = [name for _, metrics in panels_of(present) for name in metrics]
+    assert order == ["auc", "mine", "updates_per_second", "learning_rate", "skipped_updates"]
 
 
 # The command line

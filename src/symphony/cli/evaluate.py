@@ -34,7 +34,7 @@ class Evaluate:
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File to write all numbers to, those of every run segment included."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Picture of simulated rollouts to draw (.png, .pdf or .svg)."""
+    """Picture of simulated rollouts to draw (.png, .pdf or .svg), or animation of them (.gif)."""
     keep: bool = True
     """Leave the folder of the run as it is."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -51,7 +51,12 @@ class Evaluate:
             from symphony.cli.pictures import draw_rollouts
 
             draw_rollouts(
-                found.agent, self.data, self.figure, found.record["interactive"], seed=self.config.seed
+                found.agent,
+                self.data,
+                self.figure,
+                found.record["interactive"],
+                seed=self.config.seed,
+                device=self.config.device,
             )
 
 

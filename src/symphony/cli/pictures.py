@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from symphony.trainers import Agent, Rollouts
+    from symphony.render import Clip
+    from symphony.trainers import Agent
 
 PANELS = 6
 """Run segments in one picture."""
@@ -16,23 +17,40 @@ SHOWN = 8
 
 
 def draw_rollouts(
-    agent: Agent, data: Path, path: Path, interactive: int, *, seed: int = 0, panels: int = PANELS
+    agent: Agent,
+    data: Path,
+    path: Path,
+    interactive: int,
+    *,
+    seed: int = 0,
+    panels: int = PANELS,
+    segments: Sequence[int] = (),
+    rollouts: int = SHOWN,
+    device: str = "cpu",
 ) -> None:
-    """Draw rollouts of some run segments, spread evenly over a store, beside the log.
+    """Draw, or animate, rollouts of some run segments beside the log.
 
     Args:
         agent: what drives the interactive agents.
         data: the store.
-        path: picture to write.
+        path: picture to write, an animation if it ends in .gif.
         interactive: agents per segment that are driven.
         seed: of the rollouts.
-        panels: how many segments.
+        panels: how many segments, spread evenly over the store.
+        segments: their numbers in the store, if these are to be drawn.
+        rollouts: of each.
+        device: where the agent is.
     """
-    from symphony.render import plot_grid
+    from symphony.render import animate_rollouts, plot_grid
+    from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 
-    found = _panels(agent, data, interactive, seed, panels)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_grid(found, path)
+    animated = picture_path(path, (*FORMATS, *ANIMATIONS)).suffix[1:].lower() in ANIMATIONS
+    chosen = segments or _spread(data, panels)
+    clips = _clips(agent, data, interactive, seed, chosen, rollouts=rollouts, device=device)
+    if animated:
+        animate_rollouts(clips, path)
+    else:
+        plot_grid([_panel(clip) for clip in clips], path)
 
 
 def draw_compared(
@@ -50,50 +68,55 @@ def draw_compared(
     """
     from symphony.render import plot_grid
 
-    rows = [_panels(agent, data, interactive, seed, panels, f"{name}: ") for name, agent in agents.items()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_grid([panel for row in rows for panel in row], path, columns=len(rows[0]))
+    chosen = _spread(data, panels)
+    rows = [_clips(agent, data, interactive, seed, chosen, f"{name}: ") for name, agent in agents.items()]
+    plot_grid([_panel(clip) for row in rows for clip in row], path, columns=len(rows[0]))
 
 
-def _panels(
-    agent: Agent, data: Path, interactive: int, seed: int, panels: int, label: str = ""
-) -> list[Callable[[Any], Any]]:
-    """What draws the rollouts of each of some segments."""
+def _spread(data: Path, count: int) -> list[int]:
+    from symphony.data.store import SegmentStore
+
+    there = len(SegmentStore(data))
+    count = min(count, there)
+    return [i * there // count for i in range(count)]
+
+
+def _clips(
+    agent: Agent,
+    data: Path,
+    interactive: int,
+    seed: int,
+    chosen: Sequence[int],
+    label: str = "",
+    rollouts: int = SHOWN,
+    device: str = "cpu",
+) -> list[Clip]:
+    """The rollouts of each of some segments."""
+    import torch
+
     from symphony.config import EvaluateConfig
     from symphony.data.store import SegmentStore
-    from symphony.render import plot_rollout
     from symphony.trainers.dataset import SceneDataset
     from symphony.trainers.evaluation import playback, simulated
+    from symphony.trainers.showing import clip_of
+    from symphony.trainers.simulate import Rollouts
 
     store = SegmentStore(data)
-    panels = min(panels, len(store))
-    chosen = [i * len(store) // panels for i in range(panels)]
-    dataset = SceneDataset(store, interactive, agent.dynamics, routes=agent.goals is not None)
-    config = EvaluateConfig(rollouts=SHOWN, seed=seed)
+    dataset = SceneDataset(store, interactive, agent.dynamics, chosen, routes=agent.goals is not None)
+    config = EvaluateConfig(rollouts=rollouts, seed=seed, device=device)
 
-    def panel(i: int) -> Callable[[Any], Any]:
+    def clip(i: int) -> Clip:
         segment, scene = dataset.segment(i), dataset.scene(i)
-        runs: Rollouts = playback(scene) if agent.policy is None else simulated(agent, scene, config)
-        state = runs.state[0].transpose(1, 2)
-        flags = {
-            name: getattr(runs, name)[0].transpose(1, 2).numpy()
-            for name in ("collision", "offroad", "counted")
-        }
+        there = scene.to(torch.device(device))
+        runs = playback(there) if agent.policy is None else simulated(agent, there, config)
+        runs = Rollouts(*(part.cpu() for part in runs))
+        return clip_of(segment, scene, runs, title=f"{label}{segment.segment_id}")
 
-        def draw(axes: Any) -> Any:
-            return plot_rollout(
-                segment,
-                state[:, :, 1:, :2].numpy(),
-                state[:, :, 1:, 2].numpy(),
-                scene.interactive[0].numpy(),
-                axes,
-                start=1,
-                valid=flags["counted"],
-                collision=flags["collision"],
-                offroad=flags["offroad"],
-                title=f"{label}{segment.segment_id}",
-            )
+    return [clip(i) for i in range(len(dataset))]
 
-        return draw
 
-    return [panel(i) for i in chosen]
+def _panel(clip: Clip) -> Callable[[Any], Any]:
+    """What draws rollouts on axes."""
+    from symphony.render import plot_rollout
+
+    return lambda axes: plot_rollout(target=axes, **vars(clip))

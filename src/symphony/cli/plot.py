@@ -1,4 +1,4 @@
-"""Draw what a run learned from and what it does: the tree of a search, the curves of its training."""
+"""Draw what a run learned from and what it does: its rollouts, the tree of a search, the curves of its training."""
 
 from __future__ import annotations
 
@@ -127,6 +127,59 @@ class Tree:
             collision=collision[..., 0],
             offroad=offroad[..., 0],
             routes=routes,
+        )
+
+
+@app.command(name="rollouts")
+@dataclass(frozen=True)
+class Rollouts:
+    """Draw what an agent does beside the log, or animate it."""
+
+    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
+    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback` or `constant_velocity`."""
+    data: Path
+    """Store of run segments."""
+    out: Path
+    """Picture to write (.png, .pdf or .svg), or animation (.gif)."""
+    segments: tuple[str, ...] = ()
+    """Their ids, or their numbers in the store; by default some, spread evenly over the store."""
+    panels: int = 3
+    """How many, if none are named."""
+    rollouts: int = 1
+    """Of each segment."""
+    interactive: int = 0
+    """Interactive agents per run segment; 0 takes what the agent was trained with (2 for the baselines)."""
+    seed: int = 0
+    """Of everything drawn at random."""
+    device: str = "cpu"
+    """`cpu`, `cuda` or `cuda:N`."""
+
+    def __post_init__(self) -> None:
+        for name in ("panels", "rollouts"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"--{name} must be at least 1, is {getattr(self, name)}")
+        if self.interactive < 0:
+            raise ConfigError(f"--interactive must not be negative, is {self.interactive}")
+
+    def run(self) -> None:
+        """Simulate and draw."""
+        from symphony.cli.pictures import draw_rollouts
+        from symphony.data.store import SegmentStore
+        from symphony.trainers import load_agent
+
+        agent, store = load_agent(self.agent, self.device), SegmentStore(self.data)
+        if len(store) == 0:
+            raise DataError("the store holds no run segments", file=store.path)
+        draw_rollouts(
+            agent,
+            self.data,
+            self.out,
+            self.interactive or agent.interactive,
+            seed=self.seed,
+            panels=self.panels,
+            segments=[segment_index(store, name) for name in self.segments],
+            rollouts=self.rollouts,
+            device=self.device,
         )
 
 

@@ -5,9 +5,12 @@ from symphony.render.genealogy import plot_genealogy, plot_search
 from symphony.render.histograms import plot_curvature
 from symphony.render.plots import plot_grid, plot_rollout, plot_segment
 from symphony.render.tree import SearchTree, plot_tree
+from symphony.render.video import Clip, animate_rollouts
 
 __all__ = [
+    "Clip",
     "SearchTree",
+    "animate_rollouts",
     "plot_curvature",
     "plot_curves",
     "plot_genealogy",

@@ -23,6 +23,13 @@ Records = Sequence[Mapping[str, Any]]
 
 Panel = tuple[str, Mapping[str, str]]
 """Title, and the metrics with what each is called where there are several."""
+
+
+def _quantiles(title: str, name: str) -> Panel:
+    labels = {"p90": "90 %", "p50": "median", "p10": "10 %"}
+    return f"shown: {title}", {f"show_{name}_{level}": label for level, label in labels.items()}
+
+
 PANELS: tuple[Panel, ...] = (
     ("BC loss", {"loss_bc": ""}),
     ("distillation loss", {"loss_distillation": ""}),
@@ -40,8 +47,42 @@ PANELS: tuple[Panel, ...] = (
     ("search: AUC of off-road states", {"search_auc_offroad": ""}),
     ("search: share in collision", {"search_collision_all": "all", "search_collision_kept": "kept"}),
     ("search: share off the road", {"search_offroad_all": "all", "search_offroad_kept": "kept"}),
+    ("MGAIL loss", {"loss_mgail": "MGAIL", "loss_policy": "with regression"}),
+    ("MGAIL: discriminator logit", {"mgail_score": ""}),
+    (
+        "validation: infractions, %",
+        {
+            "validation_collision_rate": "collision rate",
+            "validation_offroad_time": "off-road time",
+            "validation_infractions": "sum",
+        },
+    ),
+    ("validation: displacement, m", {"validation_ade": "ADE", "validation_min_sade": "minSADE"}),
+    ("validation: curvature JSD", {"validation_curvature_jsd": ""}),
+    _quantiles("ADE, m", "ade"),
+    _quantiles("speed, m/s", "speed"),
+    _quantiles("logged speed, m/s", "speed_log"),
+    _quantiles("acceleration, m/s²", "acceleration"),
+    _quantiles("logged acceleration, m/s²", "acceleration_log"),
+    _quantiles("turn, rad/s", "turn"),
+    _quantiles("logged turn, rad/s", "turn_log"),
+    _quantiles("logit, simulated", "score_simulated"),
+    _quantiles("logit, data", "score_data"),
+    (
+        "gradient norm",
+        {
+            "gradient_norm_policy": "policy",
+            "gradient_norm_discriminator": "discriminator",
+            "gradient_norm_goals": "goals",
+        },
+    ),
 )
-"""In this order; whatever else there is follows in panels of its own."""
+"""In this order; whatever else there is follows in panels of its own, and then what is in :data:`LAST`."""
+LAST: tuple[Panel, ...] = (
+    ("updates per second", {"updates_per_second": ""}),
+    ("learning rate", {"learning_rate": ""}),
+    ("skipped updates", {"skipped_updates": ""}),
+)
 DASHES: tuple[Any, ...] = ("-", (0, (3, 1.5)), (0, (1, 1)))
 WINDOW = 0.1
 """Share of a run's records that a point of the smoothed line is averaged over."""
@@ -111,11 +152,13 @@ def read_curves(records: Records) -> dict[str, tuple[NDArray[np.float64], NDArra
 
 def panels_of(present: Sequence[str]) -> list[Panel]:
     """The panels for the metrics there are."""
-    known = {name for _, names in PANELS for name in names}
-    grouped = [(title, {name: names[name] for name in names if name in present}) for title, names in PANELS]
-    return [panel for panel in grouped if panel[1]] + [
-        _own_panel(name) for name in present if name not in known
+    known = {name for _, names in (*PANELS, *LAST) for name in names}
+    others = [_own_panel(name) for name in present if name not in known]
+    panels = [
+        (title, {name: label for name, label in names.items() if name in present})
+        for title, names in (*PANELS, *others, *LAST)
     ]
+    return [panel for panel in panels if panel[1]]
 
 
 def smoothed(values: NDArray[np.float64], window: float) -> NDArray[np.float64]:

@@ -151,7 +151,7 @@ def plot_rollout(
         shown = np.where(logged[rank, :, None], log[rank], np.nan)
         axes.plot(*shown.T, color=INK, linestyle=LOG_DASHES, linewidth=1.4, zorder=9, gid=f"log-{agent}")
         _draw_agent(axes, runs, rank, segment.size[agent], color)
-    marks = [_draw_events(axes, runs, *event) for event in EVENTS]
+    marks = [draw_events(axes, runs, *event) for event in EVENTS]
     rollouts = f"{len(runs.position)} rollout{'s' if len(runs.position) > 1 else ''}"
     subtitle = f"{describe(segment)}   ·   {rollouts} of {(steps - 1) * segment.dt:.1f} s"
     frame(axes, view, title or segment.segment_id, subtitle)
@@ -240,6 +240,18 @@ class Rollouts:
         cut = [None if array is None else array[:, kept] for array in events]
         return cls(position[:, kept], heading[:, kept], seen[:, kept], agents[kept], cut[0], cut[1])
 
+    def until(self, step: int) -> Rollouts:
+        """As if they ended after a step."""
+        past = slice(0, step + 1)
+        return Rollouts(
+            self.position[:, :, past],
+            self.heading[:, :, past],
+            self.valid[:, :, past],
+            self.agents,
+            None if self.collision is None else self.collision[:, :, past],
+            None if self.offroad is None else self.offroad[:, :, past],
+        )
+
 
 def _draw_agent(axes: Axes, runs: Rollouts, rank: int, size: NDArray[Any], color: str) -> None:
     """One agent's path in every rollout, and its box at the last valid step of each."""
@@ -265,7 +277,7 @@ def _draw_agent(axes: Axes, runs: Rollouts, rank: int, size: NDArray[Any], color
         draw_boxes(axes, *place, color, alpha=max(alpha, 0.45), gid=f"ends-{agent}")
 
 
-def _draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str) -> Line2D | None:
+def draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str) -> Line2D | None:
     """Mark where each run of true steps of an event begins; None where there is none."""
     event = getattr(runs, name)
     if event is None:

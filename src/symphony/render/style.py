@@ -34,6 +34,7 @@ CAUTION = "#E69F00"
 GO = "#009E73"
 
 FORMATS = ("png", "pdf", "svg")
+ANIMATIONS = ("gif",)
 
 Corner = Literal["upper right", "upper left", "lower right"]
 Target = str | Path | Axes
@@ -64,12 +65,12 @@ def open_target(target: Target, view: View) -> tuple[Axes, Path | None]:
     return new_figure(width * inches, height * inches + 0.5).add_subplot(), path
 
 
-def picture_path(path: str | Path) -> Path:
+def picture_path(path: str | Path, formats: Sequence[str] = FORMATS) -> Path:
     """The path, if its name says one of the kinds of picture that can be written."""
     path = Path(path)
-    if path.suffix[1:].lower() not in FORMATS:
+    if path.suffix[1:].lower() not in formats:
         raise ConfigError(
-            f"{path}: a picture's name must end in one of {', '.join('.' + f for f in FORMATS)}"
+            f"{path}: a picture's name must end in one of {', '.join('.' + f for f in formats)}"
         )
     return path
 
@@ -109,13 +110,19 @@ def frame(axes: Axes, view: View, title: str, subtitle: str) -> None:
         spine.set_color("#C8C4BC")
     title_style: dict[str, Any] = {"fontweight": "bold", "color": INK, "parse_math": False}
     axes.set_title(title, loc="left", fontsize=font(axes, 11, title), pad=20, **title_style)
+    add_caption(axes, subtitle)
+    add_scale_bar(axes, view)
+
+
+def add_caption(axes: Axes, text: str, *, right: bool = False) -> None:
+    """Text between the picture and its title, at the left or the right end of the line."""
     place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
+    side = "right" if right else "left"
     caption = axes.annotate(
-        subtitle, (0, 1), (0, 6), fontsize=font(axes, 8.5, subtitle), color="#5B616B", **place
+        text, (float(right), 1), (0, 6), ha=side, fontsize=font(axes, 8.5, text), color="#5B616B", **place
     )
     # The title's padding has made its room; its width must not squeeze the picture.
     caption.set_in_layout(False)
-    add_scale_bar(axes, view)
 
 
 def _width(axes: Axes) -> float:

@@ -136,6 +136,20 @@ class Learner:
             record |= {name if "goal" in name else f"goal_{name}": value for name, value in values.items()}
         return record
 
+    @torch.no_grad()
+    def scores(self, step: int) -> dict[str, Tensor]:
+        """The discriminator's logits [K] of ``simulated`` and ``data`` states of the last search (K = 0 before the
+        first); empty without a discriminator. Which states, the number of the update says.
+        """
+        judge, found = self.networks.discriminator, self._found
+        if judge is None:
+            return {}
+        if found is None:
+            return dict.fromkeys(("simulated", "data"), torch.zeros(0, device=self.device))
+        batch = judge(self._both_kinds(found, torch.Generator().manual_seed(step)))
+        score, valid, simulated = (batch.get(key) for key in (keys.SCORE, keys.VALID, keys.SIMULATED))
+        return {"simulated": score[valid & simulated], "data": score[valid & ~simulated]}
+
     def _searched(self, step: int, rng: torch.Generator) -> SearchData | None:
         """The last search, or a new one if it is due; None where there is nothing to judge (yet)."""
         config = self.config

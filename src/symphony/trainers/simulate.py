@@ -32,7 +32,7 @@ equally on all branches.
 _GOALS = 1 << 40
 _PRUNING = (1 << 40) + 1
 _RETRIES = (1 << 40) + 2
-"""Numbers of the streams that goals, prunings and repeated periods draw from, far above those of rollouts and agents."""
+"""Numbers of the streams that goals, prunings and repeats draw from, far above those of rollouts and agents."""
 
 
 class Rollouts(NamedTuple):

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+from numpy.typing import NDArray
+
 from symphony.errors import DataError
 
 
@@ -39,7 +41,7 @@ class Tracker:
         self.kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
         # Put in place as a whole, lest a kill meanwhile lose what is kept.
         write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
-        with _naming(self.path):
+        with naming(self.path):
             self._file = self.path.open("a", encoding="utf-8")
         self._run = None
         mode: Any = os.environ.get("WANDB_MODE", wandb)
@@ -62,21 +64,31 @@ class Tracker:
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in values.items()
         }
-        with _naming(self.path):
+        with naming(self.path):
             self._file.write(json.dumps({"step": step, **known}) + "\n")
             self._file.flush()
         if self._run is not None:
             self._run.log(dict(values), step=step)
 
+    def show(self, step: int, samples: Mapping[str, NDArray[Any]], video: Path) -> None:
+        """Give Weights & Biases, where it is used, histograms of samples [K] and an animation (gif)."""
+        if self._run is None:
+            return
+        import wandb as tracking  # noqa: PLC0415 - is there by now
+
+        found: dict[str, Any] = {"show/rollout": tracking.Video(str(video), format="gif")}
+        found |= {f"show/{name}": tracking.Histogram(x.tolist()) for name, x in samples.items() if len(x)}
+        self._run.log(found, step=step)
+
     def sync(self) -> None:
         """Wait until all records are on the disk: a checkpoint must not survive a power cut that they don't."""
-        with _naming(self.path):
+        with naming(self.path):
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Finish the files."""
         try:
-            with _naming(self.path):
+            with naming(self.path):
                 self._file.close()
         finally:
             if self._run is not None:
@@ -100,7 +112,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 def write_file(path: Path, text: str) -> None:
     """Write a text file that appears complete or not at all. Raises DataError if the disk refuses."""
     new = path.with_name(f".new-{path.name}")
-    with _naming(path):
+    with naming(path):
         with new.open("w", encoding="utf-8") as file:
             file.write(text)
             file.flush()
@@ -109,7 +121,7 @@ def write_file(path: Path, text: str) -> None:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming(path: Path) -> Iterator[None]:
     """Errors of the disk, with the file that they are about."""
     try:
         yield

@@ -24,11 +24,14 @@ from symphony.trainers.distributed import Processes, processes
 from symphony.trainers.learner import Learner
 from symphony.trainers.networks import Networks, build_networks, dynamics_of
 from symphony.trainers.selection import Best, choose, split_name
+from symphony.trainers.showing import Show
 from symphony.trainers.tracking import Tracker, write_file
 from symphony.trainers.validation import Validator
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""
+FREE = ("out", "data", "steps", "resume", "device", "wandb", "show", "checkpoint_every", "log_every")
+"""Settings that may be others when a run goes on."""
 
 
 def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
@@ -43,7 +46,7 @@ def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
         dataset: the prepared data, if several runs are to share it; by default made from ``config.data``.
 
     Returns:
-        The run's folder: ``config.json``, ``metrics.jsonl`` and ``checkpoints/``.
+        The run's folder: ``config.json``, ``metrics.jsonl``, ``checkpoints/`` and ``media/``.
 
     Raises:
         ConfigError: if the folder holds another run, or settings can't be used.
@@ -82,21 +85,30 @@ def _train(config: TrainConfig, dataset: SceneDataset | None, world: Processes) 
     validator = None
     if world.leads and config.validation.data is not None:
         validator = Validator(config, networks, world.device)
+    show = None
+    if world.leads and 0 < config.show.every <= config.steps:
+        show = Show(config, learner, dataset if validator is None else validator.dataset)
     # No process writes before all have looked at what there is.
     world.wait()
     if world.leads:
         config.out.mkdir(parents=True, exist_ok=True)
         write_file(config.out / "config.json", to_json(config))
-    return _Loop(config, learner, validator, world).run(done)
+    return _Loop(config, learner, validator, show, world).run(done)
 
 
 class _Loop:
     """One run: updates, records, judgements and checkpoints, in that order."""
 
     def __init__(
-        self, config: TrainConfig, learner: Learner, validator: Validator | None, world: Processes
+        self,
+        config: TrainConfig,
+        learner: Learner,
+        validator: Validator | None,
+        show: Show | None,
+        world: Processes,
     ) -> None:
-        self.config, self.learner, self.validator, self.world = config, learner, validator, world
+        self.config, self.learner, self.world = config, learner, world
+        self.validator, self.show = validator, show
         self.modules = learner.networks.present()
         self.skips, self.told = Skips(), set[str]()
         self.best: Best | None = None
@@ -143,12 +155,14 @@ class _Loop:
                 numbers["updates_per_second"] = (step - first) / (time.perf_counter() - began)
                 numbers |= self._describe(numbers)
             self.progress.update(self.task, completed=step)
-            if self.validator is not None and (last or step % _validate_every(config) == 0):
-                paused = time.perf_counter()
-                numbers |= self._validate(self.validator, step)
-                began += time.perf_counter() - paused
             if self.tracker is None:
                 continue
+            paused = time.perf_counter()
+            if self.validator is not None and (last or step % _validate_every(config) == 0):
+                numbers |= self._validate(self.validator, step)
+            if self.show is not None and (last or step % config.show.every == 0):
+                numbers |= self._show(self.show, self.tracker, step)
+            began += time.perf_counter() - paused
             if numbers:
                 self.tracker.log(step, numbers)
             if last or step % config.checkpoint_every == 0:
@@ -183,6 +197,13 @@ class _Loop:
         self.best = validator.best
         self.progress.update(self.task, description="training")
         return numbers
+
+    def _show(self, show: Show, tracker: Tracker, step: int) -> dict[str, float]:
+        self.progress.update(self.task, description="showing")
+        shown = show(step)
+        tracker.show(step, shown.samples, shown.video)
+        self.progress.update(self.task, description="training")
+        return shown.numbers()
 
     def _save(self, step: int) -> None:
         """Write a checkpoint; by now all records up to it are on the disk."""
@@ -232,10 +253,7 @@ def _find(config: TrainConfig) -> Path | None:
         if not config.resume:
             raise ConfigError(f"{config.out} holds a run already; choose another folder or --resume")
         # More updates, another machine or fewer records do not make it another run.
-        free = {
-            name: getattr(config, name)
-            for name in ("out", "data", "steps", "resume", "device", "wandb", "checkpoint_every", "log_every")
-        }
+        free = {name: getattr(config, name) for name in FREE}
         before = read_config(config.out)
         judged = before.validation
         # Judgements of other segments could not be compared with those so far.

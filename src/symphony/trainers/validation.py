@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -72,20 +73,27 @@ class Validator:
         Returns:
             The numbers for the record, all beginning with ``validation_``.
         """
-        modules = self.networks.present().values()
-        modes = [module.training for module in modules]
-        devices = [torch.cuda.current_device()] if self.device.type == "cuda" else []
-        try:
-            with torch.random.fork_rng(devices):
-                for module in modules:
-                    module.eval()
-                found = judge(self.agent, self.dataset, self.how, progress).metrics.compute()
-        finally:
-            for module, mode in zip(modules, modes, strict=True):
-                module.train(mode)
+        with undisturbed(self.networks, self.device):
+            found = judge(self.agent, self.dataset, self.how, progress).metrics.compute()
         infractions = found["collision_rate"] + found["offroad_time"]
         # Not a number, and so never the best, if nobody was simulated for a single step.
         if math.isfinite(infractions) and (self.best is None or infractions < self.best.infractions):
             self.best = Best(step, infractions)
         numbers = {f"validation_{name}": found[name] for name in METRICS}
         return {**numbers, "validation_infractions": infractions}
+
+
+@contextmanager
+def undisturbed(networks: Networks, device: torch.device) -> Iterator[None]:
+    """Use networks on a device as they will be used after training, which goes on as if they had not been used."""
+    modules = networks.present().values()
+    modes = [module.training for module in modules]
+    devices = [torch.cuda.current_device()] if device.type == "cuda" else []
+    try:
+        with torch.random.fork_rng(devices):
+            for module in modules:
+                module.eval()
+            yield
+    finally:
+        for module, mode in zip(modules, modes, strict=True):
+            module.train(mode)

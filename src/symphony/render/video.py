@@ -1,0 +1,255 @@
+"""Rollouts as they unfold, in an animated picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.offsetbox import AnchoredOffsetbox
+from numpy.typing import NDArray
+from PIL import Image
+
+from symphony.data.segment import RunSegment
+from symphony.render.agents import CORNERS, draw_boxes, pieces, place
+from symphony.render.plots import (
+    EVENTS,
+    LOG_DASHES,
+    Rollouts,
+    agent_entries,
+    colors_of,
+    describe,
+    draw_events,
+    draw_playback,
+    playback_entry,
+)
+from symphony.render.roads import draw_roads, draw_signals
+from symphony.render.style import (
+    ANIMATIONS,
+    INK,
+    View,
+    add_caption,
+    add_legend,
+    frame,
+    new_figure,
+    picture_path,
+    view_around,
+)
+
+FRAMES = 51
+"""In an animation, at most; steps are left out evenly where there are more."""
+HEAD = 0.45
+"""Inches for the title of a panel."""
+COLORS = 255
+"""Of an animation: one less than the format has, which then marks what stays as it was."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """K rollouts to be animated; the fields are the arguments of :func:`symphony.render.plot_rollout`."""
+
+    segment: RunSegment
+    position: Any
+    heading: Any
+    agent_index: Any
+    start: int = 0
+    valid: Any = None
+    collision: Any = None
+    offroad: Any = None
+    view: View | None = None
+    title: str | None = None
+
+
+def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 3, size: float = 3.6) -> None:
+    """Animate rollouts over the log, in real time: a panel for each run segment.
+
+    Interactive agents are drawn where they are in every rollout, with the way they came; dashed is their way in the
+    log, outlined where they were then. Playback agents and lights are shown as logged. The last frame is the last
+    step; shorter segments end earlier and stay as they are. Where nothing moves all frames are the same.
+
+    Args:
+        clips: rollouts of each segment.
+        path: file to write (gif).
+        columns: panels per row, at most.
+        size: inches a panel is wide, and high at most.
+
+    Raises:
+        ValueError: no clips, shapes that don't fit together, or steps outside the log.
+        ConfigError: a file of another kind.
+    """
+    if not clips:
+        raise ValueError("no rollouts to animate")
+    file = picture_path(path, ANIMATIONS)
+    panels = [_Panel(clip) for clip in clips]
+    figure = _lay_out(panels, min(columns, len(clips)), size)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    # Lay out once: what moves must not move the rest.
+    figure.set_layout_engine("none")
+    still = canvas.copy_from_bbox(figure.bbox)
+    above = [
+        canvas.copy_from_bbox(artist.get_window_extent().padded(1))
+        for panel in panels
+        for artist in panel.above()
+    ]
+    times, interval = _times(panels)
+    frames = []
+    for time in times:
+        canvas.restore_region(still)
+        for panel in panels:
+            panel.draw(time)
+        for part in above:
+            canvas.restore_region(part)
+        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    _write(frames, file, interval)
+
+
+class _Panel:
+    """Rollouts of one segment on axes of their own, which hold only what never moves."""
+
+    def __init__(self, clip: Clip) -> None:
+        segment = clip.segment
+        runs = Rollouts.of(
+            segment,
+            clip.position,
+            clip.heading,
+            clip.agent_index,
+            clip.start,
+            clip.valid,
+            clip.collision,
+            clip.offroad,
+        )
+        self.segment, self.runs, self.start = segment, runs, clip.start
+        self.title = clip.title or segment.segment_id
+        self.steps = runs.position.shape[2]
+        self.others = np.setdiff1d(np.arange(segment.num_agents), runs.agents)
+        within = slice(clip.start, clip.start + self.steps)
+        log, logged = segment.position[runs.agents, within, :2], segment.valid[runs.agents, within]
+        self.log = np.where(logged[..., None], log, np.nan)
+        self.trails = np.concatenate([runs.position[runs.valid], log[logged]])
+        self.view = clip.view or view_around(self.trails)
+
+    @property
+    def aspect(self) -> float:
+        """Height of the view, with its width 1."""
+        return (self.view[3] - self.view[2]) / (self.view[1] - self.view[0])
+
+    def settle(self, axes: Axes) -> None:
+        """Draw what never moves."""
+        self.axes, agents = axes, self.runs.agents
+        entries = draw_roads(axes, self.segment.road, self.view)
+        line: dict[str, Any] = {"color": INK, "linestyle": LOG_DASHES, "linewidth": 0.9}
+        for agent, way in zip(agents, self.log, strict=True):
+            axes.plot(*way.T, zorder=5, gid=f"log-{agent}", **line)
+        # The blanks are room for the seconds.
+        frame(axes, self.view, self.title, describe(self.segment) + " " * 12)
+        axes.set_anchor("N")
+        self.still = set(axes.get_children())
+        marks = self._draw_moving(self.steps - 1)
+        self._remove_moving()
+        legend = [*agent_entries(self.segment, agents), Line2D([], [], label="log", **line), playback_entry()]
+        add_legend(axes, [*legend, *marks, *entries], self.trails)
+        self.still = set(axes.get_children())
+
+    def above(self) -> list[Artist]:
+        """What nothing that moves may hide."""
+        return [artist for artist in self.still if isinstance(artist, Legend | AnchoredOffsetbox)]
+
+    def draw(self, time: float) -> None:
+        """Draw what moves as it is some seconds after the first step, and forget it."""
+        self._draw_moving(min(round(time / self.segment.dt), self.steps - 1))
+        for artist in sorted(self._moving(), key=Artist.get_zorder):
+            self.axes.draw_artist(artist)
+        self._remove_moving()
+
+    def _draw_moving(self, at: int) -> list[Line2D]:
+        """Add what moves, as it is at one of the steps; returns legend entries for lights and events."""
+        axes, segment, runs, step = self.axes, self.segment, self.runs, self.start + at
+        marks = draw_signals(axes, segment, step, self.view)
+        draw_playback(axes, segment, step, self.others)
+        alpha = float(np.clip(2.5 / len(runs.position), 0.3, 0.9))
+        for rank, (agent, color) in enumerate(zip(runs.agents, colors_of(segment, runs.agents), strict=True)):
+            past = slice(0, at + 1)
+            ways = [
+                pieces(way[past], seen[past])[0]
+                for way, seen in zip(runs.position[:, rank], runs.valid[:, rank], strict=True)
+            ]
+            axes.add_collection(
+                LineCollection(
+                    list(np.concatenate(ways)), colors=[to_rgba(color, alpha)], linewidths=1.4, zorder=8
+                ),
+                autolim=False,
+            )
+            here = runs.valid[:, rank, at]
+            position, heading = runs.position[here, rank, at], runs.heading[here, rank, at]
+            size = np.broadcast_to(segment.size[agent], (len(position), 3))
+            draw_boxes(axes, position, heading, size, color, alpha=max(alpha, 0.45), gid=f"box-{agent}")
+        self._draw_log(step)
+        marks += filter(None, (draw_events(axes, runs.until(at), *event) for event in EVENTS))
+        add_caption(axes, f"{step * segment.dt:.1f} s", right=True)
+        return marks
+
+    def _draw_log(self, step: int) -> None:
+        """Outline where the interactive agents were."""
+        segment = self.segment
+        seen = self.runs.agents[segment.valid[self.runs.agents, step]]
+        boxes = place(CORNERS, segment.position[seen, step], segment.heading[seen, step], segment.size[seen])
+        style: dict[str, Any] = {"facecolors": "none", "edgecolors": INK, "linewidths": 0.7, "zorder": 11}
+        self.axes.add_collection(PolyCollection(list(boxes), gid="log", **style), autolim=False)
+
+    def _moving(self) -> list[Artist]:
+        return [artist for artist in self.axes.get_children() if artist not in self.still]
+
+    def _remove_moving(self) -> None:
+        for artist in self._moving():
+            artist.remove()
+
+
+def _lay_out(panels: Sequence[_Panel], columns: int, size: float) -> Figure:
+    """A figure with the panels settled in it, rows as high as their views need."""
+    lines = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    heights = [size * min(1.0, max(panel.aspect for panel in line)) + HEAD for line in lines]
+    figure = new_figure(size * columns, sum(heights))
+    grid = figure.add_gridspec(len(lines), columns, height_ratios=heights)
+    for row, line in enumerate(lines):
+        for column, panel in enumerate(line):
+            panel.settle(figure.add_subplot(grid[row, column]))
+    return figure
+
+
+def _times(panels: Sequence[_Panel]) -> tuple[NDArray[np.float64], float]:
+    """Seconds after the first step of each frame, the last step's among them, and between two frames."""
+    dt = min(panel.segment.dt for panel in panels)
+    count = 1 + round(max((panel.steps - 1) * panel.segment.dt for panel in panels) / dt)
+    every = -(-count // FRAMES)
+    return np.arange(count - 1, -1, -every)[::-1] * dt, every * dt
+
+
+def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> None:
+    """Write frames [H, W, 3] that follow each other after so many seconds."""
+    # One palette for all: with their own, frames would differ, and flicker, where nothing moves.
+    some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
+    palette = Image.fromarray(some).quantize(COLORS, Image.Quantize.FASTOCTREE)
+    images = [
+        Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE) for pixels in frames
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    images[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1000 * interval),
+        loop=0,
+        optimize=True,
+    )
