@@ -279,7 +279,7 @@ def _light_states(scenes: SceneBatch, scene: Tensor, step: Tensor, light: Tensor
 
 
 def _nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The ``count`` smallest of the last dimension, in no order, and their indices; padded with infinity at index 0."""
+    """The ``count`` smallest of the last dimension, unsorted, and their indices; padded with infinity at index 0."""
     available = min(count, squared.shape[-1])
     if squared.device.type == "cpu" and available < squared.shape[-1]:
         # On the CPU NumPy's selection takes less than half the time of topk.
