@@ -1,6 +1,6 @@
 """Where the time of a search goes: environment, policy, discriminator, and the search itself.
 
-python benchmarks/search_parts.py [--scenes 16] [--branches 16] [--threads 1]
+python benchmarks/search_parts.py [--scenes 16] [--branches 16] [--threads 1] [--prune-every 10]
 
 Untrained networks of the default size on the built-in segments; process time, so that a busy machine counts less.
 """
@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--branches", type=int, default=16)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--points", type=int, default=128)
+    parser.add_argument("--prune-every", type=int, default=10)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     config = TrainConfig(
@@ -74,7 +75,7 @@ def main() -> None:
                 start,
                 seed=0,
                 rule=KeepBest(0.5),
-                prune_every=10,
+                prune_every=arguments.prune_every,
             ).trajectories
 
     once()
