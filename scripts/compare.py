@@ -5,8 +5,8 @@
     python scripts/compare.py table --results DIR
 
 Every step skips what is there already, so an interrupted one goes on when it is called again. To save time, methods
-with tree search start from the networks of the method without it, of the same seed. `symphony table` makes the
-paper's tables of single runs that were evaluated with `symphony evaluate`.
+with tree search start from the networks of the method without it, of the same seed; they learn by the paper's
+halving. `symphony table` makes the paper's tables of single runs that were evaluated with `symphony evaluate`.
 """
 
 from __future__ import annotations
@@ -37,16 +37,19 @@ from symphony.trainers.networks import dynamics_of
 
 METHODS: tuple[Method, ...] = get_args(Method)
 BEFORE = {"bc_ts": "bc", "bc_ts_h": "bc_h", "mgail_ts": "mgail", "mgail_ts_h": "mgail_h"}
+HALVING: dict[str, Any] = {"rule": "best", "prune_every": 10}
+"""The paper's pruning."""
+RARELY = {"search": "tree", "rule": "systematic", "prune_every": 10, "temperature": 0.3}
 OFTEN = {"search": "tree", "rule": "systematic", "prune_every": 2, "temperature": 0.6}
 KINDS: dict[str, dict[str, Any]] = {
     "none": {"search": "none"},
-    "tree": {"search": "tree"},
-    "systematic": {"search": "tree", "rule": "systematic"},
+    "tree": {**HALVING, "search": "tree"},
+    "systematic": RARELY,
     "often": OFTEN,
     "forest": {**OFTEN, "trees": 16, "branches": 4},
-    "small": {"search": "tree", "rule": "systematic", "trees": 4, "branches": 4},
+    "small": {**RARELY, "trees": 4, "branches": 4},
     "best": {"search": "best", "rollouts": 1},
-    "oracle": {"search": "oracle"},
+    "oracle": {**HALVING, "search": "oracle"},
 }
 """Ways to simulate: independent rollouts; the leaves of one tree, halved every two seconds; resampled instead of
 halved; that more often; one leaf each of sixteen such trees of four branches; the leaves of four trees of four
@@ -80,9 +83,9 @@ def settings(arguments: argparse.Namespace, method: Method, seed: int) -> TrainC
         agent=AgentConfig(num_points=128),
         states=512 if searches and not adversarial else 1024,
         learning_rate=arguments.search_rate if searches else 1e-3,
-        search=SearchConfig(segments=8, updates=2)
+        search=SearchConfig(**HALVING, segments=8, updates=2)
         if adversarial
-        else SearchConfig(weight=arguments.weight, survivors=arguments.survivors),
+        else SearchConfig(**HALVING, weight=arguments.weight, survivors=arguments.survivors),
         discriminator=DiscriminatorConfig(features=arguments.features) if judged else DiscriminatorConfig(),
         mgail=mgail,
         warm_start=arguments.runs / run_name(BEFORE[method], seed) if searches else None,

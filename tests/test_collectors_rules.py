@@ -67,6 +67,18 @@ def test_systematic_copies_are_proportional(totals, noise, temperature):
         assert set(parents[0].tolist()) <= set(finite)
 
 
+@given(st.lists(NUMBERS, min_size=1, max_size=17), NOISE)
+def test_systematic_fills_slots_by_rank(totals, noise):
+    totals = torch.tensor([totals])
+    taken = totals.gather(-1, Systematic(100.0)(totals, torch.tensor([noise])))
+    assert (taken.diff(dim=-1) >= 0).all()
+    # Without differences nothing changes, so what follows a segment's end is harmless.
+    level = torch.full_like(totals, 3.0)
+    slots = torch.arange(totals.shape[-1])
+    if 1e-9 < noise < 1 - 1e-9:
+        assert torch.equal(Systematic(100.0)(level, torch.tensor([noise]).double())[0], slots)
+
+
 def test_systematic_is_fair():
     """Averaged over the noise a branch has S w copies."""
     totals = torch.tensor([0.3, 2.0, 0.1, 0.9, 0.3])

@@ -31,7 +31,7 @@ from symphony.trainers.selection import choose
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = pretrained.pretrained_names()
 METHODS = ("bc_ts_h", "mgail_ts_h")
-PRUNING = EvaluateConfig(rule="systematic", prune_every=3)
+PRUNING = EvaluateConfig(rule="best", prune_every=3)
 
 
 def load_script(name: str) -> Any:
@@ -80,7 +80,7 @@ def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.Te
         "--rollouts",
         "2",
         "--rule",
-        "systematic",
+        "best",
         "--prune-every",
         "3",
     ]
@@ -106,8 +106,8 @@ def test_an_agent_is_its_run_without_what_only_training_needs(run: Path, made: P
     assert parts_of(checkpoint) == {"policy", "goals", "discriminator"}
     assert not [name for name in contents(made) if "optimizer" in name]
     own, theirs = load_agent(str(run)), load_agent("pretrained:tiny")
-    assert own.search.rule == "best"
-    assert dataclasses.replace(own.search, rule="systematic", prune_every=3) == theirs.search
+    assert own.search.rule == "systematic"
+    assert dataclasses.replace(own.search, rule="best", prune_every=3) == theirs.search
     assert (own.observation, own.dynamics) == (theirs.observation, theirs.dynamics)
     # Nothing tells on which machine it was made.
     for name, content in contents(made).items():
@@ -137,7 +137,7 @@ def test_the_card_says_what_was_done_and_found(run: Path, made: Path, store: Pat
         "with seed 0",
         f"the run `{read_config(run).warm_start.name}`",  # type: ignore[union-attr]
         "2 updates",
-        "every 3 steps by rule `systematic` (temperature 0.3)",
+        "every 3 steps by rule `best`",
         "which it was not trained with",
         "## Limits",
     ):
@@ -146,7 +146,7 @@ def test_the_card_says_what_was_done_and_found(run: Path, made: Path, store: Pat
 
 def test_scores_of_another_agent_are_refused(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    with pytest.raises(ConfigError, match="of another agent: rule systematic, not best"):
+    with pytest.raises(ConfigError, match="of another agent: rule best, not systematic"):
         make_pretrained.make(str(run), "x", folder=folder)
     (file,) = (run / "evaluations").iterdir()
     record = json.loads(file.read_text())

@@ -367,7 +367,7 @@ def test_neither_discriminator_nor_search_touches_the_goals(
     driven = []
     for kind, judge in (("tree", agent), ("tree", strict), ("oracle", agent), ("best", strict)):
         trees = 1 if kind == "best" else 5
-        config = EvaluateConfig(search=kind, rollouts=5, trees=trees, branches=3)
+        config = EvaluateConfig(search=kind, rollouts=5, trees=trees, branches=3, rule="best")
         goals, state = goals_of(monkeypatch, judge, scenes, config)
         assert torch.equal(goals, reference)
         driven.append(state)

@@ -106,14 +106,14 @@ class SearchConfig:
     """Branches per run segment in training (S)."""
     test_branches: int = 16
     """Branches per run segment in evaluation."""
-    prune_every: int = 10
-    """Steps between prunings (T_p)."""
-    rule: Rule = "best"
+    prune_every: int = 2
+    """Steps between prunings (T_p; 10 in the paper)."""
+    rule: Rule = "systematic"
     """`best`: the better share of the branches survives (the paper); `systematic`: every branch gets copies in
-    proportion to exp(-score / temperature), as in a particle filter."""
+    proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings."""
     keep: float = 0.5
     """Share of the branches that survives a pruning with rule `best`."""
-    temperature: float = 0.3
+    temperature: float = 0.6
     """Of rule `systematic`: the lower, the stricter."""
     segments: int = 16
     """Run segments searched at a time."""

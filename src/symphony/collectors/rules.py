@@ -73,7 +73,8 @@ class Systematic:
     """Systematic resampling with weights softmax(-totals / temperature), as in particle filters.
 
     A branch of weight w gets floor(S w) or ceil(S w) copies, S w on average over the noise; slots are filled in
-    the order of the branches. Softer than truncation: bad branches become rarer instead of extinct.
+    order of rank, so slot 0 holds the best that goes on. Softer than truncation: bad branches become rarer instead
+    of extinct, and branches with equal totals all go on.
 
     Source: Kitagawa, "Monte Carlo filter and smoother", J. Comput. Graph. Stat. 5 (1996).
     """
@@ -99,13 +100,15 @@ class Systematic:
         branches = totals.shape[-1]
         worst = torch.finfo(torch.float64).min / 4
         # float64: in float32 the last of many cumulated weights may stay visibly below one.
-        logits = (-totals.double() / self.temperature).nan_to_num(nan=worst, neginf=worst, posinf=-worst)
+        ranked = totals.argsort(dim=-1, stable=True)
+        logits = (-totals.gather(-1, ranked).double() / self.temperature).nan_to_num(nan=worst, neginf=worst, posinf=-worst)
         cumulative = torch.softmax(logits, -1).cumsum(-1)
         slots = torch.arange(branches, device=totals.device)
         points = (slots + noise.double()[..., None]) / branches
         drawn = torch.searchsorted(cumulative, points * cumulative[..., -1:], right=True)
         # Rounding may carry the last point up to the total, past the last branch that has any weight.
-        return torch.minimum(drawn, (cumulative < cumulative[..., -1:]).sum(-1, keepdim=True))
+        drawn = torch.minimum(drawn, (cumulative < cumulative[..., -1:]).sum(-1, keepdim=True))
+        return ranked.gather(-1, drawn)
 
 
 def group_members(groups: Int[Tensor, "*b S"]) -> Int[Tensor, "*b G M"]:
