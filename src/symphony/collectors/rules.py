@@ -101,7 +101,8 @@ class Systematic:
         worst = torch.finfo(torch.float64).min / 4
         # float64: in float32 the last of many cumulated weights may stay visibly below one.
         ranked = totals.argsort(dim=-1, stable=True)
-        logits = (-totals.gather(-1, ranked).double() / self.temperature).nan_to_num(nan=worst, neginf=worst, posinf=-worst)
+        logits = -totals.gather(-1, ranked).double() / self.temperature
+        logits = logits.nan_to_num(nan=worst, neginf=worst, posinf=-worst)
         cumulative = torch.softmax(logits, -1).cumsum(-1)
         slots = torch.arange(branches, device=totals.device)
         points = (slots + noise.double()[..., None]) / branches
