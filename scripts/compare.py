@@ -6,7 +6,8 @@
 
 Every step skips what is there already, so an interrupted one goes on when it is called again. To save time, methods
 with tree search start from the networks of the method without it, of the same seed; they learn by the paper's
-halving. `symphony table` makes the paper's tables of single runs that were evaluated with `symphony evaluate`.
+halving. With `--before RUNS` every method starts from the run of its own name there, for the paper's settings of 20 s
+(`--duration 20`) and eight interactive agents (`--interactive 8`). `symphony table` makes the paper's tables of single runs that were evaluated with `symphony evaluate`.
 """
 
 from __future__ import annotations
@@ -68,11 +69,14 @@ def settings(arguments: argparse.Namespace, method: Method, seed: int) -> TrainC
     """The configuration of one run."""
     out, searches = arguments.runs / run_name(method, seed), method in BEFORE
     adversarial = method.startswith("mgail")
+    warm = arguments.before / run_name(method, seed) if arguments.before else None
+    if searches and warm is None:
+        warm = arguments.runs / run_name(BEFORE[method], seed)
     steps, mgail = arguments.search_steps if searches else arguments.steps, MGAILConfig()
     if adversarial:
-        regression = 0 if searches else arguments.regression
+        regression = 0 if warm else arguments.regression
         steps = regression + (arguments.adversarial_search_steps if searches else arguments.adversarial_steps)
-        mgail = MGAILConfig(regression=regression, head_start=0 if searches else 50, cost="non_saturating")
+        mgail = MGAILConfig(regression=regression, head_start=0 if warm else 50, cost="non_saturating")
     judged = searches or adversarial
     return TrainConfig(
         method,
@@ -80,15 +84,16 @@ def settings(arguments: argparse.Namespace, method: Method, seed: int) -> TrainC
         out,
         steps=steps,
         seed=seed,
-        agent=AgentConfig(num_points=128),
+        duration=arguments.duration,
+        agent=AgentConfig(num_points=128, interactive=arguments.interactive),
         states=512 if searches and not adversarial else 1024,
-        learning_rate=arguments.search_rate if searches else 1e-3,
-        search=SearchConfig(**HALVING, segments=8, updates=2)
+        learning_rate=arguments.search_rate if warm else 1e-3,
+        search=SearchConfig(**HALVING, segments=arguments.rollout_segments, updates=2)
         if adversarial
         else SearchConfig(**HALVING, weight=arguments.weight, survivors=arguments.survivors),
         discriminator=DiscriminatorConfig(features=arguments.features) if judged else DiscriminatorConfig(),
         mgail=mgail,
-        warm_start=arguments.runs / run_name(BEFORE[method], seed) if searches else None,
+        warm_start=warm,
         checkpoint_every=500 if steps > 1000 else 50,
         resume=(out / "config.json").is_file(),
         wandb="disabled",
@@ -106,7 +111,11 @@ def learn(arguments: argparse.Namespace) -> None:
                 continue
             if config.adversarial not in data:
                 data[config.adversarial] = SceneDataset(
-                    SegmentStore(arguments.data), 2, dynamics_of(config), routes=True
+                    SegmentStore(arguments.data),
+                    config.agent.interactive,
+                    dynamics_of(config),
+                    duration=config.duration,
+                    routes=True,
                 )
             began = time.perf_counter()
             train(config, data[config.adversarial])
@@ -216,6 +225,10 @@ def main() -> None:
     part.add_argument("--regression", type=int, default=2500)
     part.add_argument("--adversarial-steps", type=int, default=300)
     part.add_argument("--adversarial-search-steps", type=int, default=150)
+    part.add_argument("--rollout-segments", type=int, default=8)
+    part.add_argument("--duration", type=int, default=0)
+    part.add_argument("--interactive", type=int, default=2)
+    part.add_argument("--before", type=Path)
     part.add_argument("--search-rate", type=float, default=5e-4)
     part.add_argument("--weight", type=float, default=1.0)
     part.add_argument("--survivors", choices=("all", "best"), default="best")

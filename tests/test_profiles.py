@@ -37,6 +37,12 @@ def test_the_paper_is_followed() -> None:
     assert config.mgail.regression == 0
 
 
+def test_the_settings_of_the_paper_s_tables_are_options_of_every_recipe() -> None:
+    config = settings("bc", "--duration", "20", "--interactive", "8")
+    assert (config.duration, config.agent.interactive) == (20, 8)
+    assert config == settings("bc", "--duration", "20", "--agent.interactive", "8")
+
+
 @pytest.mark.parametrize("given", [["--steps", "7"], ["--steps=7"]])
 @pytest.mark.parametrize("first", [True, False])
 def test_what_is_given_has_precedence(given: list[str], first: bool) -> None:

@@ -10,9 +10,9 @@ import difflib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from symphony.errors import ConfigError
 
@@ -55,7 +55,7 @@ Search = Literal["agent", "none", "tree", "oracle", "best"]
 class AgentConfig:
     """What an agent sees and how large its networks are; saved with its weights."""
 
-    interactive: int = 2
+    interactive: Annotated[int, arg(aliases=("--interactive",))] = 2
     """Interactive agents per run segment (the paper uses 2 and 8)."""
     num_objects: int = 16
     """Nearest other agents it sees."""
