@@ -335,8 +335,8 @@ def _limits(config: TrainConfig, method: str) -> str:
     made = data_name(config.data).partition("/")[0] in PRESETS
     source = (
         "It knows only simulated towns: rule-made driving below about 13 m/s without freeways, pedestrians, "
-        "cyclists, parked cars or mistakes. On real logs it has to be trained further, and even then it is no "
-        "safe driver."
+        "cyclists, parked cars or mistakes. On real logs expect several times more collisions and, on roads "
+        "unlike those, a poor fit; it is no safe driver."
         if made
         else "It knows only driving and maps like those it learned from."
     )
