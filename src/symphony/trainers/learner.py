@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -78,6 +78,8 @@ class Learner:
     ) -> None:
         self.config, self.networks, self.dataset, self.device = config, networks, dataset, device
         self.sees = observation_config(config)
+        # Clearances are costly, and only the discriminator looks at them.
+        self.policy_sees = replace(self.sees, clearance=False, foresight=())
         judge, search_config = config.discriminator, config.search
         self.policy_loss = (
             DistillationLoss(
@@ -130,7 +132,7 @@ class Learner:
                 record |= self._descend("discriminator", losses, "loss_discriminator")
         record |= self._improve_policy(step, items, found, rng)
         if self.goal_loss is not None:
-            goals = self.dataset.sample_goals(items, config.goals, self.sees, rng, self.device)
+            goals = self.dataset.sample_goals(items, config.goals, self.policy_sees, rng, self.device)
             losses = self.goal_loss(goals)
             values = self._descend("goals", losses, "loss_goal")
             record |= {name if "goal" in name else f"goal_{name}": value for name, value in values.items()}
@@ -165,7 +167,7 @@ class Learner:
         """Towards the log, and the survivors or the discriminator's gradient where there are any."""
         config, settings = self.config, self.config.mgail
         if self.mgail_loss is None or found is None:
-            batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
+            batch = self.dataset.sample_states(items, config.states, self.policy_sees, rng, self.device)
             if found is not None:
                 batch = _joined(batch, self._surviving(found, rng))
             return self._descend("policy", self.policy_loss(batch), self.policy_loss.out_keys[0])
@@ -175,7 +177,7 @@ class Learner:
         losses = self.mgail_loss(self._replayed(found, rng))
         total = losses["loss_mgail"]
         if settings.expert_weight:
-            batch = self.dataset.sample_states(items, config.states, self.sees, rng, self.device)
+            batch = self.dataset.sample_states(items, config.states, self.policy_sees, rng, self.device)
             losses.update(self.policy_loss(batch))
             total = total + settings.expert_weight * losses["loss_bc"]
         return self._descend("policy", losses.set("loss_policy", total), "loss_policy")
@@ -268,7 +270,7 @@ class Learner:
         rows = (found.survivors.get(keys.STEP) < last).squeeze(-1).nonzero()
         pick = rows[torch.randint(len(rows), (self.config.search.states,), generator=rng)]
         chosen = found.survivors[tuple(pick.unbind(-1))]
-        batch = found.env.at(chosen)
+        batch = DrivingEnv(found.env.scenes, self.dataset.dynamics, self.policy_sees).at(chosen)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
         rank = found.rank[pick[:, 0], pick[:, 1]]
         batch.set(keys.RANK, rank[:, None].expand(batch.get(keys.VALID).shape))
