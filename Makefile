@@ -25,8 +25,10 @@ demo: $(CORE)  ## learn from the built-in data and write pictures and numbers to
 table: $(CORE)  ## train, judge and compare all eight methods, tiny, in out/table
 	$(BIN)/python scripts/make_table.py --out out/table
 
-test: $(DEV)  ## run the tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile
+
+test: $(DEV)  ## run the tests, in a process per core
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
 
 lint: $(DEV)  ## style, types, imports between packages, file lengths
 	$(BIN)/ruff check
