@@ -7,7 +7,8 @@
 Every step skips what is there already, so an interrupted one goes on when it is called again. To save time, methods
 with tree search start from the networks of the method without it, of the same seed; they learn by the paper's
 halving. With `--before RUNS` every method starts from the run of its own name there, for the paper's settings of 20 s
-(`--duration 20`) and eight interactive agents (`--interactive 8`). `symphony table` makes the paper's tables of single runs that were evaluated with `symphony evaluate`.
+(`--duration 20`) and eight interactive agents (`--interactive 8`). `symphony table` makes the paper's tables of
+single runs that were evaluated with `symphony evaluate`.
 """
 
 from __future__ import annotations
