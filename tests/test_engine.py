@@ -49,8 +49,10 @@ def sleep_or_return(seconds: float) -> int:
 
 
 def alive(pid: int) -> bool:
-    status = Path(f"/proc/{pid}/status")
-    return status.exists() and "State:\tZ" not in status.read_text()
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):  # the latter if it ends between opening and reading
+        return False
 
 
 def gone(pids: list[int]) -> bool:
