@@ -41,17 +41,18 @@ METHODS: tuple[Method, ...] = get_args(Method)
 BEFORE = {"bc_ts": "bc", "bc_ts_h": "bc_h", "mgail_ts": "mgail", "mgail_ts_h": "mgail_h"}
 HALVING: dict[str, Any] = {"rule": "best", "prune_every": 10}
 """The paper's pruning."""
+TREE = {**HALVING, "search": "tree"}
 RARELY = {"search": "tree", "rule": "systematic", "prune_every": 10, "temperature": 0.3}
-OFTEN = {"search": "tree", "rule": "systematic", "prune_every": 2, "temperature": 0.6}
+OFTEN = {**RARELY, "prune_every": 2, "temperature": 0.6}
 KINDS: dict[str, dict[str, Any]] = {
     "none": {"search": "none"},
-    "tree": {**HALVING, "search": "tree"},
+    "tree": TREE,
     "systematic": RARELY,
     "often": OFTEN,
     "forest": {**OFTEN, "trees": 16, "branches": 4},
     "small": {**RARELY, "trees": 4, "branches": 4},
     "best": {"search": "best", "rollouts": 1},
-    "oracle": {**HALVING, "search": "oracle"},
+    "oracle": {**TREE, "search": "oracle"},
 }
 """Ways to simulate: independent rollouts; the leaves of one tree, halved every two seconds; resampled instead of
 halved; that more often; one leaf each of sixteen such trees of four branches; the leaves of four trees of four

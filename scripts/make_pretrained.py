@@ -291,8 +291,7 @@ def _scores(name: str, record: dict[str, Any] | None) -> str:
     trees = "one search tree" if how["trees"] == 1 else f"{how['trees']} search trees"
     ways = {
         "none": f"{how['rollouts']} independent rollouts",
-        "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned "
-        f"{_pruning(how) if how['trees'] else ''}",
+        "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned {_pruning(how)}",
         "oracle": "trees pruned by the true collision and off-road flags",
         "best": f"the best of {how['branches']} independent rollouts by the discriminator",
     }

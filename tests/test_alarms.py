@@ -17,8 +17,9 @@ from torch import Tensor
 
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.cli import main
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
 from symphony.errors import SymphonyError
 from symphony.objectives import BCLoss
 from symphony.trainers import train
@@ -101,9 +102,7 @@ def test_a_run_that_goes_on_rings_as_if_it_had_not_stopped(values: list[float | 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=8))
-        writer.append(crossing(4, seed=0, steps=8))
+    fill(path, [straight_road(4, seed=0, steps=8), crossing(4, seed=0, steps=8)])
     return path
 
 

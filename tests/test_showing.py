@@ -16,8 +16,9 @@ from PIL import Image
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
+from helpers_store import fill
 from symphony.config import EvaluateConfig, ShowConfig, TrainConfig, ValidationConfig, from_dict, to_json
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.render import Clip, curves
@@ -37,19 +38,16 @@ MOTIONS = ("speed", "acceleration", "turn")
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "train"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=9))
-        writer.append(crossing(4, seed=0, steps=7))
-        writer.append(crossing(5, seed=1, steps=8))
+    fill(
+        path, [straight_road(4, seed=0, steps=9), crossing(4, seed=0, steps=7), crossing(5, seed=1, steps=8)]
+    )
     return path
 
 
 @pytest.fixture(scope="module")
 def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "held_out"
-    with StoreWriter(path) as writer:
-        for seed in range(4):
-            writer.append(crossing(6, seed=10 + seed, steps=7))
+    fill(path, [crossing(6, seed=10 + seed, steps=7) for seed in range(4)])
     return path
 
 

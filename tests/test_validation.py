@@ -15,8 +15,9 @@ from torch import nn
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle
 from symphony.errors import ConfigError, DataError
 from symphony.trainers import evaluate, load_agent, train
@@ -32,18 +33,14 @@ from symphony.trainers.validation import METRICS, Validator
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "train"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=14))
-        writer.append(crossing(4, seed=0, steps=12))
+    fill(path, [straight_road(4, seed=0, steps=14), crossing(4, seed=0, steps=12)])
     return path
 
 
 @pytest.fixture(scope="module")
 def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "held_out"
-    with StoreWriter(path) as writer:
-        for seed in range(4):
-            writer.append(crossing(6, seed=10 + seed, steps=16))
+    fill(path, [crossing(6, seed=10 + seed, steps=16) for seed in range(4)])
     return path
 
 
@@ -224,12 +221,9 @@ def test_an_agent_is_judged_without_its_folder(store: Path, held_out: Path, run:
 
 def test_stores_that_cannot_be_used_are_found_before_training(store: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
-    with StoreWriter(few) as writer:
-        writer.append(straight_road(4, steps=14))
-        writer.append(straight_road(1, seed=1, steps=14))
+    fill(few, [straight_road(4, steps=14), straight_road(1, seed=1, steps=14)])
     empty = tmp_path / "empty"
-    with StoreWriter(empty):
-        pass
+    fill(empty, [])
     for data, message in ((few, "interactive"), (empty, "no run segments"), (tmp_path / "none", "none")):
         with pytest.raises(DataError, match=message):
             train(config(store, tmp_path / "run", data))

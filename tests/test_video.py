@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.cli import main
 from symphony.data.segment import RunSegment
-from symphony.data.store import StoreWriter
 from symphony.errors import ConfigError
 from symphony.render import Clip, animate_rollouts
 from symphony.render.video import FRAMES
@@ -173,9 +173,7 @@ def _past_the_end() -> tuple[np.ndarray, np.ndarray, list[int]]:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, steps=5))
-        writer.append(crossing(4, seed=1, steps=7))
+    fill(path, [straight_road(4, steps=5), crossing(4, seed=1, steps=7)])
     return path
 
 
@@ -224,8 +222,7 @@ def test_errors_of_the_rollouts(
 
 
 def test_an_empty_store_has_no_rollouts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with StoreWriter(tmp_path / "store"):
-        pass
+    fill(tmp_path / "store", [])
     options = ["--data", str(tmp_path / "store"), "--out", str(tmp_path / "a.gif")]
     assert main(["plot", "rollouts", "playback", *options]) == 1
     assert "no run segments" in capsys.readouterr().err

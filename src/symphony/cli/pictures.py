@@ -75,10 +75,9 @@ def draw_compared(
 
 def _spread(data: Path, count: int) -> list[int]:
     from symphony.data.store import SegmentStore
+    from symphony.trainers.dataset import spread
 
-    there = len(SegmentStore(data))
-    count = min(count, there)
-    return [i * there // count for i in range(count)]
+    return spread(len(SegmentStore(data)), count)
 
 
 def _clips(
@@ -97,9 +96,8 @@ def _clips(
     from symphony.config import EvaluateConfig
     from symphony.data.store import SegmentStore
     from symphony.trainers.dataset import SceneDataset
-    from symphony.trainers.evaluation import playback, simulated
+    from symphony.trainers.evaluation import driven_by
     from symphony.trainers.showing import clip_of
-    from symphony.trainers.simulate import Rollouts
 
     store = SegmentStore(data)
     dataset = SceneDataset(store, interactive, agent.dynamics, chosen, routes=agent.goals is not None)
@@ -107,9 +105,7 @@ def _clips(
 
     def clip(i: int) -> Clip:
         segment, scene = dataset.segment(i), dataset.scene(i)
-        there = scene.to(torch.device(device))
-        runs = playback(there) if agent.policy is None else simulated(agent, there, config)
-        runs = Rollouts(*(part.cpu() for part in runs))
+        runs = driven_by(agent, scene.to(torch.device(device)), config).cpu()
         return clip_of(segment, scene, runs, title=f"{label}{segment.segment_id}")
 
     return [clip(i) for i in range(len(dataset))]

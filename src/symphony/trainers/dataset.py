@@ -103,6 +103,12 @@ def experts(
     return Experts(torch.from_numpy(rows), states, actions, mask[:, 1:] & mask[:, :-1], error, tables)
 
 
+def spread(total: int, count: int) -> list[int]:
+    """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
+    count = min(count, total)
+    return [k * total // count for k in range(count)]
+
+
 class SceneDataset:
     """Random access to the scenes and experts of a store.
 

@@ -131,7 +131,7 @@ def _evaluate_batch(
     scenes = dataset.scenes(items).to(torch.device(config.device))
     log, log_valid = logged(scenes)
     playing = agent.policy is None
-    rollouts = playback(scenes) if playing else simulated(agent, scenes, config)
+    rollouts = driven_by(agent, scenes, config)
     segments = [dataset.segment(i).segment_id for i in items]
     kinds = _kinds(scenes, rollouts, log_valid if playing else None)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
@@ -247,6 +247,11 @@ def _branches(part: Tensor, order: Tensor) -> Tensor:
     """part [B, trees, S, ...] at the branches order [B, trees, K]."""
     index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
     return part.gather(2, index)
+
+
+def driven_by(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
+    """What an agent does [B, K, ...]: :func:`playback` of the log, or :func:`simulated`."""
+    return playback(scenes) if agent.policy is None else simulated(agent, scenes, config)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:

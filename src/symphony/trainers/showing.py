@@ -17,7 +17,7 @@ from symphony.envs.scene import SceneBatch
 from symphony.geometry.frames import wrap
 from symphony.render import Clip, animate_rollouts
 from symphony.trainers.agents import assemble
-from symphony.trainers.dataset import SceneDataset, logged
+from symphony.trainers.dataset import SceneDataset, logged, spread
 from symphony.trainers.evaluation import simulated
 from symphony.trainers.learner import Learner
 from symphony.trainers.simulate import Rollouts
@@ -68,8 +68,7 @@ class Show:
     """
 
     def __init__(self, config: TrainConfig, learner: Learner, dataset: SceneDataset) -> None:
-        count = min(config.show.segments, len(dataset))
-        self.items = [k * len(dataset) // count for k in range(count)]
+        self.items = spread(len(dataset), config.show.segments)
         self.learner, self.dataset = learner, dataset
         # Before the first update, so that one that can't be used is found then.
         dataset.scenes(self.items)
@@ -90,9 +89,8 @@ class Show:
         device = self.learner.device
         segments, scenes = [self.dataset.segment(i) for i in self.items], self.dataset.scenes(self.items)
         with undisturbed(self.learner.networks, device):
-            rollouts = simulated(self.agent, scenes.to(device), self.how)
+            rollouts = simulated(self.agent, scenes.to(device), self.how).cpu()
             scores = self.learner.scores(step)
-        rollouts = Rollouts(*(part.cpu() for part in rollouts))
         samples = samples_of(scenes, rollouts, [segment.dt for segment in segments])
         samples |= {f"score_{name}": _finite(values.cpu()) for name, values in scores.items()}
         video = self.folder / f"rollout-{step:06d}.gif"

@@ -50,6 +50,10 @@ class Rollouts(NamedTuple):
     offroad: Tensor
     counted: Tensor
 
+    def cpu(self) -> Rollouts:
+        """The same on the CPU."""
+        return Rollouts(*(part.cpu() for part in self))
+
 
 class SeededNoise(TensorDictModuleBase):
     """Gives every agent the random number its next action is decided by.

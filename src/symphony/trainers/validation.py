@@ -12,7 +12,7 @@ from symphony.config import EvaluateConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 from symphony.trainers.agents import assemble
-from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.dataset import SceneDataset, spread
 from symphony.trainers.evaluation import judge
 from symphony.trainers.networks import Networks, dynamics_of
 from symphony.trainers.selection import Best
@@ -42,18 +42,18 @@ class Validator:
         store = SegmentStore(settings.data)
         if len(store) == 0:
             raise DataError("the store holds no run segments", file=store.path)
-        count = min(settings.segments, len(store))
+        chosen = spread(len(store), settings.segments)
         self.dataset = SceneDataset(
             store,
             config.agent.interactive,
             dynamics_of(config),
-            [i * len(store) // count for i in range(count)],
+            chosen,
             routes=config.hierarchical,
             duration=config.duration,
-            keep=count,
+            keep=len(chosen),
         )
         # All scenes are prepared before the first update, so that one that can't be used is found then.
-        for i in range(count):
+        for i in range(len(chosen)):
             self.dataset.scene(i)
         self.agent = assemble(str(config.out), config, networks)
         self.networks, self.device = networks, device
