@@ -35,6 +35,7 @@ from symphony.config import (
 from symphony.data.store import SegmentStore
 from symphony.trainers import evaluate, train
 from symphony.trainers.dataset import SceneDataset
+from symphony.trainers.evaluation import Evaluation
 from symphony.trainers.networks import dynamics_of
 
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -136,22 +137,20 @@ def judge(arguments: argparse.Namespace) -> None:
                 began = time.perf_counter()
                 found = evaluate(str(run), arguments.data, EvaluateConfig(seed=seed, **KINDS[kind]))
                 seconds = time.perf_counter() - began
-                rows = found.metrics.rows()
-                numbers = {k: _short(v) for k, v in found.numbers().items() if k != "agent"}
-                each = {name: [_short(row[name]) for row in rows] for name in COLUMNS[:4]}
+                numbers = measured(found)
                 write_json(
                     result,
-                    {
-                        "method": method,
-                        "seed": seed,
-                        "kind": kind,
-                        "seconds": round(seconds),
-                        **numbers,
-                        "per_segment": {k: json.dumps(v) for k, v in each.items()},
-                    },
+                    {"method": method, "seed": seed, "kind": kind, "seconds": round(seconds), **numbers},
                 )
                 shown = " ".join(f"{name} {numbers[name]}" for name in COLUMNS)
                 print(f"{result.stem}: {shown} ({seconds:.0f} s)", flush=True)
+
+
+def measured(found: Evaluation) -> dict[str, Any]:
+    """What is kept of an evaluation: its figures, and those of every segment for paired comparisons."""
+    rows = found.metrics.rows()
+    each = {name: json.dumps([_short(row[name]) for row in rows]) for name in COLUMNS[:4]}
+    return {**{k: _short(v) for k, v in found.numbers().items() if k != "agent"}, "per_segment": each}
 
 
 def _short(value: Any) -> Any:
@@ -175,7 +174,8 @@ def tabulate(arguments: argparse.Namespace) -> None:
     for (method, kind), rows in sorted(found.items(), key=_order):
         pairs = [(base[row["seed"]], row) for row in rows if row["seed"] in base]
         if pairs and (method, kind) != ("bc", "none"):
-            print(f"{method} {kind}: {_paired(pairs)}")
+            differences = ", ".join(f"{name} {paired(pairs, name)}" for name in COLUMNS[:4])
+            print(f"{method} {kind}: {differences}")
     kinds = ("into_leader", "rear_ended_by_playback", "crossing", "oncoming", "sideswipe", "other")
     print("\n| method | simulated | " + " | ".join(kinds) + " |")
     print("| --- " * (2 + len(kinds)) + "|")
@@ -195,18 +195,15 @@ def _mean(rows: Sequence[dict[str, Any]], name: str, digits: int) -> str:
     return f"{values.mean():.{digits}f} ± {values.std(ddof=1) / len(values) ** 0.5:.{digits}f}"
 
 
-def _paired(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> str:
-    """Differences of segment means over seeds, with the standard error over segments."""
-    parts = []
-    for name in ("collision_rate", "offroad_time", "ade", "min_sade"):
-        rows = [
-            np.array(json.loads(b["per_segment"][name])) - np.array(json.loads(a["per_segment"][name]))
-            for a, b in pairs
-        ]
-        difference = np.mean(rows, 0)
-        error = difference.std(ddof=1) / len(difference) ** 0.5
-        parts.append(f"{name} {difference.mean():+.2f} ± {error:.2f}")
-    return ", ".join(parts)
+def paired(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]], name: str) -> str:
+    """By how much the second of each pair is above the first: the mean over pairs and segments of what was
+    :func:`measured`, and its standard error over segments."""
+    rows = [
+        np.array(json.loads(b["per_segment"][name])) - np.array(json.loads(a["per_segment"][name]))
+        for a, b in pairs
+    ]
+    difference = np.mean(rows, 0)
+    return f"{difference.mean():+.2f} ± {difference.std(ddof=1) / len(difference) ** 0.5:.2f}"
 
 
 def main() -> None:
