@@ -146,7 +146,7 @@ def main() -> None:
     part.add_argument("--start", type=Path, required=True)
     part.add_argument("--runs", type=Path, required=True)
     part.add_argument("--names", nargs="+", choices=VARIATIONS, default=list(VARIATIONS))
-    part.add_argument("--steps", type=int, default=100)
+    part.add_argument("--steps", type=int, default=150)
     part.add_argument("--rollouts", type=int, default=8)
     parts.add_parser("table", parents=[common]).set_defaults(run=tabulate)
     arguments = parser.parse_args()
