@@ -46,6 +46,9 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
     "react": {"mgail": {"react": True}},
 }
 """Of the settings in `BASE` and of those that the start was trained with."""
+START = "start"
+"""Name of the start itself, judged beside them."""
+NAMES = (START, *VARIATIONS)
 LATE = (
     "auc",
     "accuracy_simulated",
@@ -78,30 +81,29 @@ def learn(arguments: argparse.Namespace) -> None:
     """Train and judge what is missing."""
     data: SceneDataset | None = None
     for name in arguments.names:
-        config = settings(arguments.start, name, arguments.runs, arguments.data, arguments.steps)
-        result = arguments.results / f"{config.out.name}.json"
+        method = read_config(arguments.start).method
+        result, run, trained = arguments.results / f"{method}-{name}.json", arguments.start, {}
         if result.is_file():
             continue
-        if data is None:
-            data = SceneDataset(
-                SegmentStore(arguments.data), config.agent.interactive, dynamics_of(config), routes=True
-            )
-        began = time.process_time()
-        train(replace(config, resume=(config.out / "config.json").is_file()), data)
-        seconds = time.process_time() - began
-        metrics = read_metrics(config.out)
-        found = evaluate(str(config.out), arguments.test, EvaluateConfig(rollouts=arguments.rollouts))
-        late = {key: _late(metrics, key) for key in LATE}
-        write_json(
-            result,
-            {"method": config.method, "name": name, "cpu_seconds": round(seconds), **late, **measured(found)},
-        )
+        if name != START:
+            config = settings(arguments.start, name, arguments.runs, arguments.data, arguments.steps)
+            if data is None:
+                store = SegmentStore(arguments.data)
+                data = SceneDataset(store, config.agent.interactive, dynamics_of(config), routes=True)
+            began = time.process_time()
+            run = train(replace(config, resume=(config.out / "config.json").is_file()), data)
+            trained = {"cpu_seconds": round(time.process_time() - began), **_late(read_metrics(run))}
+        found = evaluate(str(run), arguments.test, EvaluateConfig(rollouts=arguments.rollouts))
+        write_json(result, {"method": method, "name": name, **trained, **measured(found)})
         print(result.stem, *(f"{key} {found.numbers()[key]:.3f}" for key in COLUMNS), flush=True)
 
 
-def _late(metrics: list[dict[str, Any]], name: str) -> float:
-    values = [row[name] for row in metrics if row.get(name) is not None]
-    return float(f"{np.mean(values[-max(1, len(values) // 3) :]):.3g}")
+def _late(metrics: list[dict[str, Any]]) -> dict[str, float]:
+    found = {}
+    for name in LATE:
+        values = [row[name] for row in metrics if row.get(name) is not None]
+        found[name] = float(f"{np.mean(values[-max(1, len(values) // 3) :]):.3g}")
+    return found
 
 
 def tabulate(arguments: argparse.Namespace) -> None:
@@ -122,12 +124,17 @@ def tabulate(arguments: argparse.Namespace) -> None:
     columns = (*columns, "AUC", "CPU s")
     print(f"| {' | '.join(columns)} |")
     print("| --- " * len(columns) + "|")
-    for row in sorted(rows, key=lambda row: (row["method"], list(VARIATIONS).index(row["name"]))):
+    for row in sorted(rows, key=lambda row: (row["method"], NAMES.index(row["name"]))):
         numbers = [f"{row[name]:.{digits}f}" for name, digits in zip(COLUMNS, (1, 2, 2, 2, 3), strict=True)]
         for place, name in ((1, "collision_rate"), (4, "ade")):
             apart = paired([(base[row["method"]], row)], name) if row["name"] != "base" else ""
             numbers.insert(place, apart)
-        cells = [row["method"], row["name"], *numbers, f"{row['auc']:.2f}", str(row["cpu_seconds"])]
+        cells = [
+            row["method"],
+            row["name"],
+            *numbers,
+            *(f"{row.get(name, '')}" for name in ("auc", "cpu_seconds")),
+        ]
         print(f"| {' | '.join(cells)} |")
 
 
@@ -145,7 +152,7 @@ def main() -> None:
     part.add_argument("--test", type=Path, required=True)
     part.add_argument("--start", type=Path, required=True)
     part.add_argument("--runs", type=Path, required=True)
-    part.add_argument("--names", nargs="+", choices=VARIATIONS, default=list(VARIATIONS))
+    part.add_argument("--names", nargs="+", choices=NAMES, default=NAMES)
     part.add_argument("--steps", type=int, default=150)
     part.add_argument("--rollouts", type=int, default=8)
     parts.add_parser("table", parents=[common]).set_defaults(run=tabulate)
