@@ -60,7 +60,10 @@ halved; that more often; one leaf each of sixteen such trees of four branches; t
 branches; the best of sixteen independent rollouts by the discriminator; one tree pruned by the true flags.
 """
 DEFAULT_KINDS = dict.fromkeys(("bc", "bc_h", "mgail", "mgail_h"), ("none",))
-COLUMNS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
+COLUMNS = {"collision_rate": 1, "offroad_time": 2, "ade": 2, "min_sade": 2, "curvature_jsd": 3}
+"""Figures of a table, and the digits after their points."""
+EACH = tuple(COLUMNS)[:4]
+"""Those that every segment has."""
 
 
 def run_name(method: str, seed: int) -> str:
@@ -149,7 +152,7 @@ def judge(arguments: argparse.Namespace) -> None:
 def measured(found: Evaluation) -> dict[str, Any]:
     """What is kept of an evaluation: its figures, and those of every segment for paired comparisons."""
     rows = found.metrics.rows()
-    each = {name: json.dumps([_short(row[name]) for row in rows]) for name in COLUMNS[:4]}
+    each = {name: json.dumps([_short(row[name]) for row in rows]) for name in EACH}
     return {**{k: _short(v) for k, v in found.numbers().items() if k != "agent"}, "per_segment": each}
 
 
@@ -167,14 +170,13 @@ def tabulate(arguments: argparse.Namespace) -> None:
     print("| method | simulated | seeds | collision % | off-road % | ADE m | minSADE m | JSD nats |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for (method, kind), rows in sorted(found.items(), key=_order):
-        cells = [_mean(rows, name, digits) for name, digits in zip(COLUMNS, (1, 2, 2, 2, 3), strict=True)]
-        print(f"| {method} | {kind} | {len(rows)} | {' | '.join(cells)} |")
+        print(f"| {method} | {kind} | {len(rows)} | {' | '.join(figures(rows))} |")
     print("\nPaired over segments and seeds, relative to bc (none):")
     base = {row["seed"]: row for row in found.get(("bc", "none"), [])}
     for (method, kind), rows in sorted(found.items(), key=_order):
         pairs = [(base[row["seed"]], row) for row in rows if row["seed"] in base]
         if pairs and (method, kind) != ("bc", "none"):
-            differences = ", ".join(f"{name} {paired(pairs, name)}" for name in COLUMNS[:4])
+            differences = ", ".join(f"{name} {paired(pairs, name)}" for name in EACH)
             print(f"{method} {kind}: {differences}")
     kinds = ("into_leader", "rear_ended_by_playback", "crossing", "oncoming", "sideswipe", "other")
     print("\n| method | simulated | " + " | ".join(kinds) + " |")
@@ -186,6 +188,11 @@ def tabulate(arguments: argparse.Namespace) -> None:
 def _order(item: tuple[tuple[str, str], Any]) -> tuple[int, int]:
     (method, kind), _ = item
     return METHODS.index(method), list(KINDS).index(kind)
+
+
+def figures(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Of a table's row: means over what was :func:`measured`, with standard errors if there are several."""
+    return [_mean(rows, name, digits) for name, digits in COLUMNS.items()]
 
 
 def _mean(rows: Sequence[dict[str, Any]], name: str, digits: int) -> str:

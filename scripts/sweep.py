@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from compare import COLUMNS, measured, paired
+from compare import COLUMNS, figures, measured, paired
 from symphony.cli.tables import write_json
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.store import SegmentStore
@@ -125,7 +125,7 @@ def tabulate(arguments: argparse.Namespace) -> None:
     print(f"| {' | '.join(columns)} |")
     print("| --- " * len(columns) + "|")
     for row in sorted(rows, key=lambda row: (row["method"], NAMES.index(row["name"]))):
-        numbers = [f"{row[name]:.{digits}f}" for name, digits in zip(COLUMNS, (1, 2, 2, 2, 3), strict=True)]
+        numbers = figures([row])
         for place, name in ((1, "collision_rate"), (4, "ade")):
             apart = paired([(base[row["method"]], row)], name) if row["name"] != "base" else ""
             numbers.insert(place, apart)

@@ -1,6 +1,7 @@
 """The scripts that compare methods: every run that they would train has settings that can be trained with."""
 
 import argparse
+import json
 import runpy
 import sys
 from dataclasses import asdict
@@ -43,6 +44,22 @@ def test_a_sweep_changes_what_it_says_and_nothing_else(
         assert {key: changed[key] for key in changed if key not in changes} == {
             key: base[key] for key in base if key not in changes
         }
+
+
+@pytest.mark.parametrize(("name", "results"), [("sweep", "sweep"), ("compare", "mgail")])
+def test_the_tables_in_the_docs_are_printed_again(
+    name: str, results: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables = script(name, monkeypatch)
+    folder = SCRIPTS.parent / "results" / results
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "table", "--results", str(folder)])
+    tables["main"]()
+    printed = capsys.readouterr().out
+    for path in folder.glob("*.json"):
+        row = json.loads(path.read_text())
+        assert f"| {row['method']} | {row.get('kind') or row['name']} |" in printed
+        if name == "sweep":
+            assert f"| {row['collision_rate']:.1f} |" in printed
 
 
 @pytest.mark.parametrize("method", get_args(Method))
