@@ -22,8 +22,8 @@ from symphony.keys import ACTION, NOISE, OBJECTS, OBJECTS_MASK, OWN, POINTS, POI
 from symphony.modules import BoundedDisplacement, ElementGroup, displacement_policy
 from symphony.modules.displacement import INSIDE, SMOOTH
 from symphony.objectives import BCLoss
+from symphony.simulation.rollouts import SeededNoise
 from symphony.streams import uniform
-from symphony.trainers.simulate import SeededNoise
 from test_env import moved
 
 GROUPS = (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
+from symphony.agents.agent import Agent, load_agent
 from symphony.collectors import KeepAll, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
@@ -20,9 +21,8 @@ from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds, collisions, offroad
 from symphony.roadgraph import LaneGraph, visited_curvatures
-from symphony.trainers.agents import Agent, load_agent
-from symphony.trainers.dataset import SceneDataset, logged
-from symphony.trainers.simulate import (
+from symphony.simulation.demonstrations import SceneDataset, logged
+from symphony.simulation.rollouts import (
     Rollouts,
     SeededNoise,
     plant,
@@ -72,7 +72,7 @@ def evaluate(
     """Judge an agent on every run segment of a store (paper, section V-B).
 
     Args:
-        agent: an agent, or the name of one (see :func:`symphony.trainers.load_agent`).
+        agent: an agent, or the name of one (see :func:`symphony.agents.load_agent`).
         data: a store, or its folder.
         config: how.
         progress: called with the segments done and their total.

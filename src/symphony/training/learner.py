@@ -10,14 +10,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from symphony import keys
+from symphony.agents.networks import Networks, observation_config
 from symphony.collectors import BeamSearchResult, KeepAll
 from symphony.config import TrainConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss, auc
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import pruning_rule, search
 from symphony.streams import fold_in
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.networks import Networks, observation_config
-from symphony.trainers.simulate import pruning_rule, search
 
 _SEED_STRIDE = 1_000_003
 _SEEN = (keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE)
