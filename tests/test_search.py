@@ -29,12 +29,12 @@ from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.evaluator import simulated
+from symphony.modules import SeededNoise
 from symphony.simulation import simulate
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.rollouts import (
     ENDED,
     Rollouts,
-    SeededNoise,
     draw_goals,
     flag_score,
     rollouts_of,

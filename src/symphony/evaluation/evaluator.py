@@ -20,11 +20,11 @@ from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds, collisions, offroad
+from symphony.modules import SeededNoise
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.simulation.demonstrations import SceneDataset, logged
 from symphony.simulation.rollouts import (
     Rollouts,
-    SeededNoise,
     plant,
     pruning_rule,
     rollouts_of,
@@ -192,7 +192,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         logged_goals=config.logged_goals,
     )
     if _kind(agent, config) == "none":
-        policy = TensorDictSequential(SeededNoise.of(env, config.seed), agent.policy)
+        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), agent.policy)
         found = simulate(env, policy, start)
     else:
         best = config.search == "best"
