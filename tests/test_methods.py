@@ -27,6 +27,7 @@ from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.envs.routes import POINTS
 from symphony.errors import ConfigError
 from symphony.recipes import train
+from symphony.render import curves
 from symphony.simulation import SearchReplay
 from symphony.simulation.demonstrations import SceneDataset, logged
 from symphony.training import Trainer
@@ -106,6 +107,13 @@ def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
     # Who searches learns from the survivors.
     assert ("policy_nll_rollout" in records[0]) == ("search_offroad_kept" in records[0]) == ("ts" in method)
     assert {name.removeprefix("loss_") for name in records[0] if name.startswith("loss_")} == NETWORKS[method]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
+    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
+    recorded = {name for record in read_metrics(trained(method)) for name in record}
+    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize("method", METHODS)

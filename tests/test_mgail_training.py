@@ -23,6 +23,7 @@ from symphony.envs import Displacement
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate
 from symphony.recipes import train
+from symphony.render import curves
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
@@ -172,6 +173,13 @@ def test_regression_beside_it_and_more_updates_of_the_discriminator(
     half, whole = found
     torch.testing.assert_close(2 * half["loss_regression"], whole["loss_regression"])
     assert half["loss_regression"] != 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
+    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
+    recorded = {name for record in read_metrics(trained(method)) for name in record}
+    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize(("method", "dies_at"), [("mgail", 5), ("mgail_ts_h", 3)])
