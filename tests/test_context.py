@@ -267,7 +267,12 @@ def test_choices_are_counted_and_named() -> None:
 @pytest.mark.parametrize("tile", [1, 60, 5 * STEPS, 3 * STEPS**2])
 def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
     cars = scene(
-        [(NORTH, 30 * TIME + 50), (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60), (EAST, 15 * TIME + 120), (NORTH, 80)]
+        [
+            (NORTH, 30 * TIME + 50),
+            (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60),
+            (EAST, 15 * TIME + 120),
+            (NORTH, 80),
+        ]
     )
     segments = [cars, crossing(6, steps=60, seed=3), straight_road(9, steps=40)]
     whole = [relations(each, np.arange(1, each.num_agents)) for each in segments]

@@ -59,6 +59,8 @@ class Convert:
             raise ConfigError("no files given")
         if not self.rate > 0:
             raise ConfigError(f"--rate must be positive, is {self.rate}")
+        if not 0.2 <= self.rate <= 200:
+            raise ConfigError(f"--rate must be between 0.2 and 200 steps per second, is {self.rate:g}")
         if self.interactive < 1:
             raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
         if not self.smooth >= 0:
@@ -142,6 +144,43 @@ class Info:
             _print_info(found)
 
 
+@app.command(name="verify")
+@dataclass(frozen=True)
+class Verify:
+    """Read a whole store and compare every segment with the hash that was written with it, and with the schema.
+
+    Training and evaluation do so for each segment when they first read it.
+    """
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of the store."""
+    json: bool = False
+    """Print the result as JSON."""
+
+    def run(self) -> None:
+        """Verify, showing how far it is, and print."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from symphony.data.store import SegmentStore
+
+        store = SegmentStore(self.store)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("segments"),
+        )
+        with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+            task = bar.add_task("Verifying", total=len(store))
+            store.verify(lambda done, total: bar.update(task, completed=done, total=total))
+        found = {"path": str(store.path), "segments": len(store), "checksum": store.checksum()}
+        if self.json:
+            _write(jsonlib.dumps(found, indent=2))
+        else:
+            _write(f"{len(store)} segments are what was written; checksum {found['checksum']}")
+
+
 @app.command(name="plot")
 @dataclass(frozen=True)
 class Plot:
@@ -196,6 +235,8 @@ def _print_report(report: Any, out: Path) -> None:
         table.add_row(f"excluded: {reason}", str(count))
     for reason, count in report.problems.items():
         table.add_row(f"skipped: {escape(reason)}", str(count))
+    for reason, count in report.odd.items():
+        table.add_row(f"odd: {escape(reason)}", str(count))
     Console().print(table)
 
 
@@ -243,6 +284,7 @@ def _print_info(found: dict[str, Any]) -> None:
         *((f"  {reason}", str(count)) for reason, count in _exclusions(found["exclusions"])),
         ("skipped", f"{sum(found['problems'].values())}"),
         *((f"  {reason}", str(count)) for reason, count in found["problems"].items()),
+        *(("odd: " + what, str(count)) for what, count in found["odd"].items()),
         *_unfinished_row(found["unfinished"]),
     ]
     table = Table(

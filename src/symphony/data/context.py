@@ -142,21 +142,20 @@ class _Meeting:
                 found._add(segment, others, slice(a, a + group), slice(t, t + rows))
         return found
 
-    def _add(
-        self, segment: RunSegment, others: NDArray[np.integer[Any]], group: slice, steps: slice
-    ) -> None:
+    def _add(self, segment: RunSegment, others: NDArray[np.integer[Any]], group: slice, steps: slice) -> None:
         """Look at some of the others [k] and some of the ego's steps [t]."""
         along, shared, crossing = _places(segment, others[group], steps, self.spacing[steps])
         time = np.arange(segment.num_steps) * segment.dt
-        gap = time - time[steps, None]  # from the ego's step to the other's; negative where that is there first
+        # From the ego's step to the other's; negative where that is there first.
+        gap = time - time[steps, None]
         for field, where, value in (
             (self.before, shared & (gap < 0), -gap),
             (self.after, shared & (gap > 0), gap),
             (self.crossing, crossing, np.abs(gap)),
         ):
             field[group] = np.minimum(field[group], np.where(where, value, np.inf).min((1, 2)))
-        there = shared.any(2)
-        new = np.flatnonzero(there.any(1) & ~self.shared[group].any(1))
+        there = np.asarray(shared.any(axis=2))
+        new = np.flatnonzero(there.any(axis=1) & ~self.shared[group].any(axis=1))
         mine = there[new].argmax(1)
         theirs = np.where(shared[new, mine], along[new, mine], np.inf).argmin(1)
         self.first[group][new] = np.stack([steps.start + mine, theirs], -1)

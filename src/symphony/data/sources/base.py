@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,13 +45,15 @@ class Reader(ABC):
         try:
             if path.is_dir():
                 raise DataError("is a folder, expected a file", file=path)
+            if path.exists() and not path.is_file():
+                raise DataError("is no ordinary file", file=path)  # a pipe may never end
             for item in self._read(path):
                 yield self._checked(item, path)
         except DataError as error:
             yield error.at(file=path)
         except OSError as error:
             yield DataError(f"can't be read: {error.strerror or error}", file=path)
-        except Exception as error:  # noqa: BLE001 - one bad file must not end a conversion
+        except Exception as error:  # one bad file must not end a conversion
             yield unexpected(error, file=path)
 
     def companions(self, path: Path) -> tuple[Path, ...]:
@@ -65,7 +68,7 @@ class Reader(ABC):
             return validate(item)
         except DataError as error:
             return DataError(error.message, file=path, segment=error.segment, field=error.field)
-        except Exception as error:  # noqa: BLE001 - arrays of other kinds than a segment has
+        except Exception as error:  # arrays of other kinds than a segment has
             return unexpected(error, file=path, segment=item.segment_id)
 
     @abstractmethod
@@ -87,9 +90,13 @@ def read_whole(path: Path) -> bytes:
         OSError: it can't be read.
     """
     with path.open("rb") as file:
-        data = file.read(MAX_FILE + 1)
-    if len(data) > MAX_FILE:
-        raise DataError(f"more than {MAX_FILE >> 20} MiB: too large for a file of this format", file=path)
+        size = os.fstat(file.fileno()).st_size
+        if size > MAX_FILE:
+            message = f"{size} bytes, at most {MAX_FILE}: too large for a file of this format"
+            raise DataError(message, file=path)
+        data = file.read(size + 1)
+    if len(data) > size:
+        raise DataError("grew while it was read", file=path)
     return data
 
 

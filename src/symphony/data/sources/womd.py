@@ -84,7 +84,7 @@ class WomdReader(Reader):
         except DataError as error:
             field = f"{record}, {error.field}" if error.field else record
             return DataError(error.message, file=path, segment=name, field=field)
-        except Exception as error:  # noqa: BLE001 - the other records of the file are still to be read
+        except Exception as error:  # the other records of the file are still to be read
             return unexpected(error, file=path, segment=name)
 
 
