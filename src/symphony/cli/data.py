@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from symphony.cli.generate import Generate, Quality
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, printable
 
 app = tyro.extras.SubcommandApp()
 app.command(name="generate")(Generate)
@@ -203,7 +203,9 @@ class Plot:
         from symphony.data.selection import interactive_choice
         from symphony.data.store import SegmentStore
         from symphony.render import plot_segment
+        from symphony.render.style import picture_path
 
+        picture_path(self.out)
         store = SegmentStore(self.store)
         segment = store[segment_index(store, self.segment)]
         if not 0 <= self.step < segment.num_steps:
@@ -221,12 +223,18 @@ def _write(text: str) -> None:
     print(text)  # noqa: T201
 
 
+def _shown(text: str) -> str:
+    """Text from files for a table: neither markup nor what a terminal acts on."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
 def _print_report(report: Any, out: Path) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
-    table = Table("", "segments", title=escape(str(out)), title_justify="left", title_style="bold")
+    table = Table("", "segments", title=_shown(str(out)), title_justify="left", title_style="bold")
     table.columns[1].justify = "right"
     table.add_row("converted", str(report.converted))
     if report.present:
@@ -234,9 +242,9 @@ def _print_report(report: Any, out: Path) -> None:
     for reason, count in _exclusions(report.exclusions):
         table.add_row(f"excluded: {reason}", str(count))
     for reason, count in report.problems.items():
-        table.add_row(f"skipped: {escape(reason)}", str(count))
+        table.add_row(f"skipped: {_shown(reason)}", str(count))
     for reason, count in report.odd.items():
-        table.add_row(f"odd: {escape(reason)}", str(count))
+        table.add_row(f"odd: {_shown(reason)}", str(count))
     Console().print(table)
 
 
@@ -255,7 +263,6 @@ def _unfinished_row(found: dict[str, int] | None) -> list[tuple[str, str]]:
 
 def _print_info(found: dict[str, Any]) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     def span(name: str, unit: str = "") -> str:
@@ -288,11 +295,11 @@ def _print_info(found: dict[str, Any]) -> None:
         *_unfinished_row(found["unfinished"]),
     ]
     table = Table(
-        show_header=False, box=None, pad_edge=False, title=escape(found["path"]), title_style="bold"
+        show_header=False, box=None, pad_edge=False, title=_shown(found["path"]), title_style="bold"
     )
     table.title_justify = "left"
     for name, value in rows:
-        table.add_row(escape(name), escape(value))
+        table.add_row(_shown(name), _shown(value))
     Console().print(table)
 
 

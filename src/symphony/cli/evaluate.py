@@ -41,6 +41,10 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate, print the numbers and write them."""
+        if self.figure is not None:
+            from symphony.render.style import ANIMATIONS, FORMATS, picture_path
+
+            picture_path(self.figure, (*FORMATS, *ANIMATIONS))
         found = judge(self.agent, self.data, self.config)
         print_metrics(found.rows, title=str(self.data))
         if self.keep:

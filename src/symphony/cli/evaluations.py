@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from symphony.cli.tables import json_text
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
+from symphony.files import write_text
 
 if TYPE_CHECKING:
     from symphony.data.store import SegmentStore
@@ -152,14 +152,8 @@ def simulation_name(config: dict[str, Any]) -> str:
 def keep_evaluation(run: Path, record: dict[str, Any]) -> Path:
     """Write an evaluation into the folder of its run and return the file."""
     file = run / FOLDER / f"{evaluation_name(record)}.json"
-    file.parent.mkdir(exist_ok=True)
     # An interrupted write must not leave half a file where a table looks for a whole one.
-    unfinished = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        unfinished.write_text(json_text(record), encoding="utf-8")
-        unfinished.replace(file)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_text(file, json_text(record))
     return file
 
 

@@ -13,6 +13,7 @@ from symphony.cli.comparison import collect, compare
 from symphony.cli.formats import FORMATS, Format, print_text
 from symphony.cli.paper import Dataset, Setting
 from symphony.errors import ConfigError
+from symphony.files import write_text
 
 NAMED = 5
 """Runs left out for the same reason that are named."""
@@ -54,8 +55,7 @@ class Table:
             sys.stderr.write(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}\n")
         comparison = compare(entries, self.setting, self.paper)
         if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(FORMATS[self.format](comparison), encoding="utf-8")
+            write_text(self.out, FORMATS[self.format](comparison))
         elif self.format == "text" and (console := Console()).is_terminal:
             print_text(comparison, console)
         else:

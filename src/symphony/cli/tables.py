@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from symphony.files import write_text
+
 COLUMNS = (
     ("collision_rate", "collision\n%", 1),
     ("offroad_time", "off-road\n%", 1),
@@ -67,8 +69,7 @@ def _cell(value: float, error: float | None, digits: int) -> str:
 
 def write_json(path: Path, result: Any) -> None:
     """Write a result as JSON; numbers that are not finite become null."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json_text(result), encoding="utf-8")
+    write_text(path, json_text(result))
 
 
 def json_text(result: Any) -> str:

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.errors import DataError
+from symphony.files import naming
 
 try:
     import fcntl
@@ -203,11 +204,12 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Replace a JSON file in one step, so that no reader sees half of it."""
     draft = path.with_name(path.name + ".tmp")
-    with draft.open("w", encoding="utf-8") as file:
-        json.dump(value, file, indent=1, ensure_ascii=False, default=str)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
+    with naming(path):
+        with draft.open("w", encoding="utf-8") as file:
+            json.dump(value, file, indent=1, ensure_ascii=False, default=str)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
 
 
 def read_index(folder: Path, table: Table, limit: int | None = None) -> NDArray[Any]:
@@ -374,7 +376,8 @@ class TableWriter:
     def sync(self) -> None:
         """Bring everything to the disk, columns before the index."""
         for file in (*self._files.values(), self._index):
-            os.fsync(file.fileno())
+            with naming(file.name):
+                os.fsync(file.fileno())
 
     def close(self) -> None:
         """Bring everything to the disk, and write no more."""
@@ -402,6 +405,7 @@ def lock(folder: Path) -> BinaryIO:
 
 def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:
     data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-    file.seek(offset)
-    while data:
-        data = data[file.write(data) :]
+    with naming(file.name):
+        file.seek(offset)
+        while data:
+            data = data[file.write(data) :]

@@ -25,6 +25,7 @@ from symphony.data import store_format
 from symphony.data.report import Report, Skip
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError, DataError
+from symphony.files import naming
 
 FORMAT, VERSION = "symphony conversion", 1
 JOURNAL, STORE, PARTS = "journal.jsonl", "store", "parts"
@@ -175,9 +176,10 @@ class Draft:
         self._told = len(report.skipped)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        self._journal.write(json.dumps(line, ensure_ascii=False, default=str).encode() + b"\n")
-        self._journal.flush()
-        os.fsync(self._journal.fileno())
+        with naming(self.folder / JOURNAL):
+            self._journal.write(json.dumps(line, ensure_ascii=False, default=str).encode() + b"\n")
+            self._journal.flush()
+            os.fsync(self._journal.fileno())
 
     def finish(self, report: Report) -> None:
         """Give the store its name, or add what was collected to the store that is there; then tidy up."""
@@ -221,7 +223,13 @@ class Draft:
 
 
 def folder_of(out: Path) -> Path:
-    """Where the unfinished conversion into a store lies."""
+    """Where the unfinished conversion into a store lies.
+
+    Raises:
+        DataError: the root of a file system can't be a store.
+    """
+    if not out.name:
+        raise DataError("no place for a store: it has no name of its own", file=out)
     return out.with_name(out.name + store_format.PARTIAL)
 
 
