@@ -19,13 +19,12 @@ from helpers_sources import ROAD, commonroad, driver
 from helpers_store import fill
 from symphony import cli
 from symphony.cli import main
-from symphony.cli.tables import write_json
 from symphony.data.convert import convert
 from symphony.data.sources.base import Item
 from symphony.data.sources.sumo import process
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import DataError, printable
-from symphony.files import replacing, write_text
+from symphony.files import replacing, write_file, write_json
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -73,13 +72,12 @@ def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
                 assert str(caught.value.filename).startswith(str(tmp_path / "store"))
                 FULL.filename = None
             for write in (
-                lambda: write_text(tmp_path / "a.json", "{}"),
+                lambda: write_file(tmp_path / "a.json", "{}"),
                 lambda: write_json(tmp_path / "a.json", {}),
             ):
-                with pytest.raises(OSError, match="No space left") as caught:
+                with pytest.raises(DataError, match="No space left") as error:
                     write()
-                assert caught.value.filename == str(tmp_path / "a.json")
-                FULL.filename = None
+                assert error.value.file == tmp_path / "a.json"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["store"]
 
 
@@ -108,7 +106,7 @@ def test_a_column_on_a_full_disk_is_named(tmp_path: Path) -> None:
 
 def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
     path = tmp_path / "new" / "a.json"
-    write_text(path, "one")
+    write_file(path, "one")
 
     def fail() -> None:
         with replacing(path) as draft:
@@ -121,16 +119,26 @@ def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
     assert [each.name for each in path.parent.iterdir()] == ["a.json"]
     link = tmp_path / "link.json"
     link.symlink_to(path)
-    write_text(link, "three")
+    write_file(link, "three")
     assert link.is_symlink()
     assert path.read_text() == "three"
+
+
+def test_drafts_of_killed_processes_are_removed(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    names = (f".a.{dead.pid}.new.json", f".a.{os.getppid()}.new.json", f".b.{dead.pid}.new.json")
+    for name in names:
+        (tmp_path / name).touch()
+    write_file(tmp_path / "a.json", "{}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], "a.json"])
 
 
 def test_what_is_no_file_is_written_to(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    write_text(pipe, "text")
+    write_file(pipe, "text")
     assert os.read(reader, 10) == b"text"
     os.close(reader)
     assert pipe.is_fifo()

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.errors import DataError
-from symphony.files import naming
+from symphony.files import locating
 
 try:
     import fcntl
@@ -204,7 +204,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Replace a JSON file in one step, so that no reader sees half of it."""
     draft = path.with_name(path.name + ".tmp")
-    with naming(path):
+    with locating(path):
         with draft.open("w", encoding="utf-8") as file:
             json.dump(value, file, indent=1, ensure_ascii=False, default=str)
             file.flush()
@@ -252,7 +252,7 @@ def check_columns(folder: Path, table: Table, records: NDArray[Any]) -> bool:
         Whether one holds more: a writer is at work or has died, or the index was cut short.
 
     Raises:
-        DataError: naming the first column that is missing or too short.
+        DataError: locating the first column that is missing or too short.
     """
     rows, more = ends(records, table), False
     for column in table.columns:
@@ -376,7 +376,7 @@ class TableWriter:
     def sync(self) -> None:
         """Bring everything to the disk, columns before the index."""
         for file in (*self._files.values(), self._index):
-            with naming(file.name):
+            with locating(file.name):
                 os.fsync(file.fileno())
 
     def close(self) -> None:
@@ -405,7 +405,7 @@ def lock(folder: Path) -> BinaryIO:
 
 def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:
     data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-    with naming(file.name):
+    with locating(file.name):
         file.seek(offset)
         while data:
             data = data[file.write(data) :]

@@ -25,7 +25,7 @@ from symphony.data import store_format
 from symphony.data.report import Report, Skip
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError, DataError
-from symphony.files import naming
+from symphony.files import locating
 
 FORMAT, VERSION = "symphony conversion", 1
 JOURNAL, STORE, PARTS = "journal.jsonl", "store", "parts"
@@ -51,7 +51,7 @@ class Job:
         """Refuse to go on with a conversion that was begun otherwise.
 
         Raises:
-            ConfigError: naming the first setting that differs.
+            ConfigError: locating the first setting that differs.
         """
         names = dict.fromkeys([*begun.settings, *self.settings])
         pairs = [(name, begun.settings.get(name), self.settings.get(name)) for name in names]
@@ -176,7 +176,7 @@ class Draft:
         self._told = len(report.skipped)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        with naming(self.folder / JOURNAL):
+        with locating(self.folder / JOURNAL):
             self._journal.write(json.dumps(line, ensure_ascii=False, default=str).encode() + b"\n")
             self._journal.flush()
             os.fsync(self._journal.fileno())

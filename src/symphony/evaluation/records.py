@@ -13,14 +13,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from symphony.cli.tables import json_text
+from symphony.agents.choice import choose, split_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
-from symphony.files import write_text
+from symphony.files import write_json
 
 if TYPE_CHECKING:
+    from symphony.agents import Agent
     from symphony.data.store import SegmentStore
-    from symphony.trainers import Agent, Evaluation
+    from symphony.evaluation import Evaluation
 
 FORMAT = 1
 """Version of a kept evaluation."""
@@ -74,8 +75,6 @@ def evaluation_record(
 
 
 def _run_facts(name: str) -> dict[str, Any] | None:
-    from symphony.trainers.selection import choose, split_name
-
     folder, which = split_name(name)
     if not (folder / "config.json").is_file():
         return None
@@ -153,7 +152,7 @@ def keep_evaluation(run: Path, record: dict[str, Any]) -> Path:
     """Write an evaluation into the folder of its run and return the file."""
     file = run / FOLDER / f"{evaluation_name(record)}.json"
     # An interrupted write must not leave half a file where a table looks for a whole one.
-    write_text(file, json_text(record))
+    write_json(file, record)
     return file
 
 
