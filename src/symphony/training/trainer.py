@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import random
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from symphony.agents.agent import read_config
-from symphony.agents.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
+from symphony.agents.checkpoint import (
+    MANIFEST,
+    CheckpointError,
+    latest,
+    load_checkpoint,
+    parts_of,
+    prune,
+    save_checkpoint,
+)
 from symphony.agents.choice import Best, choose, split_name
 from symphony.agents.networks import Networks, build_networks, dynamics_of
 from symphony.config import TrainConfig, to_json
@@ -75,7 +85,10 @@ def _train(config: TrainConfig, dataset: SceneDataset | None, world: Processes) 
     if config.hierarchical and not dataset.routes:
         raise ConfigError(f"method {config.method} needs a dataset with routes")
     done = _find(config)
+    # All three are kept with checkpoints, so that those of equal runs are equal files.
     torch.manual_seed(config.seed)
+    random.seed(config.seed)
+    np.random.seed(config.seed % 2**32)  # noqa: NPY002
     networks = build_networks(config)
     if config.warm_start is not None and done is None:
         _warm_start(networks, config.warm_start)
@@ -122,7 +135,10 @@ class _Loop:
         if done is not None:
             loaded = load_checkpoint(done, modules=self.modules, optimizers=self.learner.optimizers)
             step = loaded.step
-            self._restore(loaded.extra)
+            try:
+                self._restore(loaded.extra)
+            except CheckpointError as error:
+                raise error.at(file=done / MANIFEST) from error
         self.world.share(self.learner)
         self.alarms = Alarms()
         if self.world.leads:
@@ -225,12 +241,14 @@ class _Loop:
 
     def _restore(self, extra: Mapping[str, Any]) -> None:
         before = extra.get("processes", 1)
+        if type(before) is not int or before < 1:
+            raise CheckpointError("no number of processes", field="extra.processes")
         if before != self.world.count:
             raise ConfigError(
                 f"{self.config.out}: trained by {before} processes so far, can't be resumed by {self.world.count}"
             )
         self.best = Best.of(extra)
-        self.skips = Skips(**extra.get("skips", {}))
+        self.skips = Skips.of(extra)
         if self.validator is not None:
             self.validator.best = self.best
 
