@@ -8,9 +8,11 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import Positional, arg
 
@@ -385,7 +387,8 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, file: Path | None = No
     """Build a configuration from what :func:`to_json` wrote.
 
     Raises:
-        ConfigError: for an unknown format or name (with the nearest known one), or a missing field.
+        ConfigError: for an unknown format or name (with the nearest known one), a missing field, or a value of
+            another type.
     """
     where = f"{file}: " if file is not None else ""
     values = dict(values)
@@ -406,13 +409,32 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, file: Path | None = No
         "show": ShowConfig,
     }
     built = {}
+    kinds = get_type_hints(kind)
     for name, value in values.items():
         if name in nested and isinstance(value, dict):
             built[name] = from_dict(nested[name], value, file=file)
         else:
+            if not _fits(value, kinds[name]):
+                raise ConfigError(f"{where}'{name}' can't be {str(value)[:40]!r}")
             is_path = "Path" in str(fields[name].type) and value is not None
             built[name] = Path(value) if is_path else value
     try:
         return kind(**built)
     except TypeError as error:
         raise ConfigError(f"{where}{error}") from error
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value read from JSON is one of a field of that type."""
+    origin, options = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return any(_fits(value, option) for option in options)
+    if origin is Literal:
+        return any(type(value) is type(option) and value == option for option in options)
+    if origin in (tuple, list):
+        return isinstance(value, list) and all(_fits(item, options[0]) for item in value)
+    if kind is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    if kind is int:
+        return type(value) is int and -(2**63) <= value < 2**63
+    return isinstance(value, str) if kind is Path else kind is Any or type(value) is kind

@@ -105,6 +105,8 @@ def read_config(folder: Path) -> TrainConfig:
         )
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid JSON ({error})") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: not a JSON object")
     return from_dict(TrainConfig, values, file=path)

@@ -240,7 +240,7 @@ def _runs_below(folder: Path) -> list[Path]:
 def _read_object(file: Path) -> dict[str, Any]:
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"not valid JSON ({error})", file=file) from error
     if not isinstance(value, dict):
         raise DataError("not a JSON object", file=file)
