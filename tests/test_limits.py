@@ -123,6 +123,14 @@ def test_argoverse_rows_and_texts_beyond_all_measure(tmp_path: Path) -> None:
         assert "500001 rows" in read_error("argoverse2", path).message
 
 
+def test_argoverse_columns_of_lists(tmp_path: Path) -> None:
+    helpers = pytest.importorskip("helpers_argoverse2", exc_type=ImportError)
+    columns = helpers.scenario()
+    columns["track_id"] = [[name] for name in columns["track_id"]]
+    error = read_error("argoverse2", helpers.write(tmp_path, columns))
+    assert (error.field, error.message) == ("track_id", "expected text, is list<element: string>")
+
+
 def test_a_reader_that_fails_does_not_end_the_conversion(tmp_path: Path) -> None:
     helpers = pytest.importorskip("helpers_argoverse2", exc_type=ImportError)
     files = []

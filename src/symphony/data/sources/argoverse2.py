@@ -144,6 +144,9 @@ def read_columns(data: bytes) -> Columns:
         missing = [name for name in _COLUMNS if name not in schema.names]
         if missing:
             raise DataError("the column is missing", field=missing[0])
+        for name, kind in _COLUMNS.items():
+            if pa.types.is_nested(schema.field(name).type):
+                raise DataError(f"expected {kind}, is {schema.field(name).type}", field=name)
         # Text stays a dictionary: a long one that all rows share must not become a copy for each.
         texts = [name for name, kind in _COLUMNS.items() if kind == _TEXT]
         source = pa.BufferReader(data)
