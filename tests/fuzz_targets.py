@@ -360,25 +360,27 @@ def _load_checkpoint(folder: Path, _: str) -> tuple[str, str]:
 
 
 def _configuration() -> Files:
-    from symphony.config import TrainConfig, to_json
+    from symphony.config import AgentSpec, DiscriminatorConfig, TrainConfig, to_json
 
-    return {"config.json": to_json(TrainConfig("mgail_ts_h", Path("data"), Path("out"))).encode()}
+    run = TrainConfig(method="mgail_ts_h", data=Path("data"), out=Path("out"))
+    spec = AgentSpec(action_space="bicycle", dt=0.2, discriminator=DiscriminatorConfig(), searches=True)
+    return {"config.json": to_json(run).encode(), "agent.json": to_json(spec).encode()}
 
 
-def _change_all(rng: Rng, files: Files) -> Files:
-    return {name: change.json_(rng, data) for name, data in files.items()}
+def _change_one(rng: Rng, files: Files) -> Files:
+    name = change.pick(rng, list(files))
+    return {**files, name: change.json_(rng, files[name])}
 
 
 def _read_configuration(folder: Path, _: str) -> tuple[str, str]:
-    from symphony.agents.agent import read_config
-    from symphony.config import to_json
-    from symphony.errors import SymphonyError
+    from symphony.config import AgentSpec, TrainConfig, read_json, to_json
+    from symphony.errors import ConfigError
 
     try:
-        config = read_config(folder)
-    except SymphonyError:
+        for kind, name in ((TrainConfig, "config.json"), (AgentSpec, "agent.json")):
+            to_json(read_json(kind, folder / name))
+    except ConfigError:
         return REFUSED, ""
-    to_json(config)
     return ACCEPTED, ""
 
 
@@ -388,5 +390,5 @@ TARGETS: dict[str, Target] = {
     "argoverse2": reader("argoverse2", _argoverse2),
     "store": Target(functools.cache(_store), _change_store, _read_store),
     "checkpoint": Target(functools.cache(_checkpoint), _change_checkpoint, _load_checkpoint),
-    "configuration": Target(functools.cache(_configuration), _change_all, _read_configuration),
+    "configuration": Target(functools.cache(_configuration), _change_one, _read_configuration),
 }

@@ -14,7 +14,6 @@ import pytest
 import torch
 from torch import nn
 
-from helpers_runs import tiny
 from helpers_segments import crossing
 from helpers_store import fill
 from symphony.agents.checkpoint import (
@@ -26,8 +25,8 @@ from symphony.agents.checkpoint import (
 )
 from symphony.agents.choice import choose
 from symphony.agents.fitting import match_optimizer
-from symphony.config import ValidationConfig
-from symphony.training import train
+from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig, ValidationConfig
+from symphony.recipes import train
 from symphony.training.alarms import Skips
 
 
@@ -190,9 +189,25 @@ def store(tmp_path: Path) -> Path:
     return tmp_path / "store"
 
 
+def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
+    """The smallest run."""
+    small: dict[str, Any] = {
+        "agent": AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        "search": SearchConfig(branches=2, prune_every=4, segments=2, updates=2, states=8, test_branches=2),
+        "discriminator": DiscriminatorConfig(hidden=8, head=8, states=8),
+        "steps": 4,
+        "segments": 2,
+        "states": 16,
+        "checkpoint_every": 2,
+        "log_every": 1,
+        "wandb": "disabled",
+    }
+    return TrainConfig(method=method, data=store, out=out, **small | changes)
+
+
 @pytest.mark.parametrize("at", ["best", "skips", "processes"])
 def test_what_a_run_keeps_is_looked_at_when_it_goes_on(at: str, store: Path, tmp_path: Path) -> None:
-    judged = ValidationConfig(store, segments=1, rollouts=1)
+    judged = ValidationConfig(data=store, segments=1, rollouts=1)
     train(tiny("bc", store, tmp_path / "run", validation=judged))
     file = checkpoints(tmp_path / "run" / "checkpoints")[-1] / MANIFEST
     good = json.loads(file.read_text())
