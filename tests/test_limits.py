@@ -15,12 +15,14 @@ from helpers_convert import FakeReader
 from helpers_sources import ROAD, commonroad, driver, obstacle, read_error, state, womd_scenario
 from symphony.data import convert as converting
 from symphony.data.convert import convert
+from symphony.data.generate import Plan, generate
 from symphony.data.segment import RunSegment
 from symphony.data.sources import get_reader, tfrecord
 from symphony.data.sources.base import Item
 from symphony.data.sources.lines import drivable_rings
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.store import SegmentStore
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.unfinished import folder_of
 from symphony.errors import ConfigError, DataError
 
 
@@ -238,3 +240,39 @@ def test_reports_that_are_none(tmp_path: Path) -> None:
         path.write_text(json.dumps(good | {key: value}))
         with pytest.raises(DataError, match="not a conversion report"):
             converting.info(tmp_path / "out")
+
+
+def test_journals_that_are_none(tmp_path: Path) -> None:
+    (tmp_path / "a.scene").write_text("straight 1\ninterrupt")
+    with pytest.raises(KeyboardInterrupt):
+        convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "out")
+    journal = folder_of(tmp_path / "out") / "journal.jsonl"
+    head = json.loads(journal.read_text().splitlines()[0])
+    line = {"files": 1, "converted": 1, "present": 0, "segments": 1, "skipped": []}
+    assert json.dumps(head["job"]["files"][0]) in journal.read_text()
+    for change in (
+        {"files": 2},
+        {"files": "1"},
+        {"converted": -1},
+        {"segments": True},
+        {"odd": 3},
+        {"skipped": [1]},
+    ):
+        journal.write_text(json.dumps(head) + "\n" + json.dumps(line | change) + "\n")
+        with pytest.raises(DataError, match="not the journal") as caught:
+            convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "out")
+        assert caught.value.file == journal
+    for text in ("[]", '{"job": 3}', json.dumps(head | {"job": {"files": [1]}}), "[" * 100_000):
+        journal.write_text(text + "\n")
+        with pytest.raises(DataError, match="not the journal"):
+            convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "out")
+
+
+def test_generations_that_are_none(tmp_path: Path) -> None:
+    pytest.importorskip("sumo", reason="SUMO is not installed (pip install 'symphony[sumo]')")
+    plan = Plan(3)
+    with StoreWriter(tmp_path / "out") as writer:
+        for found in (3, {"networks": "x"}, {"reasons": []}, {"complete": 1}):
+            writer.write_report({"settings": plan.settings(), "generation": found})
+            with pytest.raises(DataError, match="how far a generation is"):
+                generate(plan, tmp_path / "out")

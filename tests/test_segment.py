@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import crossing, hide, random_segment, segments, straight_road
-from symphony.data.bounds import oddities
+from symphony.data.bounds import line_length, oddities
 from symphony.data.segment import Polylines, RunSegment, content_hash, validate
 from symphony.errors import DataError
 
@@ -300,6 +300,7 @@ ABSURD = {
     "road.lanes": lambda s: _road(s, "lanes", 1e30),
     "road.boundary": lambda s: _road(s, "boundary", 30_000),
     "road.marks": lambda s: _road(s, "marks", 1e6),
+    "road": lambda s: _many(s.replace(segment_id="many")),
     "road.speed_limit": lambda s: s.replace(
         road=dataclasses.replace(s.road, speed_limit=s.road.speed_limit * np.float32(1e6))
     ),
@@ -310,6 +311,14 @@ def _moved(position: NDArray[Any], metres: float) -> NDArray[Any]:
     moved = position.copy()
     moved[1, 3:, 0] += metres
     return moved
+
+
+def _many(segment: RunSegment) -> RunSegment:
+    """The same mark, from one end of the map to the other, again and again."""
+    line = np.array([[-15_000, 0], [15_000, 0]])
+    marks = Polylines.of([line] * 170)
+    road = dataclasses.replace(segment.road, marks=marks, mark_type=np.ones(170, np.uint8))
+    return segment.replace(road=road)
 
 
 def _road(segment: RunSegment, name: str, metres: float) -> RunSegment:
@@ -335,3 +344,10 @@ def test_odd_values_are_named() -> None:
     for odd, word in ((fast, "faster"), (small, "under 0.2 m"), (jumping, "jumps")):
         (found,) = oddities(validate(odd))
         assert word in found
+
+
+def test_gaps_between_lines_are_no_length() -> None:
+    segment = random_segment(seed=3, lanes=3, marks=3)
+    for lines in (segment.road.lanes, segment.road.boundary, segment.road.marks, Polylines.of([])):
+        expected = sum(np.hypot(*np.diff(line[:, :2].astype(float), axis=0).T).sum() for line in lines)
+        assert line_length(lines) == pytest.approx(expected)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from symphony.errors import DataError
 
 if TYPE_CHECKING:
-    from symphony.data.segment import RoadMap, RunSegment
+    from symphony.data.segment import Polylines, RoadMap, RunSegment
 
 MAX_COORDINATE = 20_000.0
 """Metres from the origin beyond which float32 no longer resolves a millimetre; segments must be re-centred."""
@@ -45,6 +45,8 @@ MAX_STATES = 2_000_000
 """Agents times steps."""
 MAX_POINTS = 1_000_000
 """Points of a map."""
+MAX_LENGTH = 5e6
+"""Metres of all lines of a map."""
 MAX_FILE = 128 << 20
 """Bytes of a file that is read as a whole (CommonRoad, Argoverse 2)."""
 
@@ -128,6 +130,9 @@ def _road_checks(road: RoadMap) -> Iterator[Check]:
         height = _largest(points[:, 2])
         message = f"a height of {height:.4g} m, at most {MAX_HEIGHT:g}"
         yield f"road.{name}", height <= MAX_HEIGHT, message
+    lines = (road.lanes, road.boundary, road.marks)
+    length = sum(map(line_length, lines))
+    yield "road", length <= MAX_LENGTH, f"{length:.4g} m of lines, at most {MAX_LENGTH:g}"
     for name, most in (("speed_limit", MAX_SPEED), ("lane_width", MAX_WIDTH)):
         array = getattr(road, name)
         yield _most(f"road.{name}", array[~np.isnan(array)], most, f"more than {most:g}")
@@ -154,6 +159,13 @@ def _jumps(s: RunSegment) -> NDArray[np.float64]:
     """[A, T - 1] metres from each step to the next, 0 where an agent is not valid at both."""
     way = np.hypot(*np.moveaxis(np.diff(s.position[..., :2].astype(np.float64), axis=1), -1, 0))
     return np.where(s.valid[:, 1:] & s.valid[:, :-1], way, 0.0)
+
+
+def line_length(lines: Polylines) -> float:
+    """Metres of all lines."""
+    sides = np.hypot(*np.diff(lines.points[:, :2].astype(np.float64), axis=0).T)
+    owner = lines.line_index
+    return float(sides[owner[1:] == owner[:-1]].sum())
 
 
 def _largest(array: NDArray[Any]) -> float:

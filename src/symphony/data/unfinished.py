@@ -251,17 +251,19 @@ def read_journal(folder: Path) -> Begun | None:
         if head["format"] != FORMAT or head["version"] != VERSION:
             message = f"a {head['format']} of version {head['version']}; this release knows version {VERSION}"
             raise DataError(message, file=path)
-        job = Job(**head["job"] | {"files": [(name, size) for name, size in head["job"]["files"]]})
+        job = Job(**head["job"] | {"files": [(str(name), int(size)) for name, size in head["job"]["files"]]})
         report, segments, finished = Report(settings=dict(job.settings)), 0, False
         for line in lines:
             if "finished" in line:
                 finished = True
                 continue
-            report.files, report.converted = line["files"], line["converted"]
-            report.present, segments = line["present"], line["segments"]
-            report.odd = line.get("odd", {})
+            counts = [line[name] for name in ("files", "converted", "present", "segments")]
+            if not all(type(count) is int and count >= 0 for count in counts) or counts[0] > len(job.files):
+                raise ValueError(f"{counts} are no counts of {len(job.files)} files")
+            report.files, report.converted, report.present, segments = counts
+            report.odd = dict(line.get("odd", {}))
             report.skipped += [Skip(**skip) for skip in line["skipped"]]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(f"not the journal of a conversion: {error}", file=path) from error
     return Begun(job, report, segments, finished, size)
 
