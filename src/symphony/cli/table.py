@@ -11,6 +11,7 @@ import tyro
 
 from symphony.config import Method, PaperData, Setting, TableFormat
 from symphony.errors import ConfigError
+from symphony.files import write_file
 
 NAMED = 5
 """Runs left out for the same reason that are named."""
@@ -61,8 +62,7 @@ class Table:
             for difference in differences(entries, self.paired):
                 sys.stderr.write(f"{difference.text()}\n")
         if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(FORMATS[self.format](comparison), encoding="utf-8")
+            write_file(self.out, FORMATS[self.format](comparison))
         elif self.format == "text" and (console := Console()).is_terminal:
             print_text(comparison, console)
         else:
