@@ -15,6 +15,7 @@ _READERS = {
     "argoverse2": ("symphony.data.sources.argoverse2", "Argoverse2Reader"),
     "commonroad": ("symphony.data.sources.commonroad", "CommonRoadReader"),
     "interaction": ("symphony.data.sources.interaction", "InteractionReader"),
+    "scenarionet": ("symphony.data.sources.scenarionet", "ScenarioNetReader"),
     "womd": ("symphony.data.sources.womd", "WomdReader"),
 }
 

@@ -26,8 +26,10 @@ def evenly(line: Doubles, count: int) -> Doubles:
     return np.stack([np.interp(where, along, line[:, k]) for k in range(2)], axis=-1)
 
 
-def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple[Doubles, ...]:
-    """Closed rings [P, 2] around the union of outlines, the inside on the left; holes run the other way.
+def drivable_rings(
+    outlines: Sequence[Doubles | shapely.Polygon], field: str = "lanelet"
+) -> tuple[Doubles, ...]:
+    """Closed rings [P, 2] around the union of outlines or polygons, inside on the left; holes run the other way.
 
     Slits and holes up to 2 * :data:`SLIT` wide are closed.
 
@@ -35,7 +37,7 @@ def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple
         DataError: the union can't be formed; ``field`` says where the outlines come from.
     """
     try:
-        polygons = shapely.make_valid(np.array([shapely.Polygon(outline) for outline in outlines]))
+        polygons = shapely.make_valid(np.array([shapely.Polygon(outline) for outline in outlines], object))
         union = shapely.union_all(polygons)
         closed = union.buffer(SLIT, join_style="mitre").buffer(-SLIT, join_style="mitre").simplify(0.01)
     except shapely.errors.ShapelyError as error:
