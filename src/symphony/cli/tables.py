@@ -22,6 +22,8 @@ KINDS = (
     ("crossing", "crossing"),
     ("oncoming", "oncoming"),
     ("sideswipe", "sideswipe"),
+    ("pedestrian", "into a pedestrian"),
+    ("cyclist", "into a cyclist"),
     ("other", "other"),
 )
 """Kinds of first collision (see :class:`symphony.metrics.CollisionKind`) and their words."""
@@ -48,7 +50,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     first = rows[0]
     for row in rows:
         if row["collision_rate"] > 0 and "collision_into_leader" in row:
-            parts = ", ".join(f"{row[f'collision_{kind}']:.1f} {text}" for kind, text in KINDS)
+            parts = ", ".join(f"{row[name]:.1f} {text}" for name, text in _kinds_of(row))
             console.print(f"{escape(str(row['agent']))}: collisions, % of rollouts: {parts}", style="dim")
     most = max(row["rollouts"] for row in rows)
     console.print(
@@ -56,6 +58,11 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
         f"rollouts; ± standard error over segments; seed {first['seed']}",
         style="dim",
     )
+
+
+def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
+    """Names and words of the kinds a row has; older results know no pedestrians and cyclists."""
+    return [(f"collision_{kind}", text) for kind, text in KINDS if f"collision_{kind}" in row]
 
 
 def _cell(value: float, error: float | None, digits: int) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 
 from symphony.data import store_format
 from symphony.data.engine import Engine
+from symphony.data.overlaps import tags
 from symphony.data.parts import Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip
 from symphony.data.report import Report, Skip
 from symphony.data.sources import Reader, get_reader
@@ -41,6 +42,7 @@ def convert(
     interactive: int = 2,
     smooth: float = 0.0,
     append: bool = False,
+    exclude_overlaps: bool = False,
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
@@ -62,6 +64,8 @@ def convert(
         interactive: interactive agents a segment must have at its first step (N_I).
         smooth: sigma in seconds of the smoothing of tracks before they are resampled; 0 for none.
         append: add to the store if there is one, skipping the segments it holds.
+        exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`); they
+            are counted either way.
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
             depend on it.
@@ -84,13 +88,14 @@ def convert(
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
+    settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
     paths = expand(files, reader.patterns)
     draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
     with closing(draft):
         report = draft.report
         try:
             if not draft.finished:
-                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before)
+                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps)
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:
                 draft.finish(report)
@@ -191,9 +196,13 @@ class _Run:
             try:
                 if isinstance(outcome, Stored):
                     writer.copy(outcome.store, outcome.index)
+                    overlaps = outcome.overlaps
                 else:
-                    writer.append(outcome)
+                    found = tags(outcome)
+                    writer.append(outcome, tags=found)
+                    overlaps = found is not None
                 self.report.converted += 1
+                self.report.overlaps += overlaps
             except DataError as error:
                 self.report.skipped.append(skip(error, path, outcome.segment_id))
 
@@ -241,8 +250,9 @@ def info(path: str | Path) -> dict[str, Any]:
     Returns:
         Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each),
         ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
-        many of these under each of the paper's), ``problems`` (the reasons of the others) and ``unfinished``
-        (None, or how far a conversion is that will add to the store).
+        many of these under each of the paper's), ``problems`` (the reasons of the others), ``groups`` (recordings the
+        segments are of), ``overlaps`` (segments in whose log boxes overlap) and ``unfinished`` (None, or how far a
+        conversion is that will add to the store).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -261,6 +271,8 @@ def info(path: str | Path) -> dict[str, Any]:
         "exclusions": report.exclusions,
         "reasons": report.reasons,
         "problems": report.problems,
+        "overlaps": report.overlaps,
+        "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),
     }

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from symphony.data import overlaps
 from symphony.data import resample as resampling
 from symphony.data.engine import Engine, ordered_map
 from symphony.data.report import Skip
@@ -41,6 +42,11 @@ class Stored:
         """Its id."""
         return self.store.ids[self.index]
 
+    @property
+    def overlaps(self) -> bool:
+        """Whether boxes overlap in its log."""
+        return overlaps.TAG in self.store.tags(self.index)
+
 
 Outcome = RunSegment | Stored | Skip | None
 """What became of a record; None where the store held the segment before."""
@@ -56,6 +62,7 @@ class Recipe:
         sigma: of the smoothing in seconds, 0 for none.
         interactive: interactive agents a segment must have (N_I).
         before: path of the store that is added to, and the segments it held; their ids are passed over.
+        exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
     """
 
     reader: Reader
@@ -63,6 +70,7 @@ class Recipe:
     sigma: float
     interactive: int
     before: tuple[str, int] | None = None
+    exclude_overlaps: bool = False
 
     def outcomes(self, path: str) -> Iterator[Outcome]:
         """One for each record of a file, in its order."""
@@ -85,6 +93,9 @@ class Recipe:
         excluded = exclusion(segment, self.interactive)
         if excluded is not None:
             return skip(excluded[1], path, segment.segment_id, excluded[0])
+        if self.exclude_overlaps and (pairs := len(overlaps.overlapping(segment))):
+            found = DataError(f"the boxes of {pairs} pairs of agents overlap in the log", field="agents")
+            return skip(found, path, segment.segment_id, overlaps.TAG)
         return segment
 
 
@@ -162,7 +173,7 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
         if writer.has(outcome.segment_id):
             return writer.index_of(outcome.segment_id)
         try:
-            return writer.append(outcome)
+            return writer.append(outcome, tags=overlaps.tags(outcome))
         except DataError as error:
             outcome = skip(error, file, outcome.segment_id)
     return outcome.to_json() if isinstance(outcome, Skip) else PRESENT

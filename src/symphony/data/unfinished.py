@@ -170,7 +170,7 @@ class Draft:
         """Put on record that ``report.files`` files are done; this survives whatever comes."""
         writer.sync()
         skipped = [skip.to_json() for skip in report.skipped[self._told :]]
-        counts = {name: getattr(report, name) for name in ("files", "converted", "present")}
+        counts = {name: getattr(report, name) for name in ("files", "converted", "present", "overlaps")}
         self._write(counts | {"segments": len(writer), "skipped": skipped})
         self._told = len(report.skipped)
 
@@ -251,6 +251,7 @@ def read_journal(folder: Path) -> Begun | None:
                 continue
             report.files, report.converted = line["files"], line["converted"]
             report.present, segments = line["present"], line["segments"]
+            report.overlaps = line.get("overlaps", 0)
             report.skipped += [Skip(**skip) for skip in line["skipped"]]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"not the journal of a conversion: {error}", file=path) from error
