@@ -38,7 +38,7 @@ def test_readers_are_found_by_name() -> None:
             assert get_reader(name).name == name
     with pytest.raises(ConfigError, match="did you mean 'womd'"):
         get_reader("wmod")
-    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, womd"):
+    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, interaction, scenarionet, womd"):
         get_reader("?")
     with pytest.raises(ConfigError, match="'egoes'"):
         get_reader("commonroad", egoes="all")
