@@ -256,7 +256,10 @@ def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
         if files.phases is None or files.topology is None:
             raise DataError("its signal phases, or the one *_map.kml that goes with them, are missing")
         lines = [center(lane) for lane in lanes]
-        lights = read_lights(files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection)
+        until = int(rows.time.max())
+        lights = read_lights(
+            files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection, until
+        )
     reach = np.abs(np.concatenate([lane.ring for lane in lanes]) - origin).max(axis=0)
     away = np.hypot(*np.maximum(np.abs(rows.state[:, :2] - origin) - reach, 0).T)
     if float(np.median(away)) > FAR:

@@ -23,6 +23,8 @@ from symphony.errors import DataError
 
 START, END = 3.0, 8.0
 """Metres by which a lane's start and end may miss those of a connection."""
+LATE = 5000
+"""Milliseconds by which the phases may end before the tracks (in the one real recording: 1200)."""
 
 _KML = "{http://www.opengis.net/kml/2.2}"
 _STATES = {
@@ -78,7 +80,12 @@ NO_LIGHTS = Lights(np.zeros(0, np.int32), np.zeros((0, 2)), (), ())
 
 
 def read_lights(
-    phases: Path, topology: Path, lanes: Sequence[Doubles], entered: Sequence[int], projection: Projection
+    phases: Path,
+    topology: Path,
+    lanes: Sequence[Doubles],
+    entered: Sequence[int],
+    projection: Projection,
+    until: int,
 ) -> Lights:
     """Read both files and find the lane of each connection.
 
@@ -92,12 +99,17 @@ def read_lights(
         lanes: centre lines [P, 2] in metres.
         entered: indices of the lanes that have a predecessor.
         projection: of the map.
+        until: milliseconds at which the tracks end.
 
     Raises:
-        DataError: a file can't be read, or no light belongs to any lane.
+        DataError: a file can't be read, the phases end more than :data:`LATE` before the tracks, or no light belongs
+            to any lane.
     """
     try:
         groups = read_phases(phases)
+        end = min(int(times[-1]) for times, _ in groups.values())
+        if end < until - LATE:
+            raise DataError(f"end at {end} ms, the tracks at {until} ms", field="timestamp_ms")
     except DataError as error:
         raise error.at(file=phases) from error
     connections = read_connections(topology, projection)
