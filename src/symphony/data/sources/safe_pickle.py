@@ -128,6 +128,12 @@ def _encode(text: Any, encoding: Any) -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes(*arguments: Any) -> bytes:
+    if arguments:
+        raise pickle.UnpicklingError("makes bytes of something")
+    return b""
+
+
 def _never(*_: Any) -> Any:
     raise pickle.UnpicklingError("makes an array by itself")
 
@@ -139,8 +145,9 @@ _NAMES: dict[tuple[str, str], Any] = {
     **{(f"numpy.{core}.multiarray", n): _Named(f) for core in ("core", "_core") for n, f in _NUMPY.items()},
     **{(f"numpy.{core}.numeric", "_frombuffer"): _Named(_from_buffer) for core in ("core", "_core")},
     ("_codecs", "encode"): _Named(_encode),
-    # How protocols before 4 write sets.
+    # How early protocols write sets and empty bytes.
     **{(module, "set"): _Named(set) for module in ("builtins", "__builtin__")},
+    **{(module, "bytes"): _Named(_no_bytes) for module in ("builtins", "__builtin__")},
 }
 
 
