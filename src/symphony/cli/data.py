@@ -56,6 +56,9 @@ class Convert:
     motion: Literal["logged", "positions"] = "logged"
     """INTERACTION: take velocities and headings as logged, or compute them from the positions (for files that are
     refused because theirs don't fit)."""
+    radius: float | None = None
+    """Keep what comes within so many metres of the ego's path, of map and agents: for sources that give whole
+    districts, whose maps would exceed the paper's limit (ScenarioNet)."""
     exclude_overlaps: bool = False
     """Leave out segments in whose log a moving vehicle's box overlaps another box."""
     append: bool = False
@@ -77,6 +80,8 @@ class Convert:
             raise ConfigError(f"--smooth must not be negative, is {self.smooth}")
         if self.workers < 1:
             raise ConfigError(f"--workers must be at least 1, is {self.workers}")
+        if self.radius is not None and not self.radius > 0:
+            raise ConfigError(f"--radius must be positive, is {self.radius}")
         if self.egos == "all" and self.format not in {"commonroad", "interaction"}:
             raise ConfigError(
                 f"--egos all is for commonroad and interaction; {self.format} names its ego vehicle"
@@ -118,6 +123,7 @@ class Convert:
                     workers=self.workers,
                     engine=self.engine,
                     exclude_overlaps=self.exclude_overlaps,
+                    radius=self.radius,
                     reader_options=self._options(),
                     progress=show,
                 )

@@ -43,6 +43,7 @@ def convert(
     smooth: float = 0.0,
     append: bool = False,
     exclude_overlaps: bool = False,
+    radius: float | None = None,
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
@@ -66,6 +67,7 @@ def convert(
         append: add to the store if there is one, skipping the segments it holds.
         exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`); they
             are counted either way.
+        radius: metres around the ego's path that are kept, of map and agents; None for all.
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
             depend on it.
@@ -82,20 +84,21 @@ def convert(
         DataError: ``out`` exists already, or not one segment could be converted.
         SymphonyError: a worker process died; what is done stays, as after an interrupt.
     """
-    _check_arguments(rate, interactive, smooth, workers)
+    _check_arguments(rate, interactive, smooth, workers, radius)
     out = Path(out).absolute()
     options = dict(reader_options or {})
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
+    settings |= {} if radius is None else {"radius": radius}
     paths = expand(files, reader.patterns)
     draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
     with closing(draft):
         report = draft.report
         try:
             if not draft.finished:
-                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps)
+                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius)
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:
                 draft.finish(report)
@@ -108,7 +111,11 @@ def convert(
     raise _nothing(report)
 
 
-def _check_arguments(rate: float, interactive: int, smooth: float, workers: int) -> None:
+def _check_arguments(
+    rate: float, interactive: int, smooth: float, workers: int, radius: float | None
+) -> None:
+    if radius is not None and not 0 < radius < math.inf:
+        raise ConfigError(f"radius must be positive, is {radius}")
     if not 0 < rate < math.inf:
         raise ConfigError(f"rate must be positive, is {rate}")
     if not 0 <= smooth < math.inf:

@@ -17,6 +17,7 @@ from typing import Any
 
 from symphony.data import overlaps
 from symphony.data import resample as resampling
+from symphony.data.crop import crop
 from symphony.data.engine import Engine, ordered_map
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
@@ -63,6 +64,7 @@ class Recipe:
         interactive: interactive agents a segment must have (N_I).
         before: path of the store that is added to, and the segments it held; their ids are passed over.
         exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
+        radius: metres around the ego's path that are kept (see :mod:`symphony.data.crop`); None for all.
     """
 
     reader: Reader
@@ -71,6 +73,7 @@ class Recipe:
     interactive: int
     before: tuple[str, int] | None = None
     exclude_overlaps: bool = False
+    radius: float | None = None
 
     def outcomes(self, path: str) -> Iterator[Outcome]:
         """One for each record of a file, in its order."""
@@ -88,6 +91,8 @@ class Recipe:
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
             segment = resampling.resample(segment, self.dt)
+            if self.radius is not None:
+                segment = crop(segment, self.radius)
         except DataError as error:
             return skip(error, path, segment.segment_id)
         excluded = exclusion(segment, self.interactive)
