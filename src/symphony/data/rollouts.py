@@ -40,9 +40,10 @@ def read_rollouts(file: Path) -> RolloutArrays:
         DataError: the file is damaged or something is missing or of a wrong kind; names file and field.
     """
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise DataError("is one array, expected an .npz archive of several", file=file)
+        archive = np.load(file, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise DataError("is one array, expected an .npz archive of several", file=file)
+        with archive:
             return _read(archive, file)
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
         raise DataError(f"not an .npz archive, or damaged: {error}", file=file) from None

@@ -31,6 +31,11 @@ _FLAGS = {
     "traffic_light_violation": "traffic_light_violation_per_step",
 }
 """Features that the yes-or-no components come from."""
+_RATES = {
+    "simulated_collision_rate": "collision_per_step",
+    "simulated_offroad_rate": "offroad_per_step",
+    "simulated_traffic_light_violation_rate": "traffic_light_violation_per_step",
+}
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025
     weights = {name: component.weight for name, component in config.components.items()}
     displacement = features.simulated.average_displacement_error
     rates = {
-        name: _ever(features, flag, vehicles=False)[1].float().mean().item() for name, flag in _FLAGS.items()
+        name: _ever(features, flag, vehicles=False)[1].float().mean().item() for name, flag in _RATES.items()
     }
     return WosacScores(
         metametric=sum(weights[name] * value for name, value in likelihoods.items()),
@@ -109,10 +114,30 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025
         buckets={bucket: _mean(likelihoods, weights, names) for bucket, names in BUCKETS.items()},
         average_displacement_error=displacement.mean().item(),
         min_average_displacement_error=displacement.mean(-1).amin().item(),
-        simulated_collision_rate=rates["collision_indication"],
-        simulated_offroad_rate=rates["offroad_indication"],
-        simulated_traffic_light_violation_rate=rates["traffic_light_violation"],
+        **rates,
     )
+
+
+def object_scores(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025) -> list[dict[str, Any]]:
+    """What each scored object adds: the likelihoods of its own log, its errors and the shares of its rollouts.
+
+    The score of the scenario is no mean of these: a scenario's likelihoods take all objects' steps together. NaN where
+    the object has no step to score.
+    """
+    parts: dict[str, list[Any]] = {
+        "object_id": features.object_id.tolist(),
+        "object_type": features.object_type.tolist(),
+    }
+    for name, values in log_likelihoods(features, config).items():
+        mask = component_mask(features, name).view(len(values), -1)
+        total = torch.where(mask, values.view(len(values), -1), 0.0).sum(-1)
+        parts[f"{name}_likelihood"] = (total / mask.sum(-1)).exp().tolist()
+    displacement = features.simulated.average_displacement_error
+    parts["average_displacement_error"] = displacement.mean(0).tolist()
+    parts["min_ade"] = displacement.amin(0).tolist()
+    for name, flag in _RATES.items():
+        parts[name] = _ever(features, flag, vehicles=False)[1].float().mean(0).tolist()
+    return [{name: values[k] for name, values in parts.items()} for k in range(len(features.object_id))]
 
 
 def log_likelihoods(features: WosacFeatures, config: WosacConfig) -> dict[str, Tensor]:
