@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from symphony.cli.tables import write_json
+from symphony.cli.wosac_files import ScenarioScore, score_files, summary
 from symphony.errors import ConfigError
-
-if TYPE_CHECKING:
-    from symphony.trainers.wosac import ScenarioScore
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,6 @@ class Score:
 
     def run(self) -> None:
         """Score, showing how far it is, and report."""
-        from symphony.trainers.wosac import summary
-
         results = self._score()
         found = summary(results, self.config)
         _print(found)
@@ -60,8 +56,6 @@ class Score:
     def _score(self) -> list[ScenarioScore]:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        from symphony.trainers.wosac import score_files
 
         columns = (TextColumn("Scoring"), BarColumn(), MofNCompleteColumn(), TextColumn("scenarios"))
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:

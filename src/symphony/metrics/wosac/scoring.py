@@ -121,8 +121,8 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025
 def object_scores(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025) -> list[dict[str, Any]]:
     """What each scored object adds: the likelihoods of its own log, its errors and the shares of its rollouts.
 
-    The score of the scenario is no mean of these: a scenario's likelihoods take all objects' steps together. NaN where
-    the object has no step to score.
+    The score of the scenario is no mean of these: a scenario's likelihoods take all objects' steps together. NaN
+    where the object has no step to score.
     """
     parts: dict[str, list[Any]] = {
         "object_id": features.object_id.tolist(),

@@ -5,31 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from symphony.data.engine import ordered_map
-from symphony.data.rollouts import read_rollouts
-from symphony.data.sources.wosac import (
-    parse_scenario,
-    read_scenario_payloads,
-    scenario_arrays,
-    scenario_files,
-)
 from symphony.errors import DataError
-from symphony.metrics.wosac import (
-    CHALLENGES,
-    SimulatedRollouts,
-    WosacFeatures,
-    WosacScenario,
-    WosacScores,
-    compute_features,
-    mean_scores,
-    object_scores,
-    score_features,
-)
-from symphony.metrics.wosac.config import ROLLOUTS
+
+if TYPE_CHECKING:
+    from symphony.metrics.wosac import WosacFeatures, WosacScores
 
 _NAMED = 5
 
@@ -95,6 +76,8 @@ def score_files(
     Raises:
         DataError: something can't be scored; names file, scenario, agent and field.
     """
+    from symphony.data.engine import ordered_map
+
     if features is not None:
         features.mkdir(parents=True, exist_ok=True)
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
@@ -111,6 +94,18 @@ def score_files(
 
 def score_task(task: ScoreTask) -> ScenarioScore:
     """Score one scenario."""
+    from symphony.data.rollouts import read_rollouts
+    from symphony.data.sources.wosac import parse_scenario, scenario_arrays
+    from symphony.metrics.wosac import (
+        CHALLENGES,
+        SimulatedRollouts,
+        WosacScenario,
+        compute_features,
+        object_scores,
+        score_features,
+    )
+    from symphony.metrics.wosac.config import ROLLOUTS
+
     scenario_id = None
     try:
         record = parse_scenario(task.payload, task.file, task.record)
@@ -138,6 +133,8 @@ def score_task(task: ScoreTask) -> ScenarioScore:
 
 def summary(results: list[ScenarioScore], config: str) -> dict[str, Any]:
     """The mean over scenarios and every scenario's own scores, as JSON can hold it."""
+    from symphony.metrics.wosac import mean_scores
+
     return {
         "config": config,
         "scenario_count": len(results),
@@ -150,6 +147,8 @@ def write_features(file: Path, features: WosacFeatures) -> None:
     """Write features as arrays: ``eval_object_id`` [E], ``log_valid`` [E, 80], and each feature of the log
     (``log_NAME``) and of the rollouts (``sim_NAME``, with a leading dimension of rollouts).
     """
+    import numpy as np
+
     arrays = {
         f"{prefix}_{field.name}": getattr(source, field.name).numpy()
         for prefix, source in (("log", features.log), ("sim", features.simulated))
@@ -167,6 +166,8 @@ def write_features(file: Path, features: WosacFeatures) -> None:
 
 def _pairs(scenarios: Path, rollouts: Path, partial: bool) -> Iterator[tuple[Path, int, bytes, Path]]:
     """(file, record, payload, rollouts) of every scenario to score."""
+    from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, scenario_files
+
     many = rollouts.is_dir()
     unused = {file.stem: file for file in rollouts.glob("*.npz")} if many else {}
     if many and not unused:
