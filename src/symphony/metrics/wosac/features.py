@@ -138,7 +138,13 @@ def _road_edge(scene: Composite, edges: Edges) -> Tensor:
 def _violations(scene: Composite, scenario: WosacScenario) -> Tensor:
     position = torch.stack((scene.x, scene.y), dim=-1)[:, : scene.evaluated]
     valid = scene.valid[:, : scene.evaluated]
-    signals = Signals.of(scenario, valid.shape[-1])
+    signals = Signals.of(
+        scenario.signal_step,
+        scenario.signal_lane,
+        scenario.signal_state,
+        scenario.signal_point,
+        valid.shape[-1],
+    )
     return red_light_violations(position, valid, surface_street_lanes(scenario), signals)
 
 

@@ -117,14 +117,24 @@ class Signals:
     point: Float[Tensor, "Q T 2"]
 
     @classmethod
-    def of(cls, scenario: WosacScenario, steps: int) -> Signals:
-        """Bring a scenario's observations into a table; of several for one lane and step, the last one counts."""
-        lane, row = scenario.signal_lane.unique(return_inverse=True)
-        state = torch.zeros(len(lane), steps, dtype=torch.long, device=lane.device)
-        point = torch.zeros(len(lane), steps, 2, device=lane.device)
-        state[row, scenario.signal_step] = scenario.signal_state.long()
-        point[row, scenario.signal_step] = scenario.signal_point.float()
-        return cls(lane, torch.isin(state, torch.tensor(RED, device=lane.device)), point)
+    def of(
+        cls,
+        step: Int[Tensor, " M"],
+        lane: Int[Tensor, " M"],
+        state: Int[Tensor, " M"],
+        point: Float[Tensor, "M 2"],
+        steps: int,
+    ) -> Signals:
+        """Bring M observations into a table; of several for one lane and step, the last one counts."""
+        lanes, row = lane.unique(return_inverse=True)
+        cell = row * steps + step
+        last = torch.full((len(lanes) * steps,), -1, device=lane.device)
+        last = last.scatter_reduce(0, cell, torch.arange(len(cell), device=lane.device), "amax")
+        there = last >= 0
+        states, points = state.new_zeros(len(last)), torch.zeros(len(last), 2, device=point.device)
+        states[there], points[there] = state[last[there]], point[last[there]].float()
+        red = torch.isin(states, torch.tensor(RED, device=lane.device))
+        return cls(lanes, red.view(-1, steps), points.view(-1, steps, 2))
 
 
 def red_light_violations(
