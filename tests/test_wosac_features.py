@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from helpers_wosac import ROAD, edge_distance, made_rollouts, made_scenario, rounded_gap
 from symphony.errors import DataError
-from symphony.metrics.wosac import Lines, SimulatedRollouts, WosacFeatures, compute_features, kinematics
+from symphony.metrics.wosac import (
+    Lines,
+    SimulatedRollouts,
+    WosacFeatures,
+    cells,
+    compute_features,
+    kinematics,
+)
 from symphony.metrics.wosac.interaction import distance_to_nearest, time_to_collision
 from symphony.metrics.wosac.lights import Lanes, Signals, red_light_violations
 from symphony.metrics.wosac.road import Edges, distance_to_road_edge, signed_distance_to_edges
@@ -125,6 +132,29 @@ def test_road_edges_agree_with_looking_at_every_segment(seed: int, closed: bool)
     # Where two segments are equally near, rounding may choose either; their sides may differ.
     agree = np.sign(found.numpy()[clear]) == np.sign(expected[clear])
     assert agree.mean() > 0.97
+
+
+@pytest.mark.parametrize("far", [0.0, 80_000.0])
+def test_cells_and_blocks_change_nothing(far: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    move = np.array([far, -far, 0])
+    lines = [
+        np.cumsum(rng.normal(0, [3, 3, 0.5], (40, 3)), 0) + rng.uniform(-90, 90, 3) * [1, 1, 0]
+        for _ in range(9)
+    ]
+    points = points_near(rng, lines, 500)
+    points[:3] *= 1e4
+    edges, points = Edges.of(Lines.of([line + move for line in lines])), points + move.astype(np.float32)
+    lanes = Lanes.of(Lines.of([line + move for line in lines]), torch.arange(9))
+    given = torch.from_numpy(points)
+    found = []
+    for cell, pairs in ((1e12, 1 << 30), (cells.CELL, cells._PAIRS), (0.3, 100)):
+        monkeypatch.setattr(cells, "CELL", cell)
+        monkeypatch.setattr(cells, "_PAIRS", pairs)
+        found.append((signed_distance_to_edges(given, edges), lanes.nearest(given[:, :2])))
+    for distance, segment in found[1:]:
+        torch.testing.assert_close(distance, found[0][0], rtol=0, atol=0)
+        assert torch.equal(segment, found[0][1])
 
 
 def test_edge_by_hand() -> None:

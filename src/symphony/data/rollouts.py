@@ -39,14 +39,14 @@ def read_rollouts(file: Path) -> RolloutArrays:
     Raises:
         DataError: the file is damaged or something is missing or of a wrong kind; names file and field.
     """
-    try:
-        archive = np.load(file, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise DataError("is one array, expected an .npz archive of several", file=file)
-        with archive:
-            return _read(archive, file)
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
-        raise DataError(f"not an .npz archive, or damaged: {error}", file=file) from None
+    with file.open("rb") as raw:
+        try:
+            archive = np.load(raw, allow_pickle=False)
+            if isinstance(archive, np.lib.npyio.NpzFile):
+                return _read(archive, file)
+        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
+            raise DataError(f"not an .npz archive, or damaged: {error}", file=file) from None
+    raise DataError("is one array, expected an .npz archive of several", file=file)
 
 
 def _read(archive: Any, file: Path) -> RolloutArrays:

@@ -96,9 +96,7 @@ def check_submission(path: Path, required: Mapping[str, frozenset[int]] | None =
         report.add(DataError(f"not a .tar.gz archive, or damaged: {error}", file=path))
         return report
     report.shards = len(shards)
-    report.problems += [
-        DataError(problem, file=path, field="shards") for problem in _shard_problems(list(shards))
-    ]
+    report.add(*(DataError(text, file=path, field="shards") for text in _shard_problems(list(shards))))
     first = next(iter(metas), "")
     for name, meta in metas.items():
         if meta != metas[first]:
