@@ -1,7 +1,8 @@
 """The nearest of many segments to each of many points, without looking at every pair.
 
-Points are grouped into small cells. For all points of a cell at once, a bound from below and one from above of each
-segment's distance tell which segments can be the nearest at all; only those are measured for each point.
+Points are grouped into small cells, consecutive segments into blocks. For all points of a cell at once, bounds of
+the distance tell first which blocks, then which of their segments can be the nearest at all; only those are measured
+for each point.
 """
 
 from __future__ import annotations
@@ -12,68 +13,72 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
-CELL = 4.0
-"""Metres. A choice of speed: results don't depend on it."""
-_PAIRS = 1 << 19
-"""Pairs of a cell and a segment, or of a point and a segment, that are held at a time."""
+CELL = 3.0
+"""Metres. A choice of speed, as are the next two: results don't depend on them."""
+_BLOCK = 32
+"""Segments in a block."""
+_PAIRS = 1 << 17
+"""Pairs of a cell or a point and a segment that are held at a time."""
 _INDICES = 1 << 20
 
 
 @dataclass(frozen=True)
-class Cells:
-    """C boxes, each around the points of one cell.
+class Boxes:
+    """Axis-parallel boxes around K things in D dimensions, metres."""
 
-    Attributes:
-        low: [C, D] smallest coordinates.
-        high: [C, D] greatest coordinates.
-    """
+    low: Float[Tensor, "K D"]
+    high: Float[Tensor, "K D"]
 
-    low: Float[Tensor, "C D"]
-    high: Float[Tensor, "C D"]
+    def __getitem__(self, rows: slice | Tensor) -> Boxes:
+        return Boxes(self.low[rows], self.high[rows])
 
     @property
-    def slack(self) -> Float[Tensor, "C 1"]:
+    def slack(self) -> Float[Tensor, " K"]:
         """Metres of rounding that bounds have to allow for."""
-        return 0.05 + 1e-6 * torch.maximum(self.low.abs(), self.high.abs()).amax(-1, keepdim=True)
-
-    def __getitem__(self, rows: slice) -> Cells:
-        return Cells(self.low[rows], self.high[rows])
+        return 0.05 + 1e-6 * torch.maximum(self.low.abs(), self.high.abs()).amax(-1)
 
 
-Bounds = Callable[[Cells], tuple[Tensor, Tensor]]
-"""From cells to (lower, upper) bounds [C, S] of the distance of any of a cell's points to each of S segments."""
+Bounds = Callable[[Boxes, Tensor], tuple[Tensor, Tensor]]
+"""From boxes of points and indices [Q] of segments to (lower, upper) bounds [Q] of the distance of any such point."""
 Measure = Callable[[Tensor, Tensor], Tensor]
 """From indices [Q] of points and of segments to distances [Q]."""
 
 
 def nearest(
-    points: Float[Tensor, "M D"], segments: int, bounds: Bounds, measure: Measure
+    points: Float[Tensor, "M D"],
+    segments: Boxes,
+    weights: Float[Tensor, " D"],
+    bounds: Bounds,
+    measure: Measure,
 ) -> Int[Tensor, " M"]:
     """Index of the nearest segment to each point; of several, the first one.
 
     Args:
         points: in metres.
-        segments: how many there are, at least one.
-        bounds: of a cell's distances; a segment whose lower bound is above another one's upper bound is left out.
+        segments: boxes around the segments, of which there is at least one; no point is nearer to a segment than to
+            its box.
+        weights: of the dimensions in the distance to a box.
+        bounds: of the distances to a segment.
         measure: the distance itself.
     """
     order, sizes, cells = _group(points)
+    blocks = _blocks(segments)
     result = points.new_empty(len(points), dtype=torch.long)
     done = 0
-    step = max(1, _PAIRS // segments)
+    step = max(1, 16 * _PAIRS // (_BLOCK * len(blocks.low)))
     for start in range(0, len(sizes), step):
-        lower, upper = bounds(cells[start : start + step])
-        cell, candidate = (lower <= upper.amin(1, keepdim=True)).nonzero(as_tuple=True)
         here = sizes[start : start + step]
+        cell, segment = _candidates(cells[start : start + step], segments, blocks, weights, bounds)
         members = order[done : done + int(here.sum())]
         done += len(members)
-        result[members] = _first(members, here, candidate, torch.bincount(cell, minlength=len(here)), measure)
+        result[members] = _first(members, here, segment, torch.bincount(cell, minlength=len(here)), measure)
     return result
 
 
-def _group(points: Tensor) -> tuple[Tensor, Tensor, Cells]:
-    """(points ordered by cell, number of points per cell, the cells)."""
+def _group(points: Tensor) -> tuple[Tensor, Tensor, Boxes]:
+    """(points ordered by cell, number of points per cell, box around the points of each cell)."""
     # A cell may be as large as it likes, its box is taken from its points: far away, many share one.
     index = (points / CELL).floor().clamp(-_INDICES, _INDICES - 1).long() + _INDICES
     key = torch.zeros_like(index[:, 0])
@@ -84,7 +89,41 @@ def _group(points: Tensor) -> tuple[Tensor, Tensor, Cells]:
     shape = len(sizes), points.shape[-1]
     low = points.new_full(shape, torch.inf).scatter_reduce_(0, spread, points, "amin")
     high = points.new_full(shape, -torch.inf).scatter_reduce_(0, spread, points, "amax")
-    return cell.argsort(stable=True), sizes, Cells(low, high)
+    return cell.argsort(stable=True), sizes, Boxes(low, high)
+
+
+def _blocks(segments: Boxes) -> Boxes:
+    missing = -len(segments.low) % _BLOCK
+    low = functional.pad(segments.low, (0, 0, 0, missing), value=torch.inf)
+    high = functional.pad(segments.high, (0, 0, 0, missing), value=-torch.inf)
+    return Boxes(low.unflatten(0, (-1, _BLOCK)).amin(1), high.unflatten(0, (-1, _BLOCK)).amax(1))
+
+
+def _candidates(
+    cells: Boxes, segments: Boxes, blocks: Boxes, weights: Tensor, bounds: Bounds
+) -> tuple[Tensor, Tensor]:
+    """Pairs (cell, segment) of what can be nearest, in ascending order."""
+    device = cells.low.device
+    count, width = len(cells.low), len(blocks.low)
+    gap = torch.zeros(count, width, device=device)
+    for axis, weight in enumerate(weights):
+        below = blocks.low[:, axis] - cells.high[:, None, axis]
+        above = cells.low[:, None, axis] - blocks.high[:, axis]
+        gap += (torch.maximum(below, above).clamp_(min=0) * weight).square_()
+    gap = gap.sqrt_() - cells.slack[:, None]
+    # One segment of each block is enough for a first bound from above.
+    cell = torch.arange(count, device=device).repeat_interleave(width)
+    middle = (torch.arange(width, device=device) * _BLOCK + _BLOCK // 2).clamp(max=len(segments.low) - 1)
+    most = bounds(cells[cell], middle.repeat(count))[1].view(count, width).amin(1)
+    cell, block = (gap <= most[:, None]).nonzero(as_tuple=True)
+    cell = cell.repeat_interleave(_BLOCK)
+    segment = (block[:, None] * _BLOCK + torch.arange(_BLOCK, device=device)).flatten()
+    there = segment < len(segments.low)
+    cell, segment = cell[there], segment[there]
+    lower, upper = bounds(cells[cell], segment)
+    most = torch.segment_reduce(upper, "min", lengths=torch.bincount(cell, minlength=count))
+    kept = lower <= most[cell]
+    return cell[kept], segment[kept]
 
 
 def _first(points: Tensor, sizes: Tensor, candidate: Tensor, counts: Tensor, measure: Measure) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
 import torch
@@ -78,7 +80,7 @@ def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> Wo
     """
     rollouts = rollouts.to(scenario.valid.device)
     rollouts.check(scenario)
-    with torch.no_grad():
+    with torch.no_grad(), _one_thread():
         scene = Composite.of(scenario, rollouts)
         scored = slice(scene.evaluated)
         future = slice(CURRENT + 1, None)
@@ -90,6 +92,17 @@ def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> Wo
             log=features[0],
             simulated=features[1:],
         )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Many small steps: several threads would wait for each other most of the time, and burn it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _features(scene: Composite, scenario: WosacScenario) -> StepFeatures:

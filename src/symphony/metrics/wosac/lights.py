@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.metrics.wosac.cells import Bounds, Cells, Measure, nearest
+from symphony.metrics.wosac.cells import Bounds, Boxes, Measure, nearest
 from symphony.metrics.wosac.scenario import SURFACE_STREET, Lines, WosacScenario
 
 RED = (1, 4)
@@ -77,7 +77,9 @@ class Lanes:
 
         What it compares is ``|away + t along|``, where the distance would be ``|away - t along|``.
         """
-        return nearest(points, len(self.start), self._bounds(), self._measure(points))
+        # What is compared is never less than the distance to the first point.
+        boxes = Boxes(self.start, self.start)
+        return nearest(points, boxes, torch.ones(2), self._bounds(), self._measure(points))
 
     def _measure(self, points: Tensor) -> Measure:
         def measure(point: Tensor, segment: Tensor) -> Tensor:
@@ -91,13 +93,14 @@ class Lanes:
     def _bounds(self) -> Bounds:
         length = self.squared.sqrt()
 
-        def bounds(cells: Cells) -> tuple[Tensor, Tensor]:
-            # What is compared is never less than the distance to the first point, and at most the length more.
-            middle = ((cells.low + cells.high) / 2)[:, None]
-            away = torch.hypot(middle[..., 0] - self.start[:, 0], middle[..., 1] - self.start[:, 1])
-            radius = (cells.high - cells.low).norm(dim=-1, keepdim=True) / 2 + cells.slack
+        def bounds(cells: Boxes, segment: Tensor) -> tuple[Tensor, Tensor]:
+            # What is compared is at most the segment's length more than the distance to the first point.
+            x, y = ((cells.low + cells.high) / 2 - self.start[segment]).unbind(-1)
+            away = torch.hypot(x, y)
+            size_x, size_y = (cells.high - cells.low).unbind(-1)
+            radius = torch.hypot(size_x, size_y) / 2 + cells.slack
             low, high = (away - radius).clamp_(min=0), away + radius
-            return low, high + torch.minimum(high, length)
+            return low, high + torch.minimum(high, length[segment])
 
         return bounds
 

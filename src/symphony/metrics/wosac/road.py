@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.metrics.wosac.boxes import corners
-from symphony.metrics.wosac.cells import Bounds, Cells, Measure, nearest
+from symphony.metrics.wosac.cells import Bounds, Boxes, Measure, nearest
 from symphony.metrics.wosac.scenario import Lines
 
 NOWHERE = -1e10
@@ -96,7 +96,11 @@ def signed_distance_to_edges(
     The nearest is chosen with heights multiplied by ``stretch``. Where the nearest place is an end that two segments
     share, the side is that of both: right of either where the line turns left, of both where it turns right.
     """
-    segment = nearest(points, len(edges.start), _bounds(edges, stretch), _measure(points, edges, stretch))
+    end = edges.start + edges.along
+    boxes = Boxes(torch.minimum(edges.start, end), torch.maximum(edges.start, end))
+    weights = points.new_tensor([1.0, 1.0, stretch])
+    bounds, measure = _bounds(edges, boxes, stretch), _measure(points, edges, stretch)
+    segment = nearest(points, boxes, weights, bounds, measure)
     away = points - edges.start[segment]
     fraction = edges.fraction(away, segment)
     offset = away - fraction.clamp(0, 1)[:, None] * edges.along[segment]
@@ -124,20 +128,22 @@ def _measure(points: Tensor, edges: Edges, stretch: float) -> Measure:
     return measure
 
 
-def _bounds(edges: Edges, stretch: float) -> Bounds:
-    end = edges.start + edges.along
-    floor, ceiling = torch.minimum(edges.start[:, 2], end[:, 2]), torch.maximum(edges.start[:, 2], end[:, 2])
+def _bounds(edges: Edges, boxes: Boxes, stretch: float) -> Bounds:
     inverse = torch.where(edges.squared > 0, edges.squared, 1.0).reciprocal()
 
-    def bounds(cells: Cells) -> tuple[Tensor, Tensor]:
-        middle = ((cells.low + cells.high) / 2)[:, None]
-        x, y = (middle[..., axis] - edges.start[:, axis] for axis in (0, 1))
-        fraction = ((x * edges.along[:, 0] + y * edges.along[:, 1]) * inverse).clamp_(0, 1)
-        away = torch.hypot(x - fraction * edges.along[:, 0], y - fraction * edges.along[:, 1])
-        radius = (cells.high - cells.low)[:, :2].norm(dim=-1, keepdim=True) / 2 + cells.slack
-        low, high = cells.low[:, 2:], cells.high[:, 2:]
-        apart = torch.maximum(floor - high, low - ceiling).clamp_(min=0)
-        far = torch.maximum(ceiling - low, high - floor)
+    def bounds(cells: Boxes, segment: Tensor) -> tuple[Tensor, Tensor]:
+        x, y, _ = ((cells.low + cells.high) / 2 - edges.start[segment]).unbind(-1)
+        along_x, along_y, _ = edges.along[segment].unbind(-1)
+        fraction = ((x * along_x + y * along_y) * inverse[segment]).clamp_(0, 1)
+        away = torch.hypot(x - fraction * along_x, y - fraction * along_y)
+        size_x, size_y, _ = (cells.high - cells.low).unbind(-1)
+        radius = torch.hypot(size_x, size_y) / 2 + cells.slack
+        below = boxes.low[segment, 2] - cells.high[:, 2]
+        above = cells.low[:, 2] - boxes.high[segment, 2]
+        apart = torch.maximum(below, above).clamp_(min=0)
+        far = torch.maximum(
+            boxes.high[segment, 2] - cells.low[:, 2], cells.high[:, 2] - boxes.low[segment, 2]
+        )
         return (
             torch.hypot((away - radius).clamp_(min=0), apart * stretch),
             torch.hypot(away + radius, far * stretch),
