@@ -15,7 +15,7 @@ import pytest
 
 from helpers_wosac import record_rollouts, womd_record
 from symphony.cli import main
-from symphony.data.rollouts import RolloutArrays
+from symphony.data.rollouts import RolloutArrays, read_rollouts
 from symphony.data.sources import wosac_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
 from symphony.data.submission import SubmissionMeta, scenario_message, shard_name, write_submission
@@ -345,3 +345,13 @@ def test_submissions_that_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="not acknowledged"):
         write_submission([("aaaa", arrays())], silent, out, shards=1)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.samples
+def test_rollouts_of_a_real_scenario(samples: Path, tmp_path: Path) -> None:
+    file = samples.parent / "wosac" / "case_637f20cafde22ff8_a_official_submission.npz"
+    if not file.is_file():
+        pytest.skip(f"no rollouts at {file}")
+    out = tmp_path / "made.tar.gz"
+    assert write_submission([("637f20cafde22ff8", read_rollouts(file))], META, out, shards=1) == 1
+    assert main(["wosac", "validate", str(out), "--scenario", str(samples / "womd")]) == 0

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from symphony.metrics.wosac.boxes import corners, quadrilateral_gap
+from symphony.metrics.wosac.boxes import corners, rectangle_gap
 
 NONE = 1e10
 """Distance, in metres, where there is no other valid object."""
@@ -75,7 +75,7 @@ def _nearest(position: Tensor, heading: Tensor, size: Tensor, valid: Tensor, eva
     # The corners are rounded where they lie, as in the official scorer: far from the origin that shows.
     mine = corners(position[r, i, t], heading[r, i, t], core[r, i, t])
     theirs = corners(position[r, j, t], heading[r, j, t], core[r, j, t])
-    gap = quadrilateral_gap(mine, theirs)
+    gap = rectangle_gap(mine, theirs)
     gap = gap - radius[r, i, t] - radius[r, j, t]
     result = torch.full_like(away[:, :, 0], NONE)
     flat = (r * evaluated + i) * valid.shape[-1] + t
