@@ -29,9 +29,9 @@ def rectangle_gap(a: Float[Tensor, "M 4 2"], b: Float[Tensor, "M 4 2"]) -> Float
     The Euclidean gap, or minus the length of the shortest translation that separates them: the distance of the origin
     to the edge of the octagon of all differences of a point of a and one of b, negative inside.
 
-    In the octagon, sides of a and b follow each other by turns from its lowest corner on. Which of the two comes first
-    is found once, from the corners as they are rounded, as in the official scorer: far from the origin, where they are
-    rounded to millimetres, that shows for rectangles that are nearly parallel.
+    In the octagon, sides of a and b follow each other by turns from its lowest corner on. Which of the two comes
+    first is found once, from the corners as they are rounded, as in the official scorer: far from the origin, where
+    they are rounded to millimetres, that shows for rectangles that are nearly parallel.
     """
     a, minus_b = _from_the_lowest(a), _from_the_lowest(-b)
     side_a, side_b = a[:, 1] - a[:, 0], minus_b[:, 1] - minus_b[:, 0]
