@@ -393,6 +393,8 @@ def nan_at(rollouts: SimulatedRollouts) -> SimulatedRollouts:
     (lambda r: replace(r, object_id=r.object_id.float()), "object_id", "whole numbers"),
     (lambda r: replace(r, y=r.y[..., :79]), "y", "has shape"),
     (lambda r: replace(r, heading=r.heading.long()), "heading", "floating-point"),
+    (lambda r: replace(r, x=r.x[0, 0, 0]), "x", "no rollouts"),
+    (lambda r: replace(r, x=r.x[:0]), "x", "no rollouts"),
     (nan_at, "x", "agent 12, rollout 1, step 16: not finite"),
 ])  # fmt: skip
 def test_rollouts_that_cannot_be_scored(change: Any, field: str, text: str) -> None:

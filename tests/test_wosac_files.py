@@ -281,3 +281,17 @@ def test_rollouts_survive_a_file(tmp_path: Path) -> None:
     found = read_rollouts(tmp_path / "rollouts.npz")
     for name in RolloutArrays.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
+
+
+@pytest.mark.parametrize("kind", ["<f8", ">f4", "<f2", np.longdouble])
+def test_numbers_may_be_of_any_width_and_byte_order(tmp_path: Path, kind: Any) -> None:
+    record = womd_record()
+    arrays = vars(record_rollouts(record, 2))
+    ids = arrays.pop("object_id").astype(">i2")
+    # Near the origin, where two bytes are enough.
+    near = {name: (array % 8).astype(kind) for name, array in arrays.items()}
+    np.savez(tmp_path / "made.npz", object_id=ids, **near)
+    found = read_rollouts(tmp_path / "made.npz")
+    assert found.object_id.tolist() == [100, 101, 102]
+    np.testing.assert_array_equal(found.x, near["x"])
+    SimulatedRollouts.of(**vars(found)).check(WosacScenario.of(**scenario_arrays(record)), 2)

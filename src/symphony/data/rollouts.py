@@ -62,7 +62,10 @@ def _read(archive: Any, file: Path) -> RolloutArrays:
         if not np.issubdtype(array.dtype, kind):
             wanted = "whole numbers" if name == "object_id" else "floating-point numbers"
             raise DataError(f"holds {array.dtype}, expected {wanted}", file=file, field=name)
-        arrays[name] = array
+        # Whatever width and byte order they come in.
+        plain = np.int64 if name == "object_id" else np.float32 if array.dtype.itemsize <= 4 else np.float64
+        with np.errstate(over="ignore"):
+            arrays[name] = array.astype(plain)
     return RolloutArrays(**arrays)
 
 

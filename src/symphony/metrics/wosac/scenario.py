@@ -247,8 +247,8 @@ class SimulatedRollouts:
         ):
             if len(who):
                 raise error(f"{_agents(who)} {what}", "object_id")
-        rollouts = len(self.x) if count is None else count
-        if rollouts == 0 or self.x.ndim == 0:
+        rollouts = (len(self.x) if self.x.ndim else 0) if count is None else count
+        if rollouts == 0:
             raise error("no rollouts", "x")
         for name in ("x", "y", "z", "heading"):
             values: Tensor = getattr(self, name)
