@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 import tyro
 
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, figure, plot, profiles, table, train
+from symphony.cli import data, demo, evaluate, figure, plot, profiles, table, train, wosac
 from symphony.errors import ConfigError, SymphonyError, printable
 
 __all__ = ["main"]
@@ -36,6 +36,7 @@ app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="table")(table.Table)
 app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
+app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="demo")(demo.Demo)
 
 
