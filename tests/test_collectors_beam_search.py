@@ -20,6 +20,7 @@ from symphony.collectors import (
     KeepAll,
     KeepBest,
     KeyScore,
+    ReplaceBad,
     Systematic,
     beam_search,
     branch,
@@ -235,6 +236,37 @@ def test_groups_stay_apart():
             assert_same(found.trajectories[row, slots].exclude("goal"), alone.trajectories)
 
 
+def test_a_rule_may_mix_groups():
+    """Branches of a bad group take over the goal of the branch they are copied from; several numbers are one goal."""
+    start = starts(Walk(), 3, branches=6)
+    goals = torch.randint(3, (3, 6, 2), generator=torch.Generator().manual_seed(0))
+    start = start.set(("agents", "goal"), goals)
+    found = search(
+        start,
+        rule=ReplaceBad(2.0),
+        group_key=("agents", "goal"),
+        noise=torch.rand(3, 3, generator=torch.Generator().manual_seed(1)),
+    )
+    groups, mixed = goals, 0
+    for period in range(3):
+        parents, totals = found.parents[:, period], found.totals[:, period]
+        after = groups.gather(1, parents[..., None].expand(3, 6, 2))
+        for row, slot in (totals > 2.0).nonzero().tolist():
+            same = (groups[row] == groups[row, slot]).all(-1) & (totals[row] <= 2.0)
+            assert (
+                bool(same.any()) == bool((after[row, slot] == groups[row, slot]).all())
+                or not (totals[row] <= 2.0).any()
+            )
+            mixed += not bool(same.any())
+        groups = after
+    assert mixed > 0
+    assert torch.equal(
+        found.trajectories.get(("agents", "goal"))[:, :, -1],
+        goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)),
+    )
+    assert torch.equal(groups, goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)))
+
+
 def reseed(state, attempt):
     return state.set(STREAM, state.get(STREAM) + 7919 * attempt)
 
@@ -325,7 +357,7 @@ def test_aggregates_by_hand():
         ({"retries": 1}, "retry_above"),
         ({"retry_above": 1.0}, "retry_above"),
         ({"group_key": "goal"}, "goal"),
-        ({"group_key": X}, "one number per branch"),
+        ({"group_key": X}, "integers, one or some per branch"),
         ({"group_key": STREAM}, None),
         ({"noise": torch.zeros(2, 2)}, "noise"),
         ({"rule": Systematic(1.0)}, "noise"),
