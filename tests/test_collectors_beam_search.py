@@ -12,11 +12,12 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
-from torchrl.envs import PendulumEnv
+from torchrl.envs import ParallelEnv, PendulumEnv, SerialEnv, StepCounter, TransformedEnv
 
 from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, distance, noise, starts
 from symphony.collectors import (
     Aggregate,
+    BeamSearchCollector,
     KeepAll,
     KeepBest,
     KeyScore,
@@ -24,9 +25,11 @@ from symphony.collectors import (
     Systematic,
     beam_search,
     branch,
+    check_branching,
     lineage,
     max_then_sum,
     mean_then_sum,
+    with_rows,
 )
 from symphony.errors import ConfigError
 
@@ -187,6 +190,84 @@ def test_gradient_follows_the_survivors():
     reached = torch.zeros(3, 4, dtype=torch.bool).scatter(1, origin, True)
     assert not reached.all()
     assert torch.equal(at_root.ne(0).any(-1).any(-1), reached)
+
+
+class Counting(Walk):
+    """Moves farther with every step it takes, whatever the state it is given says."""
+
+    steps = 0
+
+    def _step(self, tensordict):
+        self.steps += 1
+        out = super()._step(tensordict)
+        return out.set(X, out.get(X) + self.steps)
+
+
+class Drawing(Walk):
+    """Draws from a generator of its own and the global one, and remembers nothing."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        drawn = torch.randn(out.get(X).shape, generator=self.rng)
+        return out.set(X, out.get(X) + drawn + torch.rand(drawn.shape))
+
+
+@pytest.mark.parametrize(
+    ("env", "why"),
+    [
+        (lambda: SerialEnv(2, Walk), "batch-locked"),
+        (lambda: ParallelEnv(2, Walk), "batch-locked"),
+        (lambda: TransformedEnv(Counting(), StepCounter()), r"another \('agents', 'x'\) when stepped"),
+        (Counting, r"another \('agents', 'x'\) when stepped"),
+    ],
+)
+def test_what_remembers_can_not_be_branched(env, why):
+    env, start = env(), starts(Walk(), 2, branches=4)
+    start.set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
+    refused = f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and ParallelEnv can't"
+    with pytest.raises(ConfigError, match=refused):
+        search(start, env=env)
+
+    def collect():
+        BeamSearchCollector(env, Policy(), score=distance, branches=4, frames_per_batch=4).next()
+
+    with pytest.raises(ConfigError, match=refused):
+        collect()
+
+
+def test_rows_are_taken_away_before_a_search():
+    """By the collector; the function gets its rows from the start."""
+    with pytest.raises(ConfigError, match=r"has a batch size, \[2\].*rows come from with_rows"):
+        search(starts(Walk(), 2, branches=4), env=with_rows(Walk(), [2]))
+
+
+@pytest.mark.parametrize("action", ["discrete", "continuous"])
+def test_an_environment_of_gymnasium_can_not_be_branched(action):
+    pytest.importorskip("gymnasium")
+    from torchrl.envs import GymEnv
+
+    env = GymEnv({"discrete": "CartPole-v1", "continuous": "Pendulum-v1"}[action])
+    with pytest.raises(ConfigError, match="GymEnv can't be branched"):
+        check_branching(env)
+
+
+def test_random_numbers_are_no_memory():
+    """Nor does looking for it cost any."""
+    for env in (Drawing(), Walk(), PendulumEnv(seed=0)):
+        state = (
+            env.reset(env.gen_params(batch_size=[3]), set_state=False)
+            if isinstance(env, PendulumEnv)
+            else starts(env, 3, branches=1)
+        )
+        torch.manual_seed(5)
+        own = env.rng.get_state() if isinstance(env, Walk) else None
+        before = state.clone()
+        check_branching(env, state)
+        assert_same(state, before)
+        drawn = torch.rand(3)
+        torch.manual_seed(5)
+        assert torch.equal(drawn, torch.rand(3))
+        assert own is None or torch.equal(own, env.rng.get_state())
 
 
 def test_lineage_by_hand():
