@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
 from symphony import keys
-from symphony.agents.networks import build_networks, dynamics_of, observation_config
+from symphony.agents.networks import (
+    discriminator_network,
+    dynamics_of,
+    goal_network,
+    observation_of,
+    policy_network,
+)
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
@@ -32,21 +37,38 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SceneDataset:
     return SceneDataset(SegmentStore(path), routes=True)
 
 
+def spec_of(method: str, dataset: SceneDataset) -> AgentSpec:
+    return AgentSpec(
+        action_space="displacement" if method == "mgail_ts_h" else "bicycle",
+        dt=dataset.dt,
+        goals=True,
+        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        searches=True,
+    )
+
+
+def networks(method: str, dataset: SceneDataset) -> tuple[Any, Any, Any]:
+    spec = spec_of(method, dataset)
+    return policy_network(spec), goal_network(spec), discriminator_network(spec)
+
+
 def losses(method: str, dataset: SceneDataset) -> tuple[dict[str, Any], DrivingEnv]:
     """The losses of a method on its own networks, as a recipe makes them, and the environment they learn in."""
-    config = tiny(method, Path("unused"), Path("unused"))
+    spec = spec_of(method, dataset)
     torch.manual_seed(0)
-    networks = build_networks(config)
+    policy, goals, judge = networks(method, dataset)
     # One scene with three interactive agents and one with two, hence with one that is padding.
     scenes = collate([scene(dataset.segment(i), [0, 1, 2][: 3 - i], dataset.graph(i)) for i in (0, 1)])
-    env = DrivingEnv(scenes, dynamics_of(config), observation_config(config))
-    found: dict[str, Any] = {"bc": BCLoss(networks.policy), "distillation": DistillationLoss(networks.policy)}
-    if networks.goals is not None:
-        found["goal"] = GoalLoss(networks.goals)
-    if networks.discriminator is not None:
-        found["discriminator"] = DiscriminatorLoss(networks.discriminator)
-        if config.adversarial:
-            found["mgail"] = MGAILLoss(networks.policy, networks.discriminator, env, horizon=2)
+    env = DrivingEnv(scenes, dynamics_of(spec), observation_of(spec))
+    found: dict[str, Any] = {
+        "bc": BCLoss(policy),
+        "distillation": DistillationLoss(policy),
+        "goal": GoalLoss(goals),
+        "discriminator": DiscriminatorLoss(judge),
+    }
+    if method == "mgail_ts_h":
+        found["mgail"] = MGAILLoss(policy, judge, env, horizon=2)
     return found, env
 
 
@@ -113,7 +135,7 @@ def test_what_losses_read_by_default_is_written_by_something(method: str, datase
     sees = env.observation
     written |= set(dataset.sample_states(items, 2, sees, rng).keys(True, True))
     written |= set(dataset.sample_goals(items, 2, sees, rng).keys(True, True))
-    for module in build_networks(tiny(method, Path("unused"), Path("unused"))).present().values():
+    for module in networks(method, dataset):
         written |= set(module.out_keys)
     written -= BY_THE_CALLER
     one_place = {value for name, value in vars(keys).items() if name.isupper()}
