@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
 
 WHEELBASE = 0.6
@@ -167,12 +169,8 @@ class Bicycle:
 
     def grid(self, like: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
-        acceleration = self.max_acceleration * _quadratic(self.num_acceleration)
-        steering = self.max_steering * _quadratic(self.num_steering)
-        return (
-            acceleration.repeat_interleave(self.num_steering).to(like),
-            steering.repeat(self.num_acceleration).to(like),
-        )
+        acceleration, steering = _grid(self)
+        return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
 
     def step(
         self,
@@ -225,6 +223,16 @@ class Bicycle:
             return action, after.gather(-2, index).squeeze(-2)
 
         return _follow(position, heading, speed.clamp_min(0.0), valid, nearest)
+
+
+@cache
+def _grid(dynamics: Bicycle) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    acceleration = dynamics.max_acceleration * _quadratic(dynamics.num_acceleration)
+    steering = dynamics.max_steering * _quadratic(dynamics.num_steering)
+    return (
+        tuple(acceleration.repeat_interleave(dynamics.num_steering).tolist()),
+        tuple(steering.repeat(dynamics.num_acceleration).tolist()),
+    )
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,27 @@ def signed_distance(
     if start.shape[1] == 0:
         return points.sum(-1) * 0 + NO_BOUNDARY
     with torch.no_grad():
-        valid = valid & ((start[..., 0] != end[..., 0]) | (start[..., 1] != end[..., 1]))
+        valid = valid & has_length(start, end)
         nearest = _nearest_segment(points.detach(), start, end, valid)
+    distance = distance_to(points, start, end, valid, previous, following, nearest)
+    return torch.where(valid.any(-1, keepdim=True), distance, NO_BOUNDARY)
+
+
+def has_length(start: Float[Tensor, "B E 2"], end: Float[Tensor, "B E 2"]) -> Bool[Tensor, "B E"]:
+    """Which segments are more than a point."""
+    return (start[..., 0] != end[..., 0]) | (start[..., 1] != end[..., 1])
+
+
+def distance_to(
+    points: Float[Tensor, "B M 2"],
+    start: Float[Tensor, "B E 2"],
+    end: Float[Tensor, "B E 2"],
+    valid: Bool[Tensor, "B E"],
+    previous: Int[Tensor, "B E"] | None,
+    following: Int[Tensor, "B E"] | None,
+    nearest: Int[Tensor, "B M"],
+) -> Float[Tensor, "B M"]:
+    """What :func:`signed_distance` gives where the nearest segments are known; ``valid`` ones have a length."""
     here = _Side.of(points, _take(start, nearest), _take(end, nearest))
     sign = here.sign
     if previous is not None:
@@ -65,8 +84,7 @@ def signed_distance(
             here.fraction > 1, _corner_sign(points, start, end, valid, following, nearest, here, True), sign
         )
     inner = (here.fraction >= 0) & (here.fraction <= 1)
-    distance = torch.where(inner, here.offset, sign * here.to_end)
-    return torch.where(valid.any(-1, keepdim=True), distance, NO_BOUNDARY)
+    return torch.where(inner, here.offset, sign * here.to_end)
 
 
 class _Side:
@@ -78,13 +96,15 @@ class _Side:
     @classmethod
     def of(cls, points: Tensor, start: Tensor, end: Tensor) -> _Side:
         along = end - start
-        squared = along.square().sum(-1)
+        # Component by component: sums over a last dimension of 2 are slow.
+        (along_x, along_y), (x, y) = along.unbind(-1), (points - start).unbind(-1)
+        squared = along_x.square() + along_y.square()
         squared = torch.where(squared > 0, squared, 1.0)
-        away = points - start
-        fraction = ((away * along).sum(-1) / squared).detach()
+        fraction = ((x * along_x + y * along_y) / squared).detach()
         # Positive to the right of the direction of travel.
-        offset = (away[..., 0] * along[..., 1] - away[..., 1] * along[..., 0]) * squared.rsqrt()
-        gap = (away - (fraction > 0.5)[..., None] * along).square().sum(-1)
+        offset = (x * along_y - y * along_x) * squared.rsqrt()
+        beyond = fraction > 0.5
+        gap = (x - beyond * along_x).square() + (y - beyond * along_y).square()
         apart = gap > 0
         to_end = torch.where(apart, torch.where(apart, gap, 1.0).sqrt(), 0.0)
         return cls(fraction, offset, to_end, along)
@@ -92,7 +112,7 @@ class _Side:
     @property
     def sign(self) -> Tensor:
         """+1 on the right, -1 on the left and on the line itself."""
-        return torch.where(self.offset.detach() > 0, 1.0, -1.0).to(self.offset.dtype)
+        return 2.0 * (self.offset.detach() > 0).to(self.offset.dtype) - 1.0
 
 
 def _corner_sign(
@@ -106,7 +126,7 @@ def _corner_sign(
     ahead: bool,
 ) -> Tensor:
     """Sign at a corner: right of either segment where the line turns left, of both where it turns right."""
-    index = neighbor.gather(1, nearest)
+    index = neighbor.gather(1, nearest).long()
     exists = (index >= 0) & valid.gather(1, index.clamp(min=0))
     index = index.clamp(min=0)
     other = _Side.of(points, _take(start, index), _take(end, index))

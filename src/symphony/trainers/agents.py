@@ -66,9 +66,9 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
         CheckpointError: if its weights can't be read.
     """
     if name == PLAYBACK:
-        return Agent(name, None, Bicycle(), ObservationConfig(num_points=1))
+        return Agent(name, None, Bicycle(), ObservationConfig.nothing())
     if name == "constant_velocity":
-        return Agent(name, ConstantVelocity(Bicycle()), Bicycle(), ObservationConfig(num_points=1))
+        return Agent(name, ConstantVelocity(Bicycle()), Bicycle(), ObservationConfig.nothing())
     folder, which = split_name(name)
     config = read_config(folder)
     checkpoint = choose(folder, which)
