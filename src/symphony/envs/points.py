@@ -79,10 +79,13 @@ def _among_all(
 ) -> None:
     """Write the nearest points of the positions ``rest``, of all points of their scenes."""
     total, count = x.shape[1], flat.shape[1]
-    block = max(1, _DISTANCES // total)
+    block = max(1, min(_DISTANCES // total, len(rest)))
+    buffers = np.empty((2, block, total), x.dtype)
     for a in range(0, len(rest), block):
         rows = rest[a : a + block]
-        squared, across = x[scene[rows]], y[scene[rows]]
+        squared, across = buffers[:, : len(rows)]
+        np.take(x, scene[rows], axis=0, out=squared, mode="clip")
+        np.take(y, scene[rows], axis=0, out=across, mode="clip")
         squared -= here_x[rows, None]
         across -= here_y[rows, None]
         np.square(squared, out=squared)
@@ -145,27 +148,20 @@ def _features_in_place(
 ) -> Tensor:
     """The same numbers, written over copied rows block by block; a third of the time, without a gradient."""
     config, count = tables.config, flat.shape[-1]
-    agents, index = origin.numel() // 2, flat.flatten()
+    agents, index = flat.numel() // count, flat.flatten()
     out = tables.points.new_empty(agents, count, POINT_FEATURES)
-    (x, y), angle = origin.reshape(-1, 2, 1).unbind(1), -heading.reshape(-1, 1)
-    cos, sin = angle.cos(), angle.sin()
-    own = (speed / config.speed_scale).reshape(-1, 1)
-    block = max(1, _ROWS // max(count, 1))
+    angle = -heading.reshape(-1, 1)
+    own, x, y = (speed / config.speed_scale).reshape(-1, 1), *origin.reshape(-1, 2, 1).unbind(1)
+    pose = (x.numpy(), y.numpy(), angle.cos().numpy(), angle.sin().numpy(), own.numpy())
+    table, order, block = tables.points.numpy(), index.numpy(), max(1, _ROWS // count)
+    buffers = np.empty((4, block, count), table.dtype)
     for a in range(0, agents, block):
-        rows = slice(a, a + block)
-        part = out[rows]
-        torch.index_select(
-            tables.points, 0, index[a * count : (a + len(part)) * count], out=part.view(-1, POINT_FEATURES)
-        )
-        c, s = cos[rows], sin[rows]
-        for k, (right, up) in enumerate(
-            ((part[..., 0] - x[rows], part[..., 1] - y[rows]), (part[..., 2], part[..., 3]))
-        ):
-            ahead, left = c * right - s * up, s * right + c * up
-            if k == 0:
-                ahead, left = ahead.div_(config.distance_scale), left.div_(config.distance_scale)
-            part[..., 2 * k], part[..., 2 * k + 1] = ahead, left
-        part[..., 5] = own[rows]
+        part = out[a : a + block].numpy()
+        chosen = order[a * count : (a + len(part)) * count]
+        # "clip" writes straight to its target; the numbers are in range.
+        np.take(table, chosen, axis=0, out=part.reshape(-1, POINT_FEATURES), mode="clip")
+        here = [value[a : a + block] for value in pose]
+        _to_frame(part, here, config.distance_scale, buffers[:, : len(part)])
     seen = out.view(*flat.shape, POINT_FEATURES)
     if tables.light is not None:
         light = tables.light.index_select(0, index)
@@ -176,6 +172,27 @@ def _features_in_place(
     if not tables.enough_points:
         out.view(-1, POINT_FEATURES)[(~mask).flatten()] = 0.0
     return seen
+
+
+def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: np.ndarray) -> None:
+    """Overwrite what depends on the agent, by the very operations of :func:`_features`, so to the same bits."""
+    x, y, cos, sin, own = pose
+    right, up, ahead, left = buffers
+    np.subtract(part[..., 0], x, out=right)
+    np.subtract(part[..., 1], y, out=up)
+    np.multiply(cos, right, out=ahead)
+    ahead -= np.multiply(sin, up, out=left)
+    np.divide(ahead, scale, out=part[..., 0])
+    np.multiply(sin, right, out=ahead)
+    ahead += np.multiply(cos, up, out=left)
+    np.divide(ahead, scale, out=part[..., 1])
+    np.multiply(cos, part[..., 2], out=ahead)
+    ahead -= np.multiply(sin, part[..., 3], out=left)
+    np.multiply(sin, part[..., 2], out=right)
+    np.multiply(cos, part[..., 3], out=up)
+    part[..., 2] = ahead
+    np.add(right, up, out=part[..., 3])
+    part[..., 5] = own
 
 
 def _light_now(tables: Tables, scene: Tensor, step: Tensor) -> Tensor:
