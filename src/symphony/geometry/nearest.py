@@ -23,7 +23,7 @@ def on_host(tensor: Tensor) -> bool:
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     """Places, in the flattened array, of the ``count`` smallest elements of each row [R, W], ascending.
 
-    Of equal elements the first ones are taken, so what else is in a row decides nothing. NaN counts as infinity.
+    Of equal elements the first ones are taken, so what else is in a row decides nothing. NaN comes last.
     """
     width = values.shape[1]
     if width <= count:
@@ -35,13 +35,14 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     number = np.count_nonzero(chosen, axis=1)
     odd = np.flatnonzero(number != count)
     if len(odd):
-        some, limit = values[odd], cut[odd]
-        if np.isnan(limit).any():
-            some = np.where(np.isnan(some), np.inf, some)
-            limit = np.partition(some, count - 1, axis=-1)[:, count - 1 : count]
-        less, equal = some < limit, some == limit
-        room = count - np.count_nonzero(less, axis=1)[:, None]
-        chosen[odd] = less | (equal & (equal.cumsum(1) <= room))
+        if np.isnan(cut[odd]).any():
+            order = np.argsort(values[odd], axis=-1, kind="stable")[:, :count]
+            chosen[odd] = False
+            chosen[odd[:, None], order] = True
+        else:
+            less, equal = values[odd] < cut[odd], values[odd] == cut[odd]
+            room = count - np.count_nonzero(less, axis=1)[:, None]
+            chosen[odd] = less | (equal & (equal.cumsum(1) <= room))
     return np.flatnonzero(chosen)
 
 
