@@ -17,13 +17,13 @@ from pathlib import Path
 
 import torch
 
+from symphony.agents.networks import build_networks, observation_config
 from symphony.config import AgentConfig, DiscriminatorConfig, TrainConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Displacement, DrivingEnv
 from symphony.objectives import MGAILLoss
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.networks import build_networks, observation_config
+from symphony.simulation.demonstrations import SceneDataset
 
 VARIANTS = {
     "all kept": {},

@@ -16,14 +16,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from symphony.agents.networks import build_networks, observation_config
 from symphony.collectors import KeepBest
 from symphony.config import AgentConfig, DiscriminatorConfig, TrainConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.networks import build_networks, observation_config
-from symphony.trainers.simulate import search
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import search
 
 
 def main() -> None:

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 import torch
 
+from symphony.agents.networks import build_networks, observation_config
 from symphony.config import AgentConfig, TrainConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
 from symphony.objectives import BCLoss
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.networks import build_networks, observation_config
+from symphony.simulation.demonstrations import SceneDataset
 
 POINTS = pytest.mark.parametrize("points", [200, 1000])
 

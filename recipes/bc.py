@@ -6,7 +6,7 @@ python recipes/bc.py --data TRAIN --test TEST --out runs/bc
 from __future__ import annotations
 
 from symphony.cli.recipe import judge, parse
-from symphony.trainers import train
+from symphony.training import train
 
 
 def main(args: list[str] | None = None) -> None:

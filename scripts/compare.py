@@ -22,7 +22,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from symphony.cli.tables import write_json
+from symphony.agents.networks import dynamics_of
 from symphony.config import (
     AgentConfig,
     DiscriminatorConfig,
@@ -33,10 +33,11 @@ from symphony.config import (
     TrainConfig,
 )
 from symphony.data.store import SegmentStore
-from symphony.trainers import evaluate, train
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.evaluation import Evaluation
-from symphony.trainers.networks import dynamics_of
+from symphony.evaluation import evaluate
+from symphony.evaluation.evaluator import Evaluation
+from symphony.files import write_json
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train
 
 METHODS: tuple[Method, ...] = get_args(Method)
 BEFORE = {"bc_ts": "bc", "bc_ts_h": "bc_h", "mgail_ts": "mgail", "mgail_ts_h": "mgail_h"}

@@ -22,8 +22,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.data.sources.sumo import generate_run
 from symphony.data.store import SegmentStore, StoreWriter
+from symphony.evaluation.logs import measure
 from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
-from symphony.trainers.quality import measure
 
 SplitName = Literal["train", "test"]
 DURATION = 150.0

@@ -20,19 +20,20 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from symphony.cli.comparison import choose_evaluation, method_name
-from symphony.cli.evaluations import FOLDER as EVALUATIONS
-from symphony.cli.evaluations import evaluation_name, kept_evaluations, read_evaluation
-from symphony.cli.tables import COLUMNS, write_json
+from symphony.agents.agent import read_config
+from symphony.agents.checkpoint import load_checkpoint, save_checkpoint
+from symphony.agents.choice import choose, split_name
+from symphony.agents.included import FOLDER, PREFIX, run_folder
+from symphony.agents.networks import build_networks
+from symphony.cli.tables import COLUMNS
 from symphony.config import EvaluateConfig, Rule, TrainConfig, to_json
 from symphony.data.generate import PRESETS
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, SymphonyError
-from symphony.trainers.agents import read_config
-from symphony.trainers.checkpoint import load_checkpoint, save_checkpoint
-from symphony.trainers.networks import build_networks
-from symphony.trainers.pretrained import FOLDER, PREFIX, run_folder
-from symphony.trainers.selection import choose, split_name
+from symphony.evaluation.comparison import choose_evaluation, method_name
+from symphony.evaluation.records import FOLDER as EVALUATIONS
+from symphony.evaluation.records import evaluation_name, kept_evaluations, read_evaluation
+from symphony.files import write_json
 
 SPLITS = ("train", "validation", "test")
 
@@ -66,7 +67,7 @@ def make(
     """Write the folder of an agent and return it.
 
     Args:
-        run: ``RUN`` or ``RUN@WHICH`` (see :func:`symphony.trainers.load_agent`).
+        run: ``RUN`` or ``RUN@WHICH`` (see :func:`symphony.agents.load_agent`).
         name: of the agent.
         scores: an evaluation of the run as ``symphony evaluate`` writes it; by default the one that the run keeps.
         pruning: its `rule`, `prune_every` and `temperature` say how the agent's trees are pruned from now on; by

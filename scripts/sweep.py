@@ -20,14 +20,15 @@ from typing import Any
 import numpy as np
 
 from compare import COLUMNS, figures, measured, paired
-from symphony.cli.tables import write_json
+from symphony.agents.agent import read_config
+from symphony.agents.networks import dynamics_of
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.store import SegmentStore
-from symphony.trainers import evaluate, train
-from symphony.trainers.agents import read_config
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.networks import dynamics_of
-from symphony.trainers.tracking import read_metrics
+from symphony.evaluation import evaluate
+from symphony.files import write_json
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train
+from symphony.training.logging import read_metrics
 
 BASE = MGAILConfig(regression=0, head_start=50, cost="non_saturating")
 VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {

@@ -17,10 +17,11 @@ from typing import Any
 import helpers_runs
 from symphony.config import TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
-from symphony.trainers import train, training, validation
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.learner import Learner
-from symphony.trainers.tracking import Tracker
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train, validation
+from symphony.training import trainer as training
+from symphony.training.learner import Learner
+from symphony.training.logging import Tracker
 
 STEPS = 8
 OWNERS = {

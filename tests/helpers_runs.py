@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from symphony.agents import load_agent
 from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig
-from symphony.trainers import load_agent
 
 
 def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:

@@ -18,17 +18,17 @@ from torch import Tensor
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
+from symphony.agents.choice import choose
+from symphony.agents.networks import build_networks
 from symphony.cli import main
 from symphony.data.store import SegmentStore
 from symphony.errors import SymphonyError
 from symphony.objectives import BCLoss
-from symphony.trainers import train
-from symphony.trainers.alarms import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, loss_of
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.learner import Learner
-from symphony.trainers.networks import build_networks
-from symphony.trainers.selection import choose
-from symphony.trainers.tracking import read_metrics
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train
+from symphony.training.alarms import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, loss_of
+from symphony.training.learner import Learner
+from symphony.training.logging import read_metrics
 
 NAN, INF = math.nan, math.inf
 

@@ -39,8 +39,8 @@ from symphony.data.sources.argoverse2 import EGO_ID, NOMINAL_SIZES, map_path
 from symphony.data.sources.lines import stretches
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
+from symphony.evaluation import evaluate
 from symphony.geometry import segments_of, signed_distance
-from symphony.trainers import evaluate
 
 pa = needs_pyarrow
 IN_FOLDER = settings(

@@ -12,8 +12,9 @@ from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
 from symphony.config import EvaluateConfig, Method, MGAILConfig
 from symphony.data.store import SegmentStore, StoreWriter
-from symphony.trainers import evaluate, train
-from symphony.trainers.tracking import read_metrics
+from symphony.evaluation import evaluate
+from symphony.training import train
+from symphony.training.logging import read_metrics
 
 CUDA = pytest.param(
     "cuda",

@@ -16,6 +16,9 @@ from torch import Tensor
 
 from helpers_segments import crossing, hide, straight_road
 from symphony import keys
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import CheckpointError, checkpoints
+from symphony.agents.networks import build_networks
 from symphony.cli import main
 from symphony.config import (
     AgentConfig,
@@ -29,12 +32,10 @@ from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.envs.routes import POINTS
 from symphony.errors import ConfigError
-from symphony.trainers import load_agent, train
-from symphony.trainers.checkpoint import CheckpointError, checkpoints
-from symphony.trainers.dataset import SceneDataset, logged
-from symphony.trainers.learner import Learner
-from symphony.trainers.networks import build_networks
-from symphony.trainers.tracking import read_metrics
+from symphony.simulation.demonstrations import SceneDataset, logged
+from symphony.training import train
+from symphony.training.learner import Learner
+from symphony.training.logging import read_metrics
 
 NETWORKS = {
     "bc": {"policy"},

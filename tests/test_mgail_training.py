@@ -15,16 +15,18 @@ from torch import Tensor
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from symphony import keys
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import latest
+from symphony.agents.networks import build_networks
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Displacement
 from symphony.errors import ConfigError, DataError, SymphonyError
-from symphony.trainers import evaluate, load_agent, train
-from symphony.trainers.checkpoint import latest
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.learner import Learner
-from symphony.trainers.networks import build_networks
-from symphony.trainers.tracking import read_metrics
+from symphony.evaluation import evaluate
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train
+from symphony.training.learner import Learner
+from symphony.training.logging import read_metrics
 
 METHODS = ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h")
 SHORT = MGAILConfig(regression=2, head_start=2, rollouts=3)

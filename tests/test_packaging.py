@@ -205,11 +205,11 @@ def skeleton(root: Path) -> Path:
         ("render/plots.py", "import symphony.data", True),
         ("render/plots.py", "import symphony.metrics", False),
         (
-            "trainers/loop.py",
+            "training/loop.py",
             "import symphony.metrics, symphony.modules, symphony.render, symphony.config",
             True,
         ),
-        ("trainers/loop.py", "import symphony.cli", False),
+        ("training/loop.py", "import symphony.cli", False),
         ("unplaced.py", "", False),
     ],
 )

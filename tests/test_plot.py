@@ -19,20 +19,21 @@ from matplotlib.colors import to_rgb
 
 import symphony.render
 from helpers_segments import crossing, straight_road
+from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.cli.plot import run_names
 from symphony.collectors.result import BeamSearchResult, lineage
 from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError
+from symphony.evaluation.evaluator import simulated
 from symphony.render import SearchTree, plot_curves, plot_genealogy, plot_search, plot_tree
 from symphony.render.curves import DASHES, PANELS, panels_of, read_curves, run_colors, smoothed
 from symphony.render.genealogy import rows
 from symphony.render.style import AGENT_COLORS, new_figure
 from symphony.render.tree import FATES, STROKES, score_colors
-from symphony.trainers import load_agent, train
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.evaluation import simulated
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train
 
 EVERY, BRANCHES, STEPS = 2, 4, 5
 PARENTS = np.array([[0, 1, 0, 1], [2, 0, 2, 3], [3, 3, 2, 2]])

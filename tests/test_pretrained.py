@@ -17,16 +17,18 @@ import torch
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
+from symphony.agents import included as pretrained
+from symphony.agents import load_agent
+from symphony.agents.agent import read_config
+from symphony.agents.checkpoint import checkpoints, parts_of
+from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.cli.train import Train
 from symphony.config import EvaluateConfig, MGAILConfig, ValidationConfig
 from symphony.data.generate import PRESETS
 from symphony.data.store import StoreWriter
 from symphony.errors import ConfigError
-from symphony.trainers import load_agent, pretrained, train
-from symphony.trainers.agents import read_config
-from symphony.trainers.checkpoint import checkpoints, parts_of
-from symphony.trainers.selection import choose
+from symphony.training import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = pretrained.pretrained_names()

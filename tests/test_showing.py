@@ -17,20 +17,22 @@ from PIL import Image
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import checkpoints
+from symphony.agents.networks import build_networks
 from symphony.config import EvaluateConfig, ShowConfig, TrainConfig, ValidationConfig, from_dict, to_json
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
+from symphony.evaluation import evaluate
+from symphony.evaluation.evaluator import playback, simulated
 from symphony.render import Clip, curves
-from symphony.trainers import evaluate, load_agent, train
-from symphony.trainers.checkpoint import checkpoints
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.evaluation import playback, simulated
-from symphony.trainers.learner import Learner
-from symphony.trainers.networks import build_networks
-from symphony.trainers.showing import QUANTILES, ROLLOUTS, Show, Shown, clip_of, samples_of
-from symphony.trainers.simulate import Rollouts
-from symphony.trainers.tracking import read_metrics
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import Rollouts
+from symphony.training import train
+from symphony.training.learner import Learner
+from symphony.training.logging import read_metrics
+from symphony.training.previews import QUANTILES, ROLLOUTS, Show, Shown, clip_of, samples_of
 
 MOTIONS = ("speed", "acceleration", "turn")
 
@@ -73,7 +75,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"".join(clip.position.tobytes() for clip in clips))
 
-    monkeypatch.setattr("symphony.trainers.showing.animate_rollouts", write)
+    monkeypatch.setattr("symphony.training.previews.animate_rollouts", write)
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +146,7 @@ def test_segments_to_validate_on_are_shown_where_there_are_some(
 ) -> None:
     seen: list[str] = []
     monkeypatch.setattr(
-        "symphony.trainers.showing.animate_rollouts",
+        "symphony.training.previews.animate_rollouts",
         lambda clips, path: seen.extend(clip.segment.segment_id for clip in clips),
     )
     for data in (None, held_out):

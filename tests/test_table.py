@@ -19,7 +19,11 @@ from rich.console import Console
 
 from helpers_segments import crossing, straight_road
 from symphony.cli import main
-from symphony.cli.comparison import (
+from symphony.config import AgentConfig, EvaluateConfig, Method, TrainConfig
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation import evaluate
+from symphony.evaluation.comparison import (
     COLUMNS,
     ROWS,
     SETTINGS,
@@ -30,15 +34,12 @@ from symphony.cli.comparison import (
     family,
     method_name,
 )
-from symphony.cli.evaluations import evaluation_name, find_runs, keep_evaluation, kept_evaluations
-from symphony.cli.formats import FORMATS, as_json, as_latex, as_markdown, as_text, print_text
-from symphony.cli.paper import METRICS, paper_figures
-from symphony.config import AgentConfig, EvaluateConfig, Method, TrainConfig
-from symphony.data.store import SegmentStore, StoreWriter
-from symphony.errors import ConfigError, DataError
+from symphony.evaluation.formats import FORMATS, as_json, as_latex, as_markdown, as_text, print_text
+from symphony.evaluation.paper import METRICS, paper_figures
+from symphony.evaluation.records import evaluation_name, find_runs, keep_evaluation, kept_evaluations
 from symphony.metrics import jensen_shannon
 from symphony.render import plot_curvature
-from symphony.trainers import evaluate, train
+from symphony.training import train
 
 METHODS = get_args(Method)
 NUMBERS = st.floats(0, 100)

@@ -12,16 +12,19 @@ import torch
 
 from helpers_segments import crossing, straight_road
 from symphony import keys
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import checkpoints
 from symphony.cli import main
 from symphony.config import AgentConfig, EvaluateConfig, TrainConfig, from_dict, to_json
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
+from symphony.evaluation import evaluate
 from symphony.metrics import collisions, offroad
-from symphony.trainers import evaluate, load_agent, simulate, train
-from symphony.trainers.checkpoint import checkpoints
-from symphony.trainers.dataset import SceneDataset, experts
-from symphony.trainers.tracking import read_metrics
+from symphony.simulation import simulate
+from symphony.simulation.demonstrations import SceneDataset, experts
+from symphony.training import train
+from symphony.training.logging import read_metrics
 
 TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
 

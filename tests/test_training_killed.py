@@ -16,13 +16,14 @@ import pytest
 import helpers_killed
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
+from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
+from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.data.store import StoreWriter
 from symphony.errors import ConfigError, DataError, SymphonyError
-from symphony.trainers import train
-from symphony.trainers.checkpoint import CheckpointError, checkpoints, latest
-from symphony.trainers.selection import choose
-from symphony.trainers.tracking import Tracker, read_metrics, write_file
+from symphony.files import write_file
+from symphony.training import train
+from symphony.training.logging import Tracker, read_metrics
 
 METHODS = ("bc", "bc_ts")
 

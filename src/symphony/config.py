@@ -49,6 +49,11 @@ Rule = Literal["best", "systematic"]
 Survivors = Literal["all", "best"]
 Cost = Literal["log_d", "non_saturating", "logit"]
 Search = Literal["agent", "none", "tree", "oracle", "best"]
+Setting = Literal["main", "long", "many"]
+"""Of the paper's tables: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
+PaperData = Literal["proprietary", "womd"]
+"""Data sets whose figures the paper gives."""
+TableFormat = Literal["text", "markdown", "latex", "json"]
 
 
 @dataclass(frozen=True)

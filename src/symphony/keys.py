@@ -9,6 +9,8 @@ Key = str | tuple[str, ...]
 
 SCENE: Key = "scene"
 """[..., 1] int64: row of the environment's scene batch."""
+SEGMENT: Key = "segment"
+"""[..., 1] int64: number of the run segment among those that scenes are drawn from."""
 STEP: Key = "step"
 """[..., 1] int64: simulated steps since the first state."""
 STREAM: Key = "stream"

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from symphony.cli.evaluate import evaluate_with_bar
-from symphony.cli.tables import print_metrics, write_json
+from symphony.cli.tables import print_metrics
 from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
+from symphony.files import write_json
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,10 @@ class Demo:
 
         from rich.console import Console
 
+        from symphony.agents import load_agent
         from symphony.cli.pictures import draw_compared
         from symphony.data.builtin import builtin_store
-        from symphony.trainers import load_agent, train
+        from symphony.training import train
 
         console = Console()
         began = time.perf_counter()

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from symphony.cli.evaluations import evaluation_record, keep_evaluation
-from symphony.cli.tables import print_metrics, write_json
+from symphony.cli.tables import print_metrics
 from symphony.config import EvaluateConfig
+from symphony.files import write_json
 
 if TYPE_CHECKING:
+    from symphony.agents import Agent
     from symphony.data.store import SegmentStore
-    from symphony.trainers import Agent, Evaluation
+    from symphony.evaluation import Evaluation
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Judged:
     Attributes:
         agent: that was judged.
         rows: numbers of log playback, then those of the agent; one row where they are the same.
-        record: all of it as JSON can hold it (see :func:`symphony.cli.evaluations.evaluation_record`).
+        record: all of it as JSON can hold it (see :func:`symphony.evaluation.records.evaluation_record`).
     """
 
     agent: Agent
@@ -80,8 +81,9 @@ class Judged:
         None for a baseline, which has no folder, and for an agent that comes with the package, whose folder is not
         the user's.
         """
-        from symphony.trainers.pretrained import is_pretrained
-        from symphony.trainers.selection import split_name
+        from symphony.agents.choice import split_name
+        from symphony.agents.included import is_pretrained
+        from symphony.evaluation.records import keep_evaluation
 
         if self.record["run"] is None or is_pretrained(self.agent.name):
             return None
@@ -92,12 +94,13 @@ def judge(name: str, data: Path, config: EvaluateConfig) -> Judged:
     """Judge an agent, and log playback beside it, on every run segment of a store.
 
     Args:
-        name: of the agent (see :func:`symphony.trainers.load_agent`).
+        name: of the agent (see :func:`symphony.agents.load_agent`).
         data: folder of the store.
         config: how.
     """
+    from symphony.agents import load_agent
     from symphony.data.store import SegmentStore
-    from symphony.trainers import load_agent
+    from symphony.evaluation.records import evaluation_record
 
     agent, store = load_agent(name, config.device), SegmentStore(data)
     result = log = evaluate_with_bar(agent, store, config)
@@ -114,7 +117,7 @@ def evaluate_with_bar(agent: Agent | str, data: SegmentStore | Path, config: Eva
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from symphony.trainers import evaluate
+    from symphony.evaluation import evaluate
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("segments"))
     with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:

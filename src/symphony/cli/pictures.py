@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from symphony.agents import Agent
     from symphony.render import Clip
-    from symphony.trainers import Agent
 
 PANELS = 6
 """Run segments in one picture."""
@@ -75,7 +75,7 @@ def draw_compared(
 
 def _spread(data: Path, count: int) -> list[int]:
     from symphony.data.store import SegmentStore
-    from symphony.trainers.dataset import spread
+    from symphony.simulation.demonstrations import spread
 
     return spread(len(SegmentStore(data)), count)
 
@@ -95,9 +95,9 @@ def _clips(
 
     from symphony.config import EvaluateConfig
     from symphony.data.store import SegmentStore
-    from symphony.trainers.dataset import SceneDataset
-    from symphony.trainers.evaluation import driven_by
-    from symphony.trainers.showing import clip_of
+    from symphony.evaluation.evaluator import driven_by
+    from symphony.simulation.demonstrations import SceneDataset
+    from symphony.training.previews import clip_of
 
     store = SegmentStore(data)
     dataset = SceneDataset(store, interactive, agent.dynamics, chosen, routes=agent.goals is not None)

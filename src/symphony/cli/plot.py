@@ -11,10 +11,10 @@ import tyro
 from symphony.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from symphony.agents import Agent
     from symphony.data.store import SegmentStore
     from symphony.render import SearchTree
-    from symphony.trainers import Agent
-    from symphony.trainers.dataset import SceneDataset
+    from symphony.simulation.demonstrations import SceneDataset
 
 app = tyro.extras.SubcommandApp()
 
@@ -53,11 +53,11 @@ class Tree:
 
     def run(self) -> None:
         """Search and draw."""
+        from symphony.agents import load_agent
         from symphony.data.store import SegmentStore
         from symphony.render import plot_search
         from symphony.render.style import picture_path
-        from symphony.trainers import load_agent
-        from symphony.trainers.dataset import SceneDataset
+        from symphony.simulation.demonstrations import SceneDataset
 
         picture_path(self.out)
         agent = load_agent(self.agent, self.device)
@@ -79,7 +79,7 @@ class Tree:
         from symphony import keys
         from symphony.envs.driving import DrivingEnv
         from symphony.render import SearchTree
-        from symphony.trainers.simulate import plant, pruning_rule, search
+        from symphony.simulation.rollouts import plant, pruning_rule, search
 
         scene = dataset.scene(0).to(torch.device(self.device))
         env = DrivingEnv(scene, agent.dynamics, agent.observation)
@@ -163,9 +163,9 @@ class Rollouts:
 
     def run(self) -> None:
         """Simulate and draw."""
+        from symphony.agents import load_agent
         from symphony.cli.pictures import draw_rollouts
         from symphony.data.store import SegmentStore
-        from symphony.trainers import load_agent
 
         agent, store = load_agent(self.agent, self.device), SegmentStore(self.data)
         if len(store) == 0:
@@ -209,7 +209,7 @@ class Curves:
     def run(self) -> None:
         """Draw them."""
         from symphony.render import plot_curves
-        from symphony.trainers.tracking import read_metrics
+        from symphony.training.logging import read_metrics
 
         found = {}
         for folder, name in zip(self.runs, run_names(self.runs), strict=True):

@@ -9,9 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from symphony.cli.comparison import collect, compare
-from symphony.cli.formats import FORMATS, Format, print_text
-from symphony.cli.paper import Dataset, Setting
+from symphony.config import PaperData, Setting, TableFormat
 from symphony.errors import ConfigError
 
 NAMED = 5
@@ -33,9 +31,9 @@ class Table:
     evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Which evaluation of a run counts, where it keeps several (in its folder `evaluations`); * and ? stand for
     anything. Of several names, the first that fits one decides."""
-    paper: Dataset | None = None
+    paper: PaperData | None = None
     """Show the paper's own figures on this data set beside ours."""
-    format: Format = "text"
+    format: TableFormat = "text"
     """How it is written."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File to write it to; otherwise it is printed."""
@@ -47,6 +45,9 @@ class Table:
     def run(self) -> None:
         """Collect, compare and write."""
         from rich.console import Console
+
+        from symphony.evaluation.comparison import collect, compare
+        from symphony.evaluation.formats import FORMATS, print_text
 
         entries, left_out = collect(self.runs, self.setting, self.evaluation)
         for reason, folders in left_out.items():

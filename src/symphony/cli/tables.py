@@ -1,11 +1,9 @@
-"""Tables and files of results."""
+"""Tables of results on the terminal."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 COLUMNS = (
@@ -63,24 +61,3 @@ def _cell(value: float, error: float | None, digits: int) -> str:
         return "–"
     text = f"{value:.{digits}f}"
     return text if error is None or math.isnan(error) else f"{text} ± {error:.{digits}f}"
-
-
-def write_json(path: Path, result: Any) -> None:
-    """Write a result as JSON; numbers that are not finite become null."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json_text(result), encoding="utf-8")
-
-
-def json_text(result: Any) -> str:
-    """A result as JSON; numbers that are not finite become null."""
-    return json.dumps(_finite(result), indent=2, allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -23,7 +23,7 @@ class Train:
         """Train them."""
         from rich.console import Console
 
-        from symphony.trainers import train
+        from symphony.training import train
 
         folder = train(self.config)
         # Of the processes that torchrun starts, one speaks.

@@ -15,6 +15,7 @@ from torchrl.envs import BatchSizeTransform, Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, _aggregate_end_of_traj
 
 from symphony.collectors.beam_search import Aggregation, Score, beam_search, branch, score_state
+from symphony.collectors.result import BeamSearchResult
 from symphony.collectors.rules import KeepBest, PruningRule
 from symphony.collectors.scores import max_then_sum
 from symphony.errors import ConfigError
@@ -35,6 +36,9 @@ class BeamSearchCollector(Collector):
     - ``("collector", "beam_slot")`` [..., T] int64: slot in which the step was simulated,
     - ``("collector", "mask")`` [..., T] bool: False after the end of an episode that did not last T steps;
       TorchRL's losses leave such steps out. With ``trajs_per_batch`` they are dropped.
+    - with `keep_tree`, ``("collector", "beam_rank")`` [..., T] int64: place of the leaf among those of its tree by
+      the totals of their last periods, 0 for the best; and ``"tree"``, a TensorDict [*env.batch_size, S, T] of all
+      that was simulated, by slot, pruned branches included, with their ``("collector", "beam_score")``.
 
     Frames are counted as returned; `simulated_frames` counts what was simulated for them, about S / L times as
     many.
@@ -48,8 +52,11 @@ class BeamSearchCollector(Collector):
         leaves: L; by default the best leaf alone, without a dimension of its own.
         prepare: called on the branched start state [*env.batch_size, S]; e.g. to give each branch a stream of
             random numbers or a group.
+        keep_tree: also return what was pruned; with ``leaves=branches`` only.
+        rule_noise: ``rule_noise(start, periods) -> [*env.batch_size, periods]``, numbers in [0, 1) for rules that
+            draw, from the branched start state; by default from a generator that :meth:`set_seed` sets.
         prune_every, rule, aggregate, prune_last, slot_keys, group_key, keep, retries, retry_above, reseed: as
-            for :func:`beam_search`. Noise for rules that draw comes from a generator that :meth:`set_seed` sets.
+            for :func:`beam_search`.
         kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T. Batches are never cut short by an
             interruptor, and trajectories all have one length, so `split_trajs` is not available.
 
@@ -73,11 +80,15 @@ class BeamSearchCollector(Collector):
         slot_keys: Sequence[NestedKey] = (),
         group_key: NestedKey | None = None,
         keep: Sequence[NestedKey] | None = None,
+        keep_tree: bool = False,
+        rule_noise: Callable[[TensorDictBase, int], Tensor] | None = None,
         retries: int = 0,
         retry_above: float | None = None,
         reseed: Callable[[TensorDictBase, int], TensorDictBase] | None = None,
         **kwargs: Any,
     ) -> None:
+        if keep_tree and leaves != branches:
+            raise ConfigError(f"keep_tree needs leaves={branches}, as many as branches; leaves is {leaves}")
         if leaves is not None and not 1 <= leaves <= branches:
             raise ConfigError(f"leaves must be 1 ... {branches} branches, is {leaves}")
         if kwargs.get("split_trajs"):
@@ -108,8 +119,11 @@ class BeamSearchCollector(Collector):
             retries=retries,
             retry_above=retry_above,
             reseed=reseed,
-            leaves=leaves or 1,
+            # The leaves of a whole tree stay in the order of their slots.
+            leaves=None if keep_tree else leaves or 1,
+            keep_tree=keep_tree,
         )
+        self._rule_noise = rule_noise
         self._rng = torch.Generator().manual_seed(torch.initial_seed() % (1 << 63))
         self._branched_env = branched_env(self.env)
         done = [("next", key) if isinstance(key, str) else ("next", *key) for key in self.env.done_keys]
@@ -126,34 +140,33 @@ class BeamSearchCollector(Collector):
         start = branch(self.env.reset(), self.branches)
         if self.prepare is not None:
             start = self.prepare(start.copy())
-        periods = -(-self.frames_per_batch // self.prune_every)
         found = self._search(
             self._branched_env,
             self._act,
             self._score,
             start,
             steps=self.frames_per_batch,
-            noise=self.rule_noise((*start.shape[:-1], periods)),
+            noise=self.rule_noise(start),
             keep=self._keep,
             exploration_type=self.exploration_type,
         )
         self.simulated_frames += found.simulated_steps
-        steps = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
-        return self._finish(
-            found.trajectories,
-            found.scores,
-            found.leaf_totals.transpose(-1, -2)[..., steps],
-            found.slots.transpose(-1, -2)[..., steps],
-        )
+        return self._finish(found)
 
-    def _finish(
-        self, leaves: TensorDictBase, scores: Tensor, totals: Tensor, slots: Tensor
-    ) -> TensorDictBase:
+    def _finish(self, found: BeamSearchResult) -> TensorDictBase:
+        leaves, totals = found.trajectories, found.leaf_totals
+        period = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
         if self._compact_next_keys:
             leaves = leaves.exclude(*self._compact_next_keys)
-        leaves.set(("collector", "beam_score"), scores)
-        leaves.set(("collector", "beam_total"), totals)
-        leaves.set(("collector", "beam_slot"), slots)
+        leaves.set(("collector", "beam_score"), found.scores)
+        leaves.set(("collector", "beam_total"), totals.transpose(-1, -2)[..., period])
+        leaves.set(("collector", "beam_slot"), found.slots.transpose(-1, -2)[..., period])
+        if found.tree is not None:
+            order = totals[..., -1, :].argsort(dim=-1, stable=True)
+            rank = order.argsort(dim=-1, stable=True)
+            leaves.set(("collector", "beam_rank"), rank[..., None].expand(leaves.shape).clone())
+            found.tree.set(("collector", "beam_score"), found.simulated_scores)
+            leaves.set("tree", found.tree)
         ended = _aggregate_end_of_traj(leaves.get("next"), done_keys=self.env.done_keys)
         mask = ended.cumsum(-1) - ended.long() == 0
         leaves.set(("collector", "mask"), mask)
@@ -192,9 +205,12 @@ class BeamSearchCollector(Collector):
         output = output.select(*self._policy_output_keys)
         return tensordict.update(output if self.env_device is None else output.to(self.env_device))
 
-    def rule_noise(self, shape: tuple[int, ...]) -> Tensor:
-        """Numbers in [0, 1) for the pruning rule, from the collector's own generator."""
-        return torch.rand(shape, generator=self._rng).to(self.env_device)
+    def rule_noise(self, start: TensorDictBase) -> Tensor:
+        """Numbers [*env.batch_size, P] in [0, 1) for the pruning rule, from a branched start state."""
+        periods = -(-self.frames_per_batch // self.prune_every)
+        if self._rule_noise is not None:
+            return self._rule_noise(start, periods)
+        return torch.rand((*start.shape[:-1], periods), generator=self._rng).to(self.env_device)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the environment and the noise of the pruning rule; returns the next seed."""
@@ -220,6 +236,14 @@ class BeamSearchCollector(Collector):
         plain.set(("collector", "beam_total"), total.new_zeros(plain.shape))
         for name, dtype in (("beam_slot", torch.int64), ("mask", torch.bool)):
             plain.set(("collector", name), torch.zeros(plain.shape, dtype=dtype, device=score.device))
+        if self._search.keywords["keep_tree"]:
+            tree = plain.exclude("collector").clone()
+            plain.set(
+                ("collector", "beam_rank"), torch.zeros(plain.shape, dtype=torch.int64, device=score.device)
+            )
+            plain.set(
+                "tree", tree.set(("collector", "beam_score"), plain.get(("collector", "beam_score")).clone())
+            )
         plain.refine_names(..., "time")
         return self._postproc(self._maybe_set_truncated(plain))
 

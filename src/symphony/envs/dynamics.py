@@ -107,6 +107,8 @@ class Dynamics(Protocol):
     """What the environment needs of a motion model."""
 
     discrete: bool
+    numbers: int
+    """Uniform numbers that decide an action; 0 for a single one without a dimension of its own."""
 
     def step(
         self, state: Float[Tensor, "*b 4"], action: Tensor, size: Float[Tensor, "*b 2"], dt: float
@@ -161,6 +163,7 @@ class Bicycle:
     speed_weight: float = 0.3
     effort: float = 0.002
     discrete: Literal[True] = True
+    numbers: Literal[0] = 0
 
     @property
     def num_actions(self) -> int:
@@ -240,6 +243,7 @@ class Displacement:
     """Continuous displacement in the agent's own frame (the action space the paper uses for MGAIL)."""
 
     discrete: Literal[False] = False
+    numbers: Literal[2] = 2
 
     def step(
         self,

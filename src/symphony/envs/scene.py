@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -51,6 +51,24 @@ _MARKS = {
 }
 
 
+class SceneSource(Protocol):
+    """Where an environment draws its scenes from, such as a store that is larger than memory.
+
+    Attributes:
+        interactive: N, interactive agents per scene.
+    """
+
+    interactive: int
+
+    def draw(self, count: int, rng: torch.Generator) -> list[int]:
+        """Numbers of different run segments at random (all, if there are fewer)."""
+        ...
+
+    def scenes(self, items: Sequence[int]) -> SceneBatch:
+        """The run segments of these numbers as one batch, which names them in ``segment``."""
+        ...
+
+
 class SceneBatch(TensorClass):
     """B run segments as padded tensors; a mask travels with every padded field.
 
@@ -76,6 +94,8 @@ class SceneBatch(TensorClass):
         edge_following: [B, E] int32.
         edge_valid: [B, E].
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
+        segment: [B] int64 number of the run segment among those that scenes are drawn from.
+        dt: [B] float64 seconds per step, the same in all scenes of a batch.
         route: [B, N, G, K, 2] points of the feasible routes of the interactive agents; G = 0 where not asked for.
         route_count: [B, N, G] int64 points that exist; 0 for padding.
         route_logged: [B, N] int64 the route nearest to what the log shows, -1 for none.
@@ -101,13 +121,19 @@ class SceneBatch(TensorClass):
     edge_following: Tensor
     edge_valid: Tensor
     stream: Tensor
+    segment: Tensor
+    dt: Tensor
     route: Tensor
     route_count: Tensor
     route_logged: Tensor
 
 
 def scene(
-    segment: RunSegment, interactive: int | Sequence[int] = 2, graph: LaneGraph | None = None
+    segment: RunSegment,
+    interactive: int | Sequence[int] = 2,
+    graph: LaneGraph | None = None,
+    *,
+    number: int = 0,
 ) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
@@ -115,6 +141,7 @@ def scene(
         segment: a validated run segment.
         interactive: how many agents are interactive (chosen by the paper's rule), or their rows.
         graph: of the segment's lanes; with it the scene holds the routes of its interactive agents.
+        number: of the segment among those that scenes are drawn from.
 
     Raises:
         DataError: if the segment has fewer usable agents.
@@ -148,6 +175,8 @@ def scene(
         "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
         "stream": np.array(stream_of(segment.segment_id)),
+        "segment": np.array(number),
+        "dt": np.array(segment.dt, np.float64),
         **_points(segment),
         **_routes(
             [] if graph is None else [route_table(segment, graph, int(a)) for a in chosen], len(chosen)
@@ -162,7 +191,14 @@ def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
     """Stack scenes into one batch, padded to the largest of each size.
 
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``.
+
+    Raises:
+        DataError: for scenes of different time steps.
     """
+    steps = torch.cat([item.dt for item in scenes])
+    if bool((steps != steps[0]).any()):
+        lengths = ", ".join(f"{dt:g} s" for dt in sorted(set(steps.tolist())))
+        raise DataError(f"segments of different time steps in one batch: {lengths}", field="dt")
     fields = {}
     for name in SceneBatch.__annotations__:
         values = [getattr(item, name) for item in scenes]

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
-Setting = Literal["main", "long", "many"]
-"""10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
-Dataset = Literal["proprietary", "womd"]
+from symphony.config import PaperData, Setting
+
 Figure = tuple[float, float]
 """Mean and standard error over five seeds; NaN where there is none."""
 
 METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
 
 # Per metric: mean, standard error. Percent, percent, metres, metres, thousandths of a nat.
-_TABLES: dict[tuple[Setting, Dataset], str] = {
+_TABLES: dict[tuple[Setting, PaperData], str] = {
     ("main", "proprietary"): """
         playback    0.99 -      0.40 -     -     -     -     -     -    -
         bc          16.65 0.41  2.16 0.08  5.80 0.07  2.16 0.04  2.82 0.26
@@ -62,7 +60,7 @@ _TABLES: dict[tuple[Setting, Dataset], str] = {
 }
 
 
-def paper_figures(setting: Setting, dataset: Dataset) -> dict[str, dict[str, Figure]] | None:
+def paper_figures(setting: Setting, dataset: PaperData) -> dict[str, dict[str, Figure]] | None:
     """The paper's figures by method and metric, in our units (the divergence in nats); None if it has none."""
     text = _TABLES.get((setting, dataset))
     if text is None:

@@ -14,13 +14,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from symphony.cli.tables import json_text
+from symphony.agents.choice import choose, split_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
+from symphony.files import json_text
 
 if TYPE_CHECKING:
+    from symphony.agents import Agent
     from symphony.data.store import SegmentStore
-    from symphony.trainers import Agent, Evaluation
+    from symphony.evaluation import Evaluation
 
 FORMAT = 1
 """Version of a kept evaluation."""
@@ -74,8 +76,6 @@ def evaluation_record(
 
 
 def _run_facts(name: str) -> dict[str, Any] | None:
-    from symphony.trainers.selection import choose, split_name
-
     folder, which = split_name(name)
     if not (folder / "config.json").is_file():
         return None

@@ -21,7 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 from symphony.errors import ConfigError
 from symphony.objectives.base import MaskedLoss
 from symphony.streams import stream_of
-from symphony.trainers.learner import Learner
+from symphony.training.learner import Learner
 
 _SEED_STRIDE = 1 << 20
 _PATIENCE = timedelta(days=1)

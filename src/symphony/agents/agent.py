@@ -9,15 +9,15 @@ from pathlib import Path
 import torch
 from tensordict.nn import TensorDictModuleBase
 
+from symphony.agents.checkpoint import load_checkpoint
+from symphony.agents.choice import choose, split_name
+from symphony.agents.included import PREFIX
+from symphony.agents.networks import Networks, build_networks, dynamics_of, observation_config
 from symphony.config import SearchConfig, TrainConfig, from_dict
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
-from symphony.trainers.checkpoint import load_checkpoint
-from symphony.trainers.networks import Networks, build_networks, dynamics_of, observation_config
-from symphony.trainers.pretrained import PREFIX
-from symphony.trainers.selection import choose, split_name
 
 PLAYBACK = "playback"
 """Name of the logged trajectories themselves, judged like an agent."""

@@ -29,8 +29,8 @@ from safetensors.torch import load as decode_tensors
 from safetensors.torch import save as encode_tensors
 from torch import Tensor, nn
 
+from symphony.agents.codec import decode, encode
 from symphony.errors import DataError
-from symphony.trainers.plain import decode, encode
 
 FORMAT = 1
 MANIFEST = "checkpoint.json"

@@ -10,14 +10,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from symphony import keys
-from symphony.collectors import BeamSearchResult, KeepAll
+from symphony.agents.networks import Networks, observation_config
+from symphony.collectors import BeamSearchResult, KeepAll, branch, with_rows
 from symphony.config import TrainConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss, auc
-from symphony.streams import fold_in
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.networks import Networks, observation_config
-from symphony.trainers.simulate import pruning_rule, search
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import branched_streams, pruning_rule, search
 
 _SEED_STRIDE = 1_000_003
 _SEEN = (keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE)
@@ -217,13 +216,14 @@ class Learner:
     def _search(self, step: int, rng: torch.Generator) -> SearchData:
         """Search from the first states of fresh scenes with the networks as they are."""
         settings = self.config.search
-        items = self.dataset.draw(settings.segments, rng)
-        scenes = self.dataset.scenes(items).to(self.device)
-        env = DrivingEnv(scenes, self.dataset.dynamics, self.sees)
-        scene = torch.arange(len(items), device=self.device)[:, None].expand(-1, settings.branches)
-        # The stream of a branch is that of its update too, so that each search draws anew.
-        start = env.start(scene, torch.arange(settings.branches, device=self.device).expand(scene.shape))
-        start.set(keys.STREAM, fold_in(start.get(keys.STREAM), step))
+        rows = [min(settings.segments, len(self.dataset))]
+        driving = DrivingEnv(
+            self.dataset, self.dataset.dynamics, self.sees, generator=rng, device=self.device
+        )
+        # A reset gives each row a stream of its own, so that each search draws anew.
+        start = branched_streams(branch(with_rows(driving, rows).reset(), settings.branches))
+        env, scenes = driving, driving.scenes
+        items = scenes.segment.tolist()
         if self.networks.goals is not None:
             start = env.with_goals(start)
         result = search(

@@ -10,7 +10,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, get_args
 
-from symphony.cli.evaluations import (
+from symphony.config import Method, PaperData, Setting
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation.paper import METRICS, paper_figures
+from symphony.evaluation.records import (
     find_runs,
     kept_evaluations,
     read_run,
@@ -18,9 +21,6 @@ from symphony.cli.evaluations import (
     simulation_name,
     updates_done,
 )
-from symphony.cli.paper import METRICS, Dataset, Setting, paper_figures
-from symphony.config import Method
-from symphony.errors import ConfigError, DataError
 
 PLAYBACK = "playback"
 ROWS: tuple[str, ...] = (PLAYBACK, *get_args(Method))
@@ -122,7 +122,7 @@ class Comparison:
     """
 
     setting: Setting
-    dataset: Dataset | None
+    dataset: PaperData | None
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
 
@@ -251,7 +251,7 @@ def _check_distinct(entries: Sequence[Entry]) -> None:
             )
 
 
-def compare(entries: Sequence[Entry], setting: Setting, dataset: Dataset | None = None) -> Comparison:
+def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | None = None) -> Comparison:
     """The table of some evaluated runs; their order does not matter.
 
     Raises:
@@ -344,7 +344,7 @@ def _way(entry: Entry) -> dict[str, Any]:
     return {name: value for name, value in entry.record["config"].items() if name != "seed"}
 
 
-def _notes(entries: Sequence[Entry], dataset: Dataset | None) -> list[str]:
+def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     record = entries[0].record
     notes = [
         f"{record['segments']} run segments of {record['data']['name']} "

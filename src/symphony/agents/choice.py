@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from symphony.agents.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from symphony.agents.included import is_pretrained, pretrained_folder
 from symphony.errors import ConfigError
-from symphony.trainers.checkpoint import CheckpointError, checkpoints, load_checkpoint
-from symphony.trainers.pretrained import is_pretrained, pretrained_folder
 
 _STEP = re.compile(r"(?:step-)?(\d+)")
 

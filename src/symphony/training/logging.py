@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from numpy.typing import NDArray
 
-from symphony.errors import DataError
+from symphony.files import naming, write_file
 
 
 class Tracker:
@@ -107,23 +106,3 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return records
-
-
-def write_file(path: Path, text: str) -> None:
-    """Write a text file that appears complete or not at all. Raises DataError if the disk refuses."""
-    new = path.with_name(f".new-{path.name}")
-    with naming(path):
-        with new.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)
-
-
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Errors of the disk, with the file that they are about."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"can't be written: {error.strerror or error}", file=path) from error

@@ -22,7 +22,7 @@ from symphony.collectors import (
 )
 from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
-from symphony.modules import drawn_goals
+from symphony.modules import SeededNoise, drawn_goals
 from symphony.streams import fold_in, uniform
 
 ENDED = -100.0
@@ -53,39 +53,6 @@ class Rollouts(NamedTuple):
     def cpu(self) -> Rollouts:
         """The same on the CPU."""
         return Rollouts(*(part.cpu() for part in self))
-
-
-class SeededNoise(TensorDictModuleBase):
-    """Gives every agent the random number its next action is decided by.
-
-    It depends on the seed, the rollout's identity, the step and the agent's place alone (never on the batch).
-
-    Args:
-        seed: of the evaluation.
-        numbers: per agent; 0 for a single one without a dimension of its own.
-    """
-
-    in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
-    out_keys = [keys.NOISE]  # noqa: RUF012
-
-    def __init__(self, seed: int, numbers: int = 0) -> None:
-        super().__init__()
-        self.seed, self.numbers = seed, numbers
-
-    @classmethod
-    def of(cls, env: DrivingEnv, seed: int) -> SeededNoise:
-        """As many numbers as an action of the environment takes."""
-        return cls(seed, 0 if env.dynamics.discrete else 2)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write numbers [..., N] or [..., N, numbers] in (0, 1)."""
-        agents = tensordict.get(keys.VALID).shape[-1]
-        place = torch.arange(agents, device=tensordict.device)
-        stream, step = fold_in(tensordict.get(keys.STREAM), place), tensordict.get(keys.STEP)
-        if self.numbers:
-            stream = fold_in(stream[..., None], torch.arange(self.numbers, device=stream.device))
-            step = step[..., None]
-        return tensordict.set(keys.NOISE, uniform(self.seed, stream, step))
 
 
 @torch.no_grad()
@@ -231,7 +198,7 @@ def search(
     following = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
     return beam_search(
         env,
-        TensorDictSequential(SeededNoise.of(env, seed), policy),
+        TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
         until_the_end,
         start,
         steps=steps,
@@ -247,6 +214,12 @@ def search(
         retry_above=retry_above if retries else None,
         reseed=_reseed,
     )
+
+
+def branched_streams(start: TensorDictBase) -> TensorDictBase:
+    """A start state [*b, S] whose branches each have a stream of random numbers of their own."""
+    slot = torch.arange(start.shape[-1], device=start.device)[:, None]
+    return start.set(keys.STREAM, fold_in(start.get(keys.STREAM), slot))
 
 
 def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:

@@ -13,20 +13,21 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from symphony.agents.agent import read_config
+from symphony.agents.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
+from symphony.agents.choice import Best, choose, split_name
+from symphony.agents.networks import Networks, build_networks, dynamics_of
 from symphony.config import TrainConfig, to_json
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.trainers.agents import read_config
-from symphony.trainers.alarms import ALARMS, NORM, Alarms, Skips, loss_of
-from symphony.trainers.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.distributed import Processes, processes
-from symphony.trainers.learner import Learner
-from symphony.trainers.networks import Networks, build_networks, dynamics_of
-from symphony.trainers.selection import Best, choose, split_name
-from symphony.trainers.showing import Show
-from symphony.trainers.tracking import Tracker, write_file
-from symphony.trainers.validation import Validator
+from symphony.files import write_file
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
+from symphony.training.learner import Learner
+from symphony.training.logging import Tracker
+from symphony.training.previews import Show
+from symphony.training.processes import Processes, processes
+from symphony.training.validation import Validator
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""

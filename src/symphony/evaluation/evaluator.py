@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
+from symphony.agents.agent import Agent, load_agent
 from symphony.collectors import KeepAll, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
@@ -19,12 +20,11 @@ from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds, collisions, offroad
+from symphony.modules import SeededNoise
 from symphony.roadgraph import LaneGraph, visited_curvatures
-from symphony.trainers.agents import Agent, load_agent
-from symphony.trainers.dataset import SceneDataset, logged
-from symphony.trainers.simulate import (
+from symphony.simulation.demonstrations import SceneDataset, logged
+from symphony.simulation.rollouts import (
     Rollouts,
-    SeededNoise,
     plant,
     pruning_rule,
     rollouts_of,
@@ -72,7 +72,7 @@ def evaluate(
     """Judge an agent on every run segment of a store (paper, section V-B).
 
     Args:
-        agent: an agent, or the name of one (see :func:`symphony.trainers.load_agent`).
+        agent: an agent, or the name of one (see :func:`symphony.agents.load_agent`).
         data: a store, or its folder.
         config: how.
         progress: called with the segments done and their total.
@@ -192,7 +192,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         logged_goals=config.logged_goals,
     )
     if _kind(agent, config) == "none":
-        policy = TensorDictSequential(SeededNoise.of(env, config.seed), agent.policy)
+        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), agent.policy)
         found = simulate(env, policy, start)
     else:
         best = config.search == "best"

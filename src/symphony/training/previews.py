@@ -11,18 +11,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.agents.agent import assemble
 from symphony.config import EvaluateConfig, TrainConfig
 from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
+from symphony.evaluation.evaluator import simulated
+from symphony.files import naming
 from symphony.geometry.frames import wrap
 from symphony.render import Clip, animate_rollouts
-from symphony.trainers.agents import assemble
-from symphony.trainers.dataset import SceneDataset, logged, spread
-from symphony.trainers.evaluation import simulated
-from symphony.trainers.learner import Learner
-from symphony.trainers.simulate import Rollouts
-from symphony.trainers.tracking import naming
-from symphony.trainers.validation import undisturbed
+from symphony.simulation.demonstrations import SceneDataset, logged, spread
+from symphony.simulation.rollouts import Rollouts
+from symphony.training.learner import Learner
+from symphony.training.validation import undisturbed
 
 PANELS = 2
 """Run segments in the animation, at most."""

@@ -8,14 +8,14 @@ from contextlib import contextmanager
 
 import torch
 
+from symphony.agents.agent import assemble
+from symphony.agents.choice import Best
+from symphony.agents.networks import Networks, dynamics_of
 from symphony.config import EvaluateConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
-from symphony.trainers.agents import assemble
-from symphony.trainers.dataset import SceneDataset, spread
-from symphony.trainers.evaluation import judge
-from symphony.trainers.networks import Networks, dynamics_of
-from symphony.trainers.selection import Best
+from symphony.evaluation.evaluator import judge
+from symphony.simulation.demonstrations import SceneDataset, spread
 
 METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
-from symphony.cli.comparison import COLUMNS, SETTINGS, Cell, Column, Comparison, Row, family
-from symphony.cli.tables import json_text
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-Format = Literal["text", "markdown", "latex", "json"]
+from symphony.config import TableFormat
+from symphony.evaluation.comparison import COLUMNS, SETTINGS, Cell, Column, Comparison, Row, family
+from symphony.files import json_text
 
 NOTHING = "–"
 WIDE = 200
@@ -21,10 +23,6 @@ WIDE = 200
 
 def print_text(comparison: Comparison, console: Console) -> None:
     """Print the table; the best values bold on a terminal and with a star elsewhere."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-    from rich.text import Text
-
     table = Table(title=comparison.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("method", no_wrap=True)
     table.add_column("seeds", justify="right")
@@ -60,10 +58,6 @@ def print_text(comparison: Comparison, console: Console) -> None:
 
 def as_text(comparison: Comparison) -> str:
     """The table as plain text."""
-    import io
-
-    from rich.console import Console
-
     file = io.StringIO()
     print_text(comparison, Console(file=file, width=WIDE, force_terminal=False, color_system=None))
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines()) + "\n"
@@ -126,7 +120,7 @@ def as_json(comparison: Comparison) -> str:
     )
 
 
-FORMATS: dict[Format, Callable[[Comparison], str]] = {
+FORMATS: dict[TableFormat, Callable[[Comparison], str]] = {
     "text": as_text,
     "markdown": as_markdown,
     "latex": as_latex,

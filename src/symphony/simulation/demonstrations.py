@@ -170,7 +170,8 @@ class SceneDataset:
 
     def _scene(self, i: int) -> SceneBatch:
         """Item ``i`` as a batch of one scene."""
-        return scene(self.segment(i), self.interactive, self.graph(i) if self.routes else None)
+        graph = self.graph(i) if self.routes else None
+        return scene(self.segment(i), self.interactive, graph, number=i)
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""
