@@ -22,7 +22,8 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.metrics import collisions, offroad
 from symphony.simulation import simulate
-from symphony.simulation.demonstrations import SceneDataset, experts
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.experts import experts
 from symphony.training import train
 from symphony.training.logging import read_metrics
 
