@@ -332,10 +332,11 @@ class DrivingEnv(EnvBase):
                 "offroad": back(offroad)[..., None],
             },
             batch_size=each,
+            device=self.device,  # one without a device would be taken for a transfer, and waited for
         )
         if observation:
             parts = {name: back(value) for name, value in observation.items()}
-            agents.set("observation", TensorDict(parts, batch_size=each))
+            agents.set("observation", TensorDict(parts, batch_size=each, device=self.device))
         return TensorDict(
             {
                 "scene": scene[..., None],

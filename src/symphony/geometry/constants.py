@@ -13,11 +13,12 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
     """A tensor of these (nested tuples of) numbers; shared, so never written to."""
     if torch.compiler.is_compiling():
         return torch.tensor(values, dtype=dtype, device=device)
-    return _made(values, dtype, device)
+    return made(values, dtype, device)
 
 
 @cache
-def _made(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+def made(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """What :func:`constant` keeps."""
     # Made outside of inference mode, or autograd could not save it.
     with torch.inference_mode(False), torch.no_grad():
-        return torch.tensor(values, dtype=dtype, device=device)
+        return torch.tensor(values, dtype=dtype).to(device)
