@@ -79,9 +79,15 @@ def offroad_flags(
         return road_distance(scenes, scene, position) > 0
     flat, row = position.reshape(-1, 2), scene.repeat_interleave(position.shape[1])
     x, y = (np.ascontiguousarray(flat[:, k].numpy()) for k in (0, 1))
-    cell = cells.locate(row.numpy(), x, y)
+    owner = row.numpy()
+    cell = cells.locate(owner, x, y)
     sign = np.where(cell >= 0, cells.sign[cell], 0) if len(cells.sign) else np.zeros(len(cell), np.int8)
-    unsure = torch.from_numpy(np.flatnonzero(sign == 0))
-    off = torch.from_numpy(sign > 0)
-    off[unsure] = road_distance(scenes, row[unsure], flat[unsure][:, None], tables)[:, 0] > 0
-    return off.view(position.shape[:2])
+    off, near = sign > 0, np.flatnonzero((sign == 0) & (cell >= 0))
+    if len(near):
+        place, edges = (cell[near], x[near], y[near]), tables.segments
+        off[near] = edges.right_of(cells.nearest_edge(owner[near], *place, edges), *place[1:])
+    far = np.flatnonzero(cell < 0)
+    if len(far):
+        outside = road_distance(scenes, row[far], flat[far][:, None])
+        off[far] = (outside[:, 0] > 0).numpy()
+    return torch.from_numpy(off).view(position.shape[:2])

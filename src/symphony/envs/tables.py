@@ -105,7 +105,8 @@ class Tables:
     @cached_property
     def segments(self) -> Edges:
         """The boundary component by component (CPU)."""
-        return Edges.of(*(self.edges[name][0].numpy() for name in ("start", "end")))
+        names = ("start", "end", "valid", "previous", "following")
+        return Edges.of(*(self.edges[name][0].numpy() for name in names))
 
     @cached_property
     def point_grids(self) -> GridSource:

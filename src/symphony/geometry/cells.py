@@ -104,19 +104,56 @@ class Cells:
 
 
 class Edges(NamedTuple):
-    """All edges of all maps, component by component [B * E]: start, direction and half the length."""
+    """All edges of all maps, component by component [B * E].
+
+    Attributes:
+        x: of the start.
+        y: of the start.
+        unit_x: direction.
+        unit_y: direction.
+        half: half the length.
+        previous: number of the edge that ends where this one starts, -1 if none that has a length.
+        following: number of the edge that starts where this one ends, likewise.
+    """
 
     x: Reals
     y: Reals
     unit_x: Reals
     unit_y: Reals
     half: Reals
+    previous: Indices
+    following: Indices
+
+    def right_of(self, nearest: Indices, x: Reals, y: Reals) -> NDArray[np.bool_]:
+        """Whether positions [R] lie to the right of their nearest edges: the sign of
+        :func:`symphony.geometry.signed_distance` without the distance.
+        """
+        along, right = self._side(nearest, x, y)
+        corners = (self.previous, along < 0, False), (self.following, along > 2 * self.half[nearest], True)
+        result = right.copy()
+        for neighbor, beyond, ahead in corners:
+            at = np.flatnonzero(beyond)
+            at = at[neighbor[nearest[at]] >= 0]
+            here, other = nearest[at], neighbor[nearest[at]]
+            _, beside = self._side(other, x[at], y[at])
+            first, second = (here, other) if ahead else (other, here)
+            turn = self.unit_x[first] * self.unit_y[second] - self.unit_y[first] * self.unit_x[second]
+            result[at] = np.where(turn > 0, right[at] | beside, right[at] & beside)
+        return result
+
+    def _side(self, edge: Indices, x: Reals, y: Reals) -> tuple[Reals, NDArray[np.bool_]]:
+        away_x, away_y = x - self.x[edge], y - self.y[edge]
+        unit_x, unit_y = self.unit_x[edge], self.unit_y[edge]
+        return away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x > 0
 
     @classmethod
-    def of(cls, start: Reals, end: Reals) -> Edges:
-        """From first and last points [B * E, 2]."""
+    def of(
+        cls, start: Reals, end: Reals, valid: NDArray[np.bool_], previous: Indices, following: Indices
+    ) -> Edges:
+        """From first and last points [B * E, 2], which edges exist and have a length, and their neighbours."""
         along = end - start
         length = np.hypot(along[:, 0], along[:, 1])
         unit = along / np.where(length > 0, length, 1)[:, None]
         parts = start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length
-        return cls(*(np.ascontiguousarray(part, dtype=start.dtype) for part in parts))
+        known = (np.where((link >= 0) & valid[link], link, -1) for link in (previous, following))
+        return cls(*(np.ascontiguousarray(part, dtype=start.dtype) for part in parts), *known)
