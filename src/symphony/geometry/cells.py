@@ -154,6 +154,9 @@ class Edges(NamedTuple):
         along = end - start
         length = np.hypot(along[:, 0], along[:, 1])
         unit = along / np.where(length > 0, length, 1)[:, None]
-        parts = start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length
-        known = (np.where((link >= 0) & valid[link], link, -1) for link in (previous, following))
-        return cls(*(np.ascontiguousarray(part, dtype=start.dtype) for part in parts), *known)
+        x, y, unit_x, unit_y, half = (
+            np.ascontiguousarray(part, dtype=start.dtype)
+            for part in (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
+        )
+        before, after = (np.where((link >= 0) & valid[link], link, -1) for link in (previous, following))
+        return cls(x, y, unit_x, unit_y, half, before, after)
