@@ -12,7 +12,7 @@ DEV := $(VENV)/.dev
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo table test fuzz lint format clean
+.PHONY: help setup demo table test fuzz bench lint format clean
 
 help:  ## what there is
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -41,6 +41,10 @@ lint: $(DEV)  ## style, types, imports between packages, file lengths
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/lint_length.py
+
+bench: $(DEV)  ## speed of simulation and search, in CPU time of one thread
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks/test_simulation_benchmark.py --benchmark-timer=time.process_time \
+		--benchmark-columns=median,iqr,rounds --benchmark-sort=name --benchmark-disable-gc
 
 format: $(DEV)  ## rewrite the files in the style that lint asks for
 	$(BIN)/ruff check --fix

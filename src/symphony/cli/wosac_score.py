@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from symphony.cli.tables import write_json
+from symphony.files import write_json
 from symphony.cli.wosac_files import ScenarioScore, score_files, summary
 from symphony.errors import ConfigError
 
