@@ -131,12 +131,14 @@ def beside(rows: Sequence[tuple[str, str]], groups: dict[str, str], columns: Seq
         title: means([(label, pattern.format(folder)) for label, pattern in rows], columns)
         for folder, title in groups.items()
     }
-    grid = [[label] for label in ["", *(label for label, _ in rows)]]
     for title, part in parts.items():
-        grid[0] += [f"{title}: {part[0][1]}", *part[0][2:]]
-        for line, more in zip(grid[1:], part[1:], strict=True):
-            line += more[1:]
-    return grid
+        part[0][1] = f"{title}: {part[0][1]}"
+    labels = ["", *(label for label, _ in rows)]
+    lines = zip(*parts.values(), strict=True)
+    return [
+        [label, *(cell for part in line for cell in part[1:])]
+        for label, line in zip(labels, lines, strict=True)
+    ]
 
 
 def setting(folder: str) -> Grid:

@@ -286,7 +286,7 @@ def test_failure_of_a_program_shows_its_message(tmp_path: Path) -> None:
 def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     process.sumo_home.cache_clear()
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(DataError, match=r"symphony\[sumo\]"):
+    with pytest.raises(DataError, match=r"symphony-traffic\[sumo\]"):
         sumo.generate("town", 0)
     process.sumo_home.cache_clear()
 
