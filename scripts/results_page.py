@@ -51,7 +51,10 @@ MGAIL = (
 )
 FEATURES = (
     ("`paper`: positions, headings, speeds, sizes, map points", "features/paper/bc_ts_h-0-often"),
-    ("`clearance`: also gaps between boxes, distance to the road's edge", "features/clearance/bc_ts_h-0-often"),
+    (
+        "`clearance`: also gaps between boxes, distance to the road's edge",
+        "features/clearance/bc_ts_h-0-often",
+    ),
     ("`foresight`: also the gaps of the next 2 s", "bc/bc_ts_h-0-often"),
 )
 HALVING = (
@@ -76,7 +79,10 @@ WAYS = (
     ("learned with resampling too: independent rollouts", "bc-resampled/bc_ts_h-0-none"),
     ("learned with resampling too: one tree, every 0.4 s", "bc-resampled/bc_ts_h-0-often"),
 )
+PLAYBACK = "log playback"
 NGSIM = (
+    (PLAYBACK, "ngsim/{}/playback"),
+    ("constant velocity", "ngsim/{}/constant_velocity"),
     ("BC", "ngsim/{}/bc-0-none"),
     ("BC+H", "ngsim/{}/bc_h-0-none"),
     ("BC+TS", "ngsim/{}/bc_ts-0-often"),
@@ -90,6 +96,7 @@ MIXED = (
     ("BC+H, then the other place (2 seeds)", "ngsim-mixed/{}/other-bc_h-*"),
     ("BC+TS+H, simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
 )
+NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
 RELATIONS = (
     ("BC to BC+TS", "bc", "bc_ts"),
     ("BC to BC+TS+H", "bc", "bc_ts_h"),
@@ -112,15 +119,19 @@ def records(pattern: str) -> list[Record]:
 
 
 def means(rows: Sequence[tuple[str, str]], columns: Sequence[str] = tuple(COLUMNS)) -> Grid:
-    """A line per row: means over seeds, with standard errors where there are several; the lowest mean in bold."""
+    """A line per row: means over seeds, with standard errors if there are several; the lowest simulated in bold."""
     values = [[[row[name] for row in records(pattern)] for name in columns] for _, pattern in rows]
     average = np.array([[np.mean(cell) for cell in line] for line in values])
     digits = [COLUMNS[name][1] for name in columns]
-    lowest = [np.round(average[:, k], digits[k]).min() for k in range(len(columns))]
+    simulated = average[[label != PLAYBACK for label, _ in rows]]
+    lowest = [np.round(simulated[:, k], digits[k]).min() for k in range(len(columns))]
     grid = [["", *(COLUMNS[name][0] for name in columns)]]
     for (label, _), line in zip(rows, values, strict=True):
         cells = [_mean(cell, number) for cell, number in zip(line, digits, strict=True)]
-        bold = [round(float(np.mean(cell)), digits[k]) == lowest[k] for k, cell in enumerate(line)]
+        bold = [
+            label != PLAYBACK and round(float(np.mean(cell)), digits[k]) == lowest[k]
+            for k, cell in enumerate(line)
+        ]
         grid.append([label, *(f"**{text}**" if b else text for text, b in zip(cells, bold, strict=True))])
     return grid
 
@@ -183,14 +194,14 @@ def against_paper() -> Grid:
 def sweep() -> Grid:
     """What every change of the adversarial settings did, paired over segments with the base."""
     grid = [["", "change", *(heading for heading, _ in COLUMNS.values()), "collisions against base", "AUC"]]
-    for method in ("mgail_h", "mgail"):
+    for method, title in NAMES.items():
         rows = {row["name"]: row for row in records(f"sweep/{method}-*")}
         for name in sorted(rows, key=lambda name: (name != "start", name != "base", name)):
             row = rows[name]
             cells = [_mean([row[key]], digits) for key, (_, digits) in COLUMNS.items()]
             apart = "–" if name == "base" else paired([rows["base"]], [row], "collision_rate", 1)
             what = "the regression alone" if name == "start" else name
-            grid.append([method, what, *cells, apart, f"{row['auc']:.2f}" if "auc" in row else "–"])
+            grid.append([title, what, *cells, apart, f"{row['auc']:.2f}" if "auc" in row else "–"])
     return grid
 
 
