@@ -51,6 +51,8 @@ POINTS: Key = ("agents", "observation", "points")
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
 ROUTE: Key = ("agents", "observation", "route")
 """[..., N, Fr] float: the agent's route as it sees it."""
+SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE)
+"""What an agent observes and could react to."""
 GAP: Key = ("agents", "observation", "gap")
 """[..., N, O] float: signed gap to the box of each object, metres."""
 GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")

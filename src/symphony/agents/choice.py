@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,6 @@ class Best:
 
     step: int
     infractions: float
-
-    def plain(self) -> dict[str, Any]:
-        """As checkpoints keep it."""
-        return asdict(self)
 
     @classmethod
     def of(cls, extra: Mapping[str, Any]) -> Best | None:

@@ -314,6 +314,16 @@ class SegmentStore(Sequence[RunSegment]):
                 raise DataError("content does not match its hash", file=self.path, segment=segment_id)
 
     @property
+    def num_steps(self) -> NDArray[np.int64]:
+        """Logged steps of every segment, the first included."""
+        return self._segments["steps"].astype(np.int64)
+
+    @property
+    def time_steps(self) -> NDArray[np.float64]:
+        """Seconds per step of every segment."""
+        return self._segments["dt"].astype(np.float64)
+
+    @property
     def report(self) -> dict[str, Any]:
         """The conversion report (empty where none was written)."""
         path = self.path / layout.REPORT

@@ -44,13 +44,13 @@ class GoalLoss(MaskedLoss):
                 `("agents", "goal_logits")`.
             mask (NestedKey): bool `[..., N, G]`, True where a goal is feasible. Defaults to
                 `("agents", "routes_mask")`.
-            label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none. Defaults to `("agents", "route")`.
+            label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none. Defaults to `("agents", "goal")`.
             valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `("agents", "valid")`.
         """
 
         logits: NestedKey = ("agents", "goal_logits")
         mask: NestedKey = ("agents", "routes_mask")
-        label: NestedKey = ("agents", "route")
+        label: NestedKey = ("agents", "goal")
         valid: NestedKey = ("agents", "valid")
 
     tensor_keys: _AcceptedKeys

@@ -112,7 +112,7 @@ class MGAILLoss(MaskedLoss):
         # Neither is trained here: in a container they are neither saved nor reset with the loss.
         self._held: dict[str, Any] = {"discriminator": discriminator, "env": env}
         self.horizon, self.cost, self.truncate, self.checkpoint = horizon, cost, truncate, checkpoint
-        self.detach_keys = list(detach_keys)
+        self.detach_keys = [key for key in detach_keys if key in actor_network.in_keys]
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "env":

@@ -103,7 +103,7 @@ def experts(
     return Experts(torch.from_numpy(rows), states, actions, mask[:, 1:] & mask[:, :-1], error, tables)
 
 
-def spread(total: int, count: int) -> list[int]:
+def evenly_spaced(total: int, count: int) -> list[int]:
     """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
     count = min(count, total)
     return [k * total // count for k in range(count)]
@@ -147,6 +147,30 @@ class SceneDataset:
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    @property
+    def dt(self) -> float:
+        """Seconds per step.
+
+        Raises:
+            DataError: if segments differ in it; names one that does.
+        """
+        steps = self.store.time_steps[self.indices]
+        other = np.flatnonzero(steps != steps[0])
+        if len(other):
+            raise DataError(
+                f"has steps of {steps[other[0]]:g} s, others of {steps[0]:g} s",
+                file=self.store.path,
+                segment=self.store.ids[self.indices[other[0]]],
+                field="dt",
+            )
+        return float(steps[0])
+
+    @property
+    def decisions(self) -> int:
+        """Actions until the last logged step of the longest segment, or up to the duration."""
+        longest = int(self.store.num_steps[self.indices].max()) - 1
+        return min(longest, round(self.duration / self.dt)) if self.duration else longest
 
     def segment(self, i: int) -> RunSegment:
         """The run segment behind item ``i``, up to the duration."""

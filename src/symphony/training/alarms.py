@@ -13,12 +13,6 @@ from torch import Tensor
 
 from symphony.errors import SymphonyError
 
-LOSSES = {
-    "policy": ("loss_policy", "loss_distillation", "loss_bc"),
-    "goals": ("loss_goal",),
-    "discriminator": ("loss_discriminator",),
-}
-"""What each network descends; the first of them that there is."""
 NORM = "gradient_norm_"
 PATIENCE = 20
 """Updates in a row that may be skipped."""
@@ -41,9 +35,9 @@ class TrainingError(SymphonyError):
     """Training that can't go on."""
 
 
-def loss_of(network: str, values: Mapping[str, Any]) -> str | None:
-    """The name of the loss that a network descended in an update; None if it was not updated."""
-    return next((name for name in LOSSES.get(network, ()) if name in values), None)
+def loss_of(network: str) -> str:
+    """The name of the loss that a network descends."""
+    return f"loss_{network}"
 
 
 @dataclass
@@ -75,8 +69,8 @@ class Skips:
         self.total += len(bad)
         for name in bad:
             if self.in_row[name] >= PATIENCE:
-                loss = loss_of(name, values)
-                told = "" if loss is None else f" ({loss} is {values[loss].item():g})"
+                loss = loss_of(name)
+                told = f" ({loss} is {values[loss].item():g})" if loss in values else ""
                 raise TrainingError(
                     f"the gradient of the {name} network{told} was not finite in {PATIENCE} updates in a row; "
                     "the last checkpoint is intact: lower the learning rate, or check the data"
@@ -98,7 +92,7 @@ class Alarms:
 
     def check(self, record: Mapping[str, Any]) -> str | None:
         """The alarm (see :data:`ALARMS`) that is on after this record, if any."""
-        value = record.get("auc")
+        value = record.get("discriminator_auc")
         if value is None or math.isnan(value):
             return None
         self._recent.append(value)
