@@ -1,4 +1,4 @@
-"""For the reference: docstrings as Markdown. Cross-references become code, the star of a shape `[*b, S]` stays one."""
+"""For the reference: docstrings as Markdown. Cross-references become code, stars of shapes such as `[*b, S]` stay."""
 
 from __future__ import annotations
 
