@@ -25,6 +25,7 @@ from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.simulation.demonstrations import SceneDataset, logged
 from symphony.simulation.driving import driven_by, search_kind
+from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.rollouts import Rollouts
 
 BASELINES = ("playback", "constant_velocity")
@@ -154,6 +155,7 @@ def evaluate_dataset(
     Raises:
         ConfigError: if the agent learned another time step than the dataset has.
         DataError: if a segment has too few agents for so many interactive ones.
+        NotFiniteError: if a network of the agent puts out a number that is not finite.
     """
     agent.check_step(dataset.dt)
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
@@ -171,7 +173,10 @@ def evaluate_dataset(
         scenes = dataset.scenes(items).to(torch.device(config.device))
         for k, (one, evaluation) in enumerate(zip(everyone, found, strict=True)):
             began = time.process_time()
-            rollouts = driven_by(one, scenes, evaluation.config)
+            try:
+                rollouts = driven_by(one, scenes, evaluation.config)
+            except NotFiniteError as error:
+                raise error.named(dataset.segment(items[error.row]).segment_id) from error
             seconds[k] += time.process_time() - began
             _add(evaluation, dataset, items, scenes, rollouts, own)
             if observe is not None and one is agent:

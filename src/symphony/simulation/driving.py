@@ -6,6 +6,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
+from symphony import keys
 from symphony.agents import Agent
 from symphony.collectors import KeepAll
 from symphony.config import EvaluateConfig
@@ -15,6 +16,7 @@ from symphony.errors import ConfigError
 from symphony.metrics import collisions, offroad
 from symphony.modules import SeededNoise
 from symphony.simulation.demonstrations import logged
+from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
@@ -23,32 +25,40 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
     """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
 
     Raises:
-        ConfigError: if the search needs a discriminator and the agent has none.
+        ConfigError: if the search needs a discriminator and the agent has none, or the agent learned another time
+            step.
+        NotFiniteError: if one of its networks puts out a number that is not finite.
     """
     if agent.policy is None:
         raise ValueError("log playback has nothing to simulate")
     agent.check_step(float(scenes.dt[0]))
     env = DrivingEnv(scenes, agent.dynamics, agent.observation)
     trees, branches, taken = _plan(agent, config)
+    watch = FiniteWatch(env)
+    goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
+    actor = watch.watched(agent.policy, [keys.LOGITS, keys.ACTION], "policy")
     start = start_states(
         env,
-        agent.goals,
+        goals,
         trees=trees,
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
     )
     if search_kind(agent, config) == "none":
-        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), agent.policy)
+        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor)
         found = simulate(env, policy, start)
     else:
         best = config.search == "best"
         settings = config.pruning(agent.search)
+        judge = None
+        if config.search != "oracle" and agent.discriminator is not None:
+            judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator")
         with torch.no_grad():
             result = search(
                 env,
-                agent.policy,
-                None if config.search == "oracle" else agent.discriminator,
+                actor,
+                judge,
                 start,
                 seed=config.seed,
                 rule=KeepAll() if best else pruning_rule(settings),
@@ -62,6 +72,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         if best:
             order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
             found = Rollouts(*(_branches(part, order) for part in found))
+    watch.check()
     return Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
 
 
