@@ -255,7 +255,7 @@ def test_stretches_hold_exactly_the_edges_kept(keep: list[bool]) -> None:
 
 def test_a_missing_pyarrow_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"symphony\[argoverse2\]"):
+    with pytest.raises(ConfigError, match=r"symphony-traffic\[argoverse2\]"):
         get_reader("argoverse2")
 
 

@@ -47,7 +47,8 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.logs import measure, shortfalls
 
 needs_sumo = pytest.mark.skipif(
-    importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony[sumo]')"
+    importlib.util.find_spec("sumo") is None,
+    reason="SUMO is not installed (pip install 'symphony-traffic[sumo]')",
 )
 seeds = st.integers(0, MAX_SEED)
 numbers = st.integers(0, BLOCK - 1)

@@ -99,7 +99,7 @@ class Argoverse2Reader(Reader):
     def __init__(self) -> None:
         if importlib.util.find_spec("pyarrow") is None:
             raise ConfigError(
-                "pyarrow is not installed; it comes with the extra: pip install 'symphony[argoverse2]'"
+                "pyarrow is not installed; it comes with the extra: pip install 'symphony-traffic[argoverse2]'"
             )
 
     def companions(self, path: Path) -> tuple[Path, ...]:
