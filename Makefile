@@ -12,7 +12,7 @@ DEV := $(VENV)/.dev
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo table test lint format clean
+.PHONY: help setup demo table test fuzz lint format clean
 
 help:  ## what there is
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -29,6 +29,11 @@ PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile
 
 test: $(DEV)  ## run the tests, in a process per core
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+
+FUZZ_ARGS ?= --inputs 2000
+
+fuzz: $(DEV)  ## feed damaged files to everything that reads files; goes on where it stopped
+	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/fuzz.py $(FUZZ_ARGS)
 
 lint: $(DEV)  ## style, types, imports between packages, file lengths
 	$(BIN)/ruff check

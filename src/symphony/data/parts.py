@@ -16,17 +16,21 @@ from pathlib import Path
 from typing import Any
 
 from symphony.data import resample as resampling
+from symphony.data.bounds import oddities
 from symphony.data.engine import Engine, ordered_map
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
 from symphony.data.sources import Reader
+from symphony.data.sources.base import unexpected
 from symphony.data.store import SegmentStore, StoreWriter
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 
 PART_BYTES, PART_FILES = 8 << 20, 64
 """Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""
 PRESENT = "present"
+ODD = "odd"
+"""Tag of a segment with something unusual: the list of what it is."""
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,21 @@ class Recipe:
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
             segment = resampling.resample(segment, self.dt)
+            excluded = exclusion(segment, self.interactive)
         except DataError as error:
             return skip(error, path, segment.segment_id)
-        excluded = exclusion(segment, self.interactive)
+        except (OSError, ConfigError):  # the machine's fault or the caller's, not the record's
+            raise
+        except Exception as error:  # one bad record must not end a conversion
+            return skip(unexpected(error), path, segment.segment_id)
         if excluded is not None:
             return skip(excluded[1], path, segment.segment_id, excluded[0])
         return segment
+
+
+def odd_tags(odd: list[str]) -> dict[str, Any] | None:
+    """What a segment is tagged with that has something unusual."""
+    return {ODD: odd} if odd else None
 
 
 def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:
@@ -162,7 +175,7 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
         if writer.has(outcome.segment_id):
             return writer.index_of(outcome.segment_id)
         try:
-            return writer.append(outcome)
+            return writer.append(outcome, tags=odd_tags(oddities(outcome)))
         except DataError as error:
             outcome = skip(error, file, outcome.segment_id)
     return outcome.to_json() if isinstance(outcome, Skip) else PRESENT
