@@ -298,7 +298,7 @@ def walkers(agents, **arguments):
 def test_it_keeps_the_contract_of_torchrl(agents, arguments):
     td = starts(Walk(agents), 5, branches=1)[:, 0]
     td[VALID] = torch.ones(5, agents, dtype=torch.bool)
-    check_contract(lambda: walkers(agents, **arguments), td, "loss_mgail", parameters=4)
+    check_contract(lambda: walkers(agents, use_mask=True, **arguments), td, "loss_mgail", parameters=4)
 
 
 # Of tensordict, about what scenes are made of.

@@ -34,7 +34,8 @@ from symphony.evaluation import evaluate
 from symphony.metrics import collisions, offroad
 from symphony.recipes import train
 from symphony.simulation import simulate
-from symphony.simulation.demonstrations import SceneDataset, experts
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.experts import experts
 from symphony.training.logging import read_metrics
 
 TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
