@@ -22,7 +22,7 @@ MAY_NAME_METHODS = ("recipes", "cli", "config")
 ROWS_OF_TABLES = ("comparison.py", "formats.py", "paired.py", "paper.py")
 """Of ``evaluation``: methods are rows there."""
 NAMES = re.compile(rf"(?<!\w)(?:{'|'.join(METHODS)})(?!\w)")
-PARTS = re.compile(r"_?(bc|mgail|ts|ts_h)_?|_h|h_")
+PARTS = re.compile(r"_?(bc|mgail)_?|_ts_?|ts_h|_h|h_")
 """What a method's name is taken apart by."""
 
 
