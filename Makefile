@@ -14,7 +14,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $
 SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo table test test-lowest lint format docs clean
+.PHONY: help setup demo table test test-lowest fuzz bench lint format docs clean
 
 help:  ## what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
@@ -32,6 +32,11 @@ PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile
 test: $(DEV)  ## run the tests, in a process per core
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
 
+FUZZ_ARGS ?= --inputs 2000
+
+fuzz: $(DEV)  ## feed damaged files to everything that reads files; goes on where it stopped
+	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/fuzz.py $(FUZZ_ARGS)
+
 # Python itself is tested in one version, and torch too: any other build of it is gigabytes.
 test-lowest:  ## run the tests with the lowest versions that pyproject.toml promises, in a .venv of their own
 	$(MAKE) test VENV=$(VENV)-lowest CONSTRAINTS=constraints-lowest.txt
@@ -44,6 +49,9 @@ lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, f
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/lint_length.py
 
+bench: $(DEV)  ## speed of simulation and search, in CPU time of one thread
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks/test_simulation_benchmark.py --benchmark-timer=time.process_time \
+		--benchmark-columns=median,iqr,rounds --benchmark-sort=name --benchmark-disable-gc
 docs: $(DEV)  ## build the pages of docs/ into out/site; broken links are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
