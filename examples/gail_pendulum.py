@@ -1,7 +1,7 @@
 """Adversarial imitation with a beam search in an environment of TorchRL's own: python examples/gail_pendulum.py
 
-A pendulum learns to swing up from an expert's states, without its actions and without a reward: a discriminator learns
-to tell the two apart, a search drops the branches that it sees through, the policy learns what survived.
+A pendulum learns to swing up from an expert's states, without its actions and without a reward: a discriminator
+learns to tell the two apart, a search drops the branches that it sees through, the policy learns what survived.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torchrl.modules import MLP, ProbabilisticActor
 from symphony.collectors import BeamSearchCollector, KeyScore, Systematic, mean_then_sum, with_rows
 from symphony.objectives import BCLoss, DiscriminatorLoss
 
-STATE = ["th", "thdot"]
+STATE, STEPS = ["th", "thdot"], 100
 
 
 class Net(nn.Sequential):
@@ -40,20 +40,17 @@ def expert(td: TensorDictBase) -> TensorDictBase:
     """Swing up by pumping energy, and balance near the top."""
     angle, speed = td["th"], td["thdot"]
     energy = speed**2 / 6 + 5 * (angle.cos() - 1)
-    near = (angle.abs() < 0.4) & (speed.abs() < 2)
-    torque = torch.where(near, -10 * angle - 3 * speed, -3 * energy * speed.sign())
+    torque = torch.where(angle.abs() < 0.4, -10 * angle - 3 * speed, -3 * energy * speed.sign())
     return td.set("action", torque.clamp(-2, 2)[..., None])
 
 
 @torch.no_grad()
-def drive(policy, steps: int) -> TensorDictBase:
-    """Rollouts [64, steps] of a policy."""
-    return with_rows(PendulumEnv(), [64]).rollout(steps, policy, break_when_any_done=False)
+def drive(policy) -> TensorDictBase:
+    """Rollouts [64, T] of a policy."""
+    return with_rows(PendulumEnv(), [64]).rollout(STEPS, policy, break_when_any_done=False)
 
 
-def main(
-    iterations: int = 60, rows: int = 16, branches: int = 8, steps: int = 100, updates: int = 8
-) -> list[float]:
+def main(iterations: int = 60, rows: int = 64, branches: int = 16, updates: int = 16) -> list[float]:
     """Print and return costs per step without search: the expert's, the policy's before and while it learns."""
     torch.manual_seed(0)
     heads = TensorDictModule(Net(2, NormalParamExtractor()), STATE, ["loc", "scale"])
@@ -67,36 +64,35 @@ def main(
         leaves=branches,
         keep_tree=True,  # the discriminator also learns from what was dropped
         prune_every=5,
-        rule=Systematic(0.5),
+        rule=Systematic(0.2),
         aggregate=mean_then_sum,
-        frames_per_batch=rows * branches * steps,
-        total_frames=iterations * rows * branches * steps,
+        frames_per_batch=rows * branches * STEPS,
+        total_frames=iterations * rows * branches * STEPS,
     )
     policy_loss, judge_loss = BCLoss(actor), DiscriminatorLoss(judge)
     policy_loss.set_keys(action="action")
     judge_loss.set_keys(score="score", simulated="simulated")
-    optimizer = torch.optim.Adam([*actor.parameters(), *judge.parameters()], lr=2e-3)
-    logged = drive(expert, steps).flatten()
-    costs = [-float(drive(policy, steps)["next", "reward"].mean()) for policy in (expert, actor)]
+    optimizer = torch.optim.Adam([*actor.parameters(), *judge.parameters()], lr=5e-3)
+    logged = drive(expert)
+    costs = [-float(drive(policy)["next", "reward"].mean()) for policy in (expert, actor)]
     print(f"cost per step: expert {costs[0]:.2f}, at first {costs[1]:.2f}")
     for iteration, batch in enumerate(collector, 1):
-        simulated, survivors = batch["tree"].flatten(), batch.flatten()
         for _ in range(updates):
-            both = torch.cat([draw(td.select(*STATE), 256) for td in (simulated, logged)])
+            both = torch.cat([draw(td.select(*STATE), 256) for td in (batch["tree"], logged)])
             both["simulated"] = torch.arange(512) < 256
-            losses = judge_loss(both).update(policy_loss(draw(survivors, 512)))
+            losses = judge_loss(both).update(policy_loss(draw(batch, 512)))
             optimizer.zero_grad()
             (losses["loss_discriminator"] + losses["loss_bc"]).backward()
             optimizer.step()
         if iteration % max(1, iterations // 6) == 0:
-            costs.append(-float(drive(actor, steps)["next", "reward"].mean()))
+            costs.append(-float(drive(actor)["next", "reward"].mean()))
             print(f"after {iteration} searches {costs[-1]:.2f}; AUC of the discriminator {losses['auc']:.2f}")
     return costs
 
 
 def draw(td: TensorDictBase, count: int) -> TensorDictBase:
-    """Some entries of a flat batch."""
-    return td[torch.randint(len(td), (count,))]
+    """Some entries of a batch."""
+    return td.flatten()[torch.randint(td.numel(), (count,))]
 
 
 if __name__ == "__main__":

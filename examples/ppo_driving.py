@@ -21,8 +21,7 @@ from symphony.envs import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, Drivin
 from symphony.modules import ElementGroup, discrete_policy, discriminator
 from symphony.simulation import SceneDataset
 
-VALUE = ("agents", "state_value")
-DONE, TERMINATED = ("agents", "done"), ("agents", "terminated")
+VALUE, DONE, TERMINATED = (("agents", name) for name in ("state_value", "done", "terminated"))
 
 
 def progress(before: TensorDictBase, after: TensorDictBase) -> torch.Tensor:
@@ -85,7 +84,7 @@ def main(batches: int = 60, rows: int = 32, steps: int = 40, hidden: int = 32) -
             with torch.no_grad():
                 advantage(batch)
             flat = batch.flatten()
-            for picked in torch.randperm(frames).split(frames // 4):
+            for picked in torch.randperm(len(flat)).split(len(flat) // 4):
                 losses = loss(flat[picked])
                 optimizer.zero_grad()
                 sum(losses[name] for name in ("loss_objective", "loss_critic", "loss_entropy")).backward()

@@ -51,7 +51,7 @@ def cost(actor: ProbabilisticActor) -> float:
     return -float(torch.stack(rewards).mean())
 
 
-def main(iterations: int = 60, branches: int = 8, workers: int = 2, updates: int = 16) -> list[float]:
+def main(iterations: int = 30, branches: int = 8, workers: int = 2, updates: int = 16) -> list[float]:
     """Print and return the policy's cost per step, without search, before and while it learns."""
     torch.manual_seed(0)
     heads = TensorDictModule(Heads(), ["th", "thdot"], ["loc", "scale"])
@@ -79,6 +79,7 @@ def main(iterations: int = 60, branches: int = 8, workers: int = 2, updates: int
     loss.set_keys(action="action")
     optimizer = torch.optim.Adam(loss.parameters(), lr=5e-3)
     costs = [cost(actor)]
+    print(f"cost per step at first {costs[0]:.2f}")
     try:
         for iteration, _ in enumerate(collector, 1):  # the batches go to the buffer
             for _ in range(updates):
