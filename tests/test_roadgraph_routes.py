@@ -21,14 +21,16 @@ from helpers_roadgraph import (
     tree,
     turned,
 )
+from helpers_segments import make_road
 from symphony.roadgraph import (
     LaneGraph,
     feasible_routes,
-    ground_truth_route,
+    ground_truth_routes,
     route_errors,
     route_polyline,
     routes,
 )
+from symphony.roadgraph.routes import MAX_LANES
 
 
 def named(name, *lanes):
@@ -152,7 +154,7 @@ def test_ground_truth_is_the_route_that_was_driven(movement, degrees):
     valid = np.ones(50, bool)
     valid[40:] = False
     log[40:] = 0
-    assert ground_truth_route(graph, found, log, valid) == truth
+    assert np.flatnonzero(ground_truth_routes(graph, found, log, valid)).tolist() == [truth]
 
 
 def test_ground_truth_ties_and_empty_logs():
@@ -160,10 +162,12 @@ def test_ground_truth_ties_and_empty_logs():
     graph = LaneGraph(road)
     found = routes(graph, [(name["in0"], 0.0)])
     log = np.stack((np.full(5, 2.0), np.linspace(-60, -50, 5)), -1)
-    assert ground_truth_route(graph, found, log, np.ones(5, bool)) == 0
-    assert ground_truth_route(graph, found, log, np.zeros(5, bool)) == 0
+    assert len(found) > 1
+    # The log ends before the routes part, so that each of them is as right as the others.
+    assert ground_truth_routes(graph, found, log, np.ones(5, bool)).all()
+    assert ground_truth_routes(graph, found, log, np.zeros(5, bool)).all()
     with pytest.raises(ValueError, match="no routes"):
-        ground_truth_route(graph, [], log, np.ones(5, bool))
+        ground_truth_routes(graph, [], log, np.ones(5, bool))
 
 
 def test_route_errors_agree_with_shapely():
@@ -207,3 +211,19 @@ def test_route_polyline_window():
     np.testing.assert_allclose(gone, [[2, 70], [2, 70]], atol=1e-5)
     with pytest.raises(ValueError, match="spacing"):
         route_polyline(graph, route, spacing=0)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-38])
+def test_lanes_of_next_to_no_length_in_a_circle(size):
+    road, name = crossing()
+    lines = [road.lanes[k][:, :2].copy() for k in range(len(road.lanes))]
+    tiny = np.array([[0, 0], [size, 0]], np.float32)
+    lines += [tiny, tiny[::-1]]
+    a, b = len(lines) - 2, len(lines) - 1
+    links = [*map(tuple, road.successors.tolist()), (name["in0"], a), (a, b), (b, a)]
+    graph = LaneGraph(make_road(lines, links))
+    found = routes(graph, [(name["in0"], 10.0)])
+    assert max(map(len, found)) == MAX_LANES
+    assert all(follows(graph, route) for route in found)
+    ordinary = [route for route in found if a not in route]
+    assert ordinary == routes(LaneGraph(road), [(name["in0"], 10.0)])

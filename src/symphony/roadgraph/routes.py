@@ -23,6 +23,9 @@ HORIZON = 240.0
 LIMIT = 200
 """Most routes a vehicle gets."""
 
+MAX_LANES = 500
+"""Most lanes of a route."""
+
 _TIE = 1e-3
 
 Path = tuple[float, Route]
@@ -90,14 +93,17 @@ def routes(
 
 
 def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: int) -> list[Route]:
-    """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest."""
+    """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest.
+
+    Lanes of next to no length in a circle would never get there: a path ends after :data:`MAX_LANES`.
+    """
     frontier = sorted(set(seeds))[:limit]
     heapq.heapify(frontier)
     done: list[Route] = []
     while frontier:
         reach, route = heapq.heappop(frontier)
         after = graph.successors[route[-1]]
-        if reach >= horizon or not after:
+        if reach >= horizon or not after or len(route) >= MAX_LANES:
             done.append(route)
             continue
         if len(done) + len(frontier) + len(after) > limit:
@@ -146,13 +152,17 @@ def route_errors(
     return np.array([distance[[row[lane] for lane in route]].min(0).mean() for route in choices])
 
 
-def ground_truth_route(
+def ground_truth_routes(
     graph: LaneGraph, choices: Sequence[Route], trajectory: NDArray[Any], valid: NDArray[np.bool_]
-) -> int:
-    """Index of the feasible route with the smallest displacement error to the logged trajectory.
+) -> NDArray[np.bool_]:
+    """The feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
 
-    The error is that of :func:`route_errors`. The first route wins where errors are within a millimetre, as for
-    routes that part beyond the trajectory's end, and where no step is valid.
+    The error is that of :func:`route_errors`. Routes whose errors are within a millimetre are equally right: those
+    that part beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place
+    would bias what is learned of choices.
+
+    Returns:
+        [G] whether a route is one of them.
 
     Raises:
         ValueError: there are no routes.
@@ -161,8 +171,8 @@ def ground_truth_route(
         raise ValueError("no routes to choose from")
     errors = route_errors(graph, choices, trajectory, valid)
     if np.isnan(errors).all():
-        return 0
-    return int(np.flatnonzero(errors <= errors.min() + _TIE)[0])
+        return np.ones(len(choices), np.bool_)
+    return errors <= errors.min() + _TIE
 
 
 def route_polyline(

@@ -1,4 +1,4 @@
-"""Runs that show what their agent does while they train."""
+"""Runs that preview what their agent does while they train."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ import pytest
 import torch
 from PIL import Image
 
-from helpers_runs import same_weights, tiny, weights
+from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
-from symphony.agents.networks import build_networks
-from symphony.config import EvaluateConfig, ShowConfig, TrainConfig, ValidationConfig, from_dict, to_json
+from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig, read_json, to_json
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.evaluation.evaluator import playback, simulated
+from symphony.evaluation.pictures import clip_of
+from symphony.recipes import train
 from symphony.render import Clip, curves
 from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.driving import playback, simulated
 from symphony.simulation.rollouts import Rollouts
-from symphony.training import train
-from symphony.training.learner import Learner
 from symphony.training.logging import read_metrics
-from symphony.training.previews import QUANTILES, ROLLOUTS, Show, Shown, clip_of, samples_of
+from symphony.training.previews import QUANTILES, ROLLOUTS, Preview, samples_of
 
 MOTIONS = ("speed", "acceleration", "turn")
 
@@ -54,16 +53,18 @@ def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(store: Path, out: Path, every: int, method: Any = "bc", **changes: Any) -> TrainConfig:
-    return tiny(method, store, out, show=ShowConfig(every=every, segments=2), **changes)
+    return tiny(method, store, out, preview=PreviewConfig(every=every, segments=2), **changes)
 
 
 def media(run: Path) -> list[str]:
     return sorted(path.name for path in (run / "media").glob("*"))
 
 
-def shown(run: Path) -> dict[int, dict[str, Any]]:
+def previewed(run: Path) -> dict[int, dict[str, Any]]:
     """What was recorded of it, by the update."""
-    records = [(r["step"], {k: v for k, v in r.items() if k.startswith("show_")}) for r in read_metrics(run)]
+    records = [
+        (r["step"], {k: v for k, v in r.items() if k.startswith("preview_")}) for r in read_metrics(run)
+    ]
     return {step: found for step, found in records if found}
 
 
@@ -85,7 +86,7 @@ def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_shows_itself_now_and_then_and_at_its_end(run: Path) -> None:
     assert media(run) == [f"rollout-00000{step}.gif" for step in (2, 4, 5)]
-    assert list(shown(run)) == [2, 4, 5]
+    assert list(previewed(run)) == [2, 4, 5]
     for name in media(run):
         with Image.open(run / "media" / name) as image:
             assert image.n_frames == 8
@@ -95,7 +96,7 @@ def test_runs_shorter_than_that_and_others_show_nothing(store: Path, tmp_path: P
     for every in (0, 3):
         out = train(config(store, tmp_path / str(every), every, steps=2))
         assert not (out / "media").exists()
-        assert shown(out) == {}
+        assert previewed(out) == {}
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_being_watched_changes_nothing(
     store: Path, held_out: Path, tmp_path: Path, method: str, validated: bool
 ) -> None:
     noisy = replace(tiny(method, store, tmp_path).discriminator, instance_noise=0.1)
-    changes = {"discriminator": noisy, "validation": ValidationConfig(held_out if validated else None)}
+    changes = {"discriminator": noisy, "validation": ValidationConfig(data=held_out if validated else None)}
     changes["validation"] = replace(changes["validation"], rollouts=2)
     blind, watched = (
         train(config(store, tmp_path / str(every), every, method, **changes)) for every in (0, 2)
@@ -115,7 +116,7 @@ def test_being_watched_changes_nothing(
     assert len(media(watched)) == 2
     strip = [
         [
-            {k: v for k, v in record.items() if not k.startswith("show_") and k != "updates_per_second"}
+            {k: v for k, v in record.items() if not k.startswith("preview_") and k != "updates_per_second"}
             for record in read_metrics(run)
         ]
         for run in (blind, watched)
@@ -128,16 +129,16 @@ def test_a_resumed_run_shows_the_rest_whatever_is_there(store: Path, tmp_path: P
     whole = config(store, tmp_path / "run", 2, "bc_ts", steps=6)
     train(whole)
     before = {name: (whole.out / "media" / name).read_bytes() for name in media(whole.out)}
-    numbers = shown(whole.out)
+    numbers = previewed(whole.out)
     shutil.rmtree(checkpoints(whole.out / "checkpoints")[-1])
     (whole.out / "media" / "rollout-000002.gif").unlink()
     (whole.out / "media" / "rollout-000006.gif").write_bytes(b"cut short")
     train(replace(whole, resume=True))
     assert media(whole.out) == ["rollout-000004.gif", "rollout-000006.gif"]
     assert all((whole.out / "media" / name).read_bytes() == before[name] for name in media(whole.out))
-    assert shown(whole.out) == numbers
+    assert previewed(whole.out) == numbers
     # How often it is shown does not make it another run.
-    train(replace(whole, resume=True, steps=8, show=ShowConfig(every=8)))
+    train(replace(whole, resume=True, steps=8, preview=PreviewConfig(every=8)))
     assert media(whole.out)[-1] == "rollout-000008.gif"
 
 
@@ -150,7 +151,7 @@ def test_segments_to_validate_on_are_shown_where_there_are_some(
         lambda clips, path: seen.extend(clip.segment.segment_id for clip in clips),
     )
     for data in (None, held_out):
-        validation = ValidationConfig(data, rollouts=1)
+        validation = ValidationConfig(data=data, rollouts=1)
         train(config(store, tmp_path / str(data is None), 2, steps=2, validation=validation))
     assert seen == ["straight-0", "crossing-0", "crossing-10", "crossing-12"]
 
@@ -179,12 +180,12 @@ def test_the_numbers_are_quantiles_of_what_the_agent_does(run: Path, store: Path
                 turn = (np.diff(angle) + math.pi) % (2 * math.pi) - math.pi
                 values[f"turn{kind}"].extend(turn / segment.dt)
         values["ade"].append(float(np.mean(away)))
-    record = shown(run)[4]
+    record = previewed(run)[4]
     for name, numbers in values.items():
         for q, expected in zip(QUANTILES, np.percentile(numbers, QUANTILES), strict=True):
-            assert record[f"show_{name}_p{q}"] == pytest.approx(expected, rel=1e-3, abs=1e-3), name
+            assert record[f"preview_{name}_p{q}"] == pytest.approx(expected, rel=1e-3, abs=1e-3), name
     for name in ("score_simulated", "score_data"):
-        low, middle, high = (record[f"show_{name}_p{q}"] for q in QUANTILES)
+        low, middle, high = (record[f"preview_{name}_p{q}"] for q in QUANTILES)
         assert low <= middle <= high
     assert len(record) == 3 * (len(values) + 2)
 
@@ -217,17 +218,23 @@ def test_statistics_of_nothing_are_no_numbers(tmp_path: Path) -> None:
     nobody = Rollouts(*found[:3], torch.zeros_like(found.counted))
     samples = samples_of(scenes, nobody, [0.2])
     assert len(samples["speed"]) == len(samples["ade"]) == 0
-    numbers = Shown(tmp_path, samples).numbers()
-    assert math.isnan(numbers["show_speed_p50"])
-    assert math.isfinite(numbers["show_speed_log_p50"])
+    numbers = Preview(tmp_path, samples).numbers()
+    assert math.isnan(numbers["preview_speed_p50"])
+    assert math.isfinite(numbers["preview_speed_log_p50"])
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_judge_that_has_not_judged_yet_has_no_scores(store: Path, tmp_path: Path) -> None:
     early = replace(tiny("mgail", store, tmp_path).mgail, regression=4)
     out = train(config(store, tmp_path / "run", 2, "mgail", steps=6, mgail=early))
-    assert [shown(out)[step]["show_score_data_p50"] is None for step in (2, 4, 6)] == [True, True, False]
-    assert not any("score" in name for name in shown(train(config(store, tmp_path / "bc", 2, steps=2)))[2])
+    assert [previewed(out)[step]["preview_score_data_p50"] is None for step in (2, 4, 6)] == [
+        True,
+        True,
+        False,
+    ]
+    assert not any(
+        "score" in name for name in previewed(train(config(store, tmp_path / "bc", 2, steps=2)))[2]
+    )
 
 
 def test_padding_of_a_batch_is_cut_off(store: Path) -> None:
@@ -269,26 +276,29 @@ def test_weights_and_biases_gets_video_and_histograms(
     settings = config(store, tmp_path / "run", 2, "mgail", mgail=early, wandb="offline")
     train(settings)
     assert [step for step, _ in recorder.logged] == sorted(step for step, _ in recorder.logged)
-    found = {step: values for step, values in recorder.logged if "show/rollout" in values}
+    found = {step: values for step, values in recorder.logged if "preview/rollout" in values}
     assert list(found) == [2, 4]
-    motions = {f"show/{name}{kind}" for name in MOTIONS for kind in ("", "_log")}
-    assert found[2].keys() == {"show/rollout", "show/ade", *motions}
-    assert found[4].keys() - found[2].keys() == {"show/score_simulated", "show/score_data"}
+    motions = {f"preview/{name}{kind}" for name in MOTIONS for kind in ("", "_log")}
+    assert found[2].keys() == {"preview/rollout", "preview/ade", *motions}
+    assert found[4].keys() - found[2].keys() == {"preview/score_simulated", "preview/score_data"}
     for step, values in found.items():
-        video = values.pop("show/rollout")
+        video = values.pop("preview/rollout")
         assert isinstance(video, wandb.Video)
         assert video._path == str(settings.out / "media" / f"rollout-{step:06d}.gif")
         assert all(isinstance(value, wandb.Histogram) and sum(value.histogram) for value in values.values())
 
 
-def test_settings_are_checked_and_old_ones_read(store: Path, tmp_path: Path) -> None:
+def test_settings_are_checked_and_read_back(store: Path, tmp_path: Path) -> None:
     for bad in ({"every": -1}, {"segments": 0}):
         with pytest.raises(ConfigError):
-            ShowConfig(**bad)
-    saved = json.loads(to_json(config(store, tmp_path, 7)))
-    assert from_dict(TrainConfig, saved).show == ShowConfig(7, 2)
-    del saved["show"]
-    assert from_dict(TrainConfig, saved).show == ShowConfig()
+            PreviewConfig(**bad)
+    file = tmp_path / "config.json"
+    file.write_text(to_json(config(store, tmp_path, 7)))
+    assert read_json(TrainConfig, file).preview == PreviewConfig(every=7, segments=2)
+    saved = json.loads(file.read_text())
+    del saved["preview"]
+    file.write_text(json.dumps(saved))
+    assert read_json(TrainConfig, file).preview == PreviewConfig()
 
 
 def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
@@ -300,20 +310,19 @@ def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
 
 
 def test_networks_are_left_as_they_were(store: Path, tmp_path: Path) -> None:
-    settings = config(store, tmp_path, 2, "bc_ts")
-    networks = build_networks(settings)
-    dataset = SceneDataset(SegmentStore(store), 2)
-    show = Show(settings, Learner(settings, networks, dataset, torch.device("cpu")), dataset)
+    trainer = build(config(store, tmp_path, 2, "bc_ts"))
+    previewer, policy = trainer.previewer, trainer.agent.modules["policy"]
+    assert previewer is not None
     state = torch.get_rng_state()
-    before = [parameter.clone() for parameter in networks.policy.parameters()]
-    first = show(2)
+    before = [parameter.clone() for parameter in policy.parameters()]
+    first = previewer(2)
     assert first.video.is_file()
-    assert all(map(torch.equal, before, networks.policy.parameters()))
-    assert networks.policy.training
+    assert all(map(torch.equal, before, policy.parameters()))
+    assert policy.training
     assert torch.equal(state, torch.get_rng_state())
-    assert first.numbers().keys() == show(4).numbers().keys()
+    assert first.numbers().keys() == previewer(4).numbers().keys()
 
 
-def test_all_that_is_shown_has_a_panel(run: Path) -> None:
+def test_all_that_is_previewed_has_a_panel(run: Path) -> None:
     known = {name for _, names in curves.PANELS for name in names}
-    assert {name for record in shown(run).values() for name in record} <= known
+    assert {name for record in previewed(run).values() for name in record} <= known
