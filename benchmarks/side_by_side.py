@@ -16,19 +16,26 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 YARDSTICKS = ("brute force", "matmul")
 
 
-def run(root: Path, workload: str, *options: str) -> dict[str, float]:
-    """One process of one version."""
+def run(root: Path, program: str, *options: str) -> str:
+    """What a program of this folder prints when it runs with the package of one version."""
     paths = os.pathsep.join([str(root / "src"), str(ROOT / "tests")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-    command = [sys.executable, str(ROOT / "benchmarks" / "workloads.py"), workload, *options]
+    command = [sys.executable, str(ROOT / "benchmarks" / program), *options]
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True, cwd=root)  # noqa: S603
-    return json.loads(done.stdout)
+    return done.stdout
+
+
+def measured(root: Path, workload: str, *options: str) -> dict[str, float]:
+    """A workload in a process of its own."""
+    return json.loads(run(root, "workloads.py", workload, *options))
 
 
 def main() -> None:
@@ -44,12 +51,19 @@ def main() -> None:
     from workloads import WORKLOADS  # noqa: PLC0415
 
     names = arguments.only or list(WORKLOADS)
+    with checked_out(arguments.before) as old:
+        report(old, names, arguments.rounds)
+
+
+@contextmanager
+def checked_out(commit: str) -> Iterator[Path]:
+    """The files of a commit in a folder of their own."""
     with tempfile.TemporaryDirectory() as folder:
         old = Path(folder) / "before"
         git = ["git", "-C", str(ROOT), "worktree"]
-        subprocess.run([*git, "add", "--detach", str(old), arguments.before], check=True, capture_output=True)  # noqa: S603
+        subprocess.run([*git, "add", "--detach", str(old), commit], check=True, capture_output=True)  # noqa: S603
         try:
-            report(old, names, arguments.rounds)
+            yield old
         finally:
             subprocess.run([*git, "remove", "--force", str(old)], check=True, capture_output=True)  # noqa: S603
 
@@ -59,10 +73,10 @@ def report(old: Path, names: list[str], rounds: int) -> None:
     found: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
     for number in range(rounds):
         for name in names:
-            found[name, "after"].append(run(ROOT, name))
+            found[name, "after"].append(measured(ROOT, name))
             if name not in YARDSTICKS:
-                found[name, "kept"].append(run(ROOT, name, "--keep-memory"))
-                found[name, "before"].append(run(old, name))
+                found[name, "kept"].append(measured(ROOT, name, "--keep-memory"))
+                found[name, "before"].append(measured(old, name))
         print(f"round {number + 1} of {rounds}", file=sys.stderr, flush=True)
 
     def middle(name: str, which: str, what: str) -> float:

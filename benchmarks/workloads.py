@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -114,26 +115,54 @@ def builtin(count: int, agents: int = 2) -> SceneBatch:
     return collate([scene(store[k], agents) for k in range(count)])
 
 
-def search() -> Work:
-    """A beam search on 16 built-in segments: 16 branches, 50 steps, 128 points, foresight."""
-    config = ObservationConfig(16, 128, clearance=True, foresight=(0.5, 1.0, 2.0))
+def search(
+    points: int = 128, features: Any = "foresight", *, branches: int = 16, noise: bool = False
+) -> Work:
+    """A beam search on 16 built-in segments, 50 steps, untrained networks.
+
+    Args:
+        points: nearest points that are seen.
+        features: of the discriminator.
+        branches: S.
+        noise: let actions be decided by numbers of their own, so that another version draws the same.
+    """
+    ahead = (0.5, 1.0, 2.0) if features == "foresight" else ()
+    config = ObservationConfig(16, points, clearance=features != "paper", foresight=ahead)
     groups = (
         ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
         ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
     )
     torch.manual_seed(0)
     policy = discrete_policy(SELF_FEATURES, groups)
-    judge = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features="foresight")
+    judge = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features=features)
     env = DrivingEnv(builtin(16), Bicycle(), config)
-    rows = torch.arange(16)[:, None].expand(-1, 16)
-    start = env.start(rows, torch.arange(16).expand(rows.shape))
+    rows = torch.arange(16)[:, None].expand(-1, branches)
+    start = env.start(rows, torch.arange(branches).expand(rows.shape))
     score = KeyScore(keys.SCORE, judge, valid_key=keys.VALID)
 
-    def once() -> Any:
-        kept = [keys.STATE, keys.ACTION]
-        return beam_search(env, policy, score, start, steps=50, prune_every=10, rule=KeepBest(0.5), keep=kept)
+    def act(state: Any) -> Any:
+        if noise:
+            place = torch.arange(env.num_agents) + 1
+            at = 12.9898 * state[keys.STREAM] % 1000 + 78.233 * state[keys.STEP] + 37.719 * place
+            state.set(keys.NOISE, (at.double().sin() * 43758.5453 % 1).float().clamp(1e-6, 1 - 1e-6))
+        return policy(state)
 
-    return once, 16 * 16 * 2 * 50
+    def once() -> Any:
+        kept = [keys.STATE, keys.ACTION, ("next", *keys.COLLISION), ("next", *keys.OFFROAD)]
+        return beam_search(
+            env,
+            act if noise else policy,
+            score,
+            start,
+            steps=50,
+            prune_every=10,
+            rule=KeepBest(0.5),
+            keep=kept,
+            slot_keys=[keys.STREAM] if noise else [],
+            exploration_type=ExplorationType.RANDOM,
+        )
+
+    return once, 16 * branches * env.num_agents * 50
 
 
 def brute_force() -> Work:
