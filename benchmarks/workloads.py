@@ -1,9 +1,9 @@
 """What is measured, in any version of the package: one round of work as a function, and how many agent-steps it is.
 
-As a program it measures one workload in a process of its own and prints a line of JSON; ``side_by_side.py`` runs it
-on two versions in turn.
+As a program it prepares one workload and answers each line of its input with a round's measurements as JSON;
+``side_by_side.py`` asks two versions in turn.
 
-    python benchmarks/workloads.py simulator --rounds 7
+    yes | head -7 | python benchmarks/workloads.py simulator
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -210,42 +209,52 @@ WORKLOADS: dict[str, Callable[[], Work]] = {
 }
 
 
+class Measured:
+    """A workload, ready to be run.
+
+    Args:
+        name: of the workload.
+        warm: rounds before the first that counts. Maps get their grids once they have been asked often enough.
+    """
+
+    def __init__(self, name: str, warm: int) -> None:
+        torch.set_num_threads(1)
+        self.work, self.steps = WORKLOADS[name]()
+        self.prepared = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        for _ in range(warm):
+            self.work()
+
+    def __call__(self) -> dict[str, float]:
+        """CPU seconds and page faults of a round, and MiB by which the peak rose above that of the prepared work."""
+        faults, began = resource.getrusage(resource.RUSAGE_SELF).ru_minflt, time.process_time()
+        self.work()
+        seconds, after = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF)
+        return {
+            "seconds": seconds,
+            "steps": self.steps,
+            "faults": after.ru_minflt - faults,
+            "mebibytes": (after.ru_maxrss - self.prepared) / 1024,
+        }
+
+
 @torch.no_grad()
-def measure(name: str, rounds: int) -> dict[str, float]:
-    """Median CPU seconds and page faults of a round, and MiB by which the peak rose above the prepared work."""
-    torch.set_num_threads(1)
-    work, steps = WORKLOADS[name]()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for _ in range(1 if name.startswith("search") else 25):
-        work()
-    spent, faults = [], resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(rounds):
-        began = time.process_time()
-        work()
-        spent.append(time.process_time() - began)
-    after = resource.getrusage(resource.RUSAGE_SELF)
-    return {
-        "seconds": statistics.median(spent),
-        "steps": steps,
-        "faults": (after.ru_minflt - faults) / rounds,
-        "mebibytes": (after.ru_maxrss - before) / 1024,
-    }
-
-
 def main() -> None:
-    """Measure one workload."""
+    """Measure one workload once for each line that comes in."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("workload", choices=WORKLOADS)
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--warm", type=int, default=40)
     parser.add_argument("--keep-memory", action="store_true", help="as the symphony command does")
     arguments = parser.parse_args()
     if arguments.keep_memory:
         from symphony import allocator  # noqa: PLC0415 - older versions have none
 
         allocator.tune()
-    print(json.dumps(measure(arguments.workload, arguments.rounds)))
+    measured = Measured(arguments.workload, arguments.warm)
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(json.dumps(measured()), flush=True)
 
 
 if __name__ == "__main__":
