@@ -216,8 +216,8 @@ def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, i
         "## Limits",
         _limits(source.config, source.spec, method),
         "## Files",
-        "`agent.json`: what the networks are and how it is simulated. `config.json`: all settings of the training, with "
-        "names in place of paths. `checkpoints/`: the weights as safetensors, each "
+        "`agent.json`: what the networks are and how it is simulated. `config.json`: all settings of the training, "
+        "with names in place of paths. `checkpoints/`: the weights as safetensors, each "
         "with its checksum in `checkpoint.json`, without the state of the optimizers. "
         + ("`evaluations/`: the scores above. " if source.scores else "")
         + "Licence: that of the package, Apache-2.0. Made by `scripts/make_pretrained.py`.",

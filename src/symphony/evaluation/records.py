@@ -130,8 +130,9 @@ def evaluation_name(record: dict[str, Any]) -> str:
         parts.append(f"step{record['run']['checkpoint']}")
     for field in dataclasses.fields(EvaluateConfig):
         value = config.get(field.name, field.default)
-        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY) and value != field.default:
+        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY, "metric") and value != field.default:
             parts.append(field.name if value is True else f"{field.name}={value}")
+    parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
     return "-".join(parts)
 
 

@@ -78,8 +78,10 @@ class SceneDataset:
         """Seconds per step.
 
         Raises:
-            DataError: if segments differ in it; names one that does.
+            DataError: if there is no segment, or segments differ in it; names one that does.
         """
+        if not self.indices:
+            raise DataError("the store holds no run segments", file=self.store.path)
         steps = self.store.time_steps[self.indices]
         other = np.flatnonzero(steps != steps[0])
         if len(other):

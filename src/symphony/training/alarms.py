@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from symphony.agents.checkpoint import CheckpointError
 from symphony.errors import SymphonyError
 
 NORM = "gradient_norm_"
@@ -40,6 +41,14 @@ def loss_of(network: str) -> str:
     return f"loss_{network}"
 
 
+def _value(found: Any, name: str) -> Any:
+    return found.get(name) if isinstance(found, dict) else None
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
 @dataclass
 class Skips:
     """Steps of optimizers that were left out because the gradient was not finite.
@@ -51,6 +60,19 @@ class Skips:
 
     total: int = 0
     in_row: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, extra: Mapping[str, Any]) -> Skips:
+        """What the extra values of a checkpoint tell.
+
+        Raises:
+            CheckpointError: they tell something else.
+        """
+        found = extra.get("skips") or {"total": 0, "in_row": {}}
+        total, in_row = _value(found, "total"), _value(found, "in_row")
+        if not isinstance(in_row, dict) or not all(map(_is_count, (total, *in_row.values()))):
+            raise CheckpointError("no counts of updates", field="extra.skips")
+        return cls(total, in_row)
 
     def count(self, values: Mapping[str, Tensor]) -> list[str]:
         """Count those of one update, from its norms of the gradient; returns the networks concerned.

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import random
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -16,11 +18,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from symphony.agents.agent import FILE, Agent
-from symphony.agents.checkpoint import load_checkpoint, prune, save_checkpoint
+from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoint, prune, save_checkpoint
 from symphony.agents.choice import Best
 from symphony.config import RunConfig, to_json
 from symphony.errors import ConfigError, DataError
-from symphony.files import write_file
+from symphony.files import naming, write_file
 from symphony.simulation import SceneDataset, SearchReplay
 from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.training.logging import Tracker
@@ -103,16 +105,26 @@ class Trainer:
             TrainingError: if gradients stay infinite or undefined.
         """
         config, step = self.config, 0
+        # Kept with checkpoints like torch's, which the recipe has seeded: those of equal runs are equal files.
+        random.seed(config.seed)
+        np.random.seed(config.seed % 2**32)  # noqa: NPY002
         # No process writes before all have looked at what there is.
         self.world.wait()
         if self.world.leads:
             config.out.mkdir(parents=True, exist_ok=True)
+            # What a process left behind that was killed while it wrote.
+            for unfinished in config.out.glob(".new-*"):
+                with naming(unfinished):
+                    unfinished.unlink()
             write_file(config.out / "config.json", to_json(config))
             write_file(config.out / FILE, to_json(self.agent.spec))
         if self.done is not None:
             loaded = load_checkpoint(self.done, modules=self.agent.modules, optimizers=self.optimizers)
             step = loaded.step
-            self._restore(loaded.extra)
+            try:
+                self._restore(loaded.extra)
+            except CheckpointError as error:
+                raise error.at(file=self.done / MANIFEST) from error
         self.alarms = Alarms()
         if self.world.leads:
             # The process before may have died between a checkpoint and the removal of old ones.
@@ -253,6 +265,8 @@ class Trainer:
 
     def _restore(self, extra: Mapping[str, Any]) -> None:
         before = extra.get("processes", 1)
+        if type(before) is not int or before < 1:
+            raise CheckpointError("no number of processes", field="extra.processes")
         if before != self.world.count:
             raise ConfigError(
                 f"{self.config.out}: trained by {before} processes so far, can't be resumed by {self.world.count}"
@@ -264,7 +278,7 @@ class Trainer:
                 file=self.data.store.path,
             )
         self.best = Best.of(extra)
-        self.skips = Skips(**extra.get("skips", {}))
+        self.skips = Skips.of(extra)
         if self.validator is not None:
             self.validator.best = self.best
 
