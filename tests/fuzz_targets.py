@@ -231,6 +231,11 @@ BY_SUFFIX: Mapping[str, Callable[[Rng, bytes], bytes]] = {
     "xml": change.xml,
     "json": change.json_,
     "parquet": _parquet,
+    "csv": change.csv,
+    "osm": change.xml,
+    "osm_xy": change.xml,
+    "kml": change.xml,
+    "pkl": change.pickle_,
 }
 
 
