@@ -27,7 +27,7 @@ from symphony.errors import DataError
 
 needs_pyarrow = pytest.mark.skipif(
     importlib.util.find_spec("pyarrow") is None,
-    reason="pyarrow is not installed (pip install 'symphony[argoverse2]')",
+    reason="pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')",
 )
 
 

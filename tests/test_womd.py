@@ -32,13 +32,13 @@ def refuse(path: Path, scenario: womd_pb2.Scenario) -> DataError:
 
 
 def test_readers_are_found_by_name() -> None:
-    assert readers() == ("argoverse2", "commonroad", "womd")
+    assert readers() == ("argoverse2", "commonroad", "interaction", "scenarionet", "womd")
     for name in readers():
         if name != "argoverse2" or importlib.util.find_spec("pyarrow"):
             assert get_reader(name).name == name
     with pytest.raises(ConfigError, match="did you mean 'womd'"):
         get_reader("wmod")
-    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, womd"):
+    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, interaction, scenarionet, womd"):
         get_reader("?")
     with pytest.raises(ConfigError, match="'egoes'"):
         get_reader("commonroad", egoes="all")

@@ -57,7 +57,7 @@ class Agent:
     @property
     def observation(self) -> ObservationConfig:
         """What it sees, what its discriminator sees included."""
-        return ObservationConfig(num_points=1) if self.spec is None else observation_of(self.spec)
+        return ObservationConfig.nothing() if self.spec is None else observation_of(self.spec)
 
     @property
     def interactive(self) -> int:

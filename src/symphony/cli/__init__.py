@@ -15,8 +15,9 @@ from collections.abc import Callable, Iterator, Sequence
 
 import tyro
 
+from symphony import allocator
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, figure, plot, profiles, table, train
+from symphony.cli import data, demo, evaluate, figure, plot, profiles, table, train, wosac
 from symphony.errors import ConfigError, SymphonyError, printable
 
 __all__ = ["main"]
@@ -36,6 +37,7 @@ app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="table")(table.Table)
 app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
+app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="demo")(demo.Demo)
 
 
@@ -48,7 +50,10 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 143 terminated.
     """
-    args = sys.argv[1:] if args is None else list(args)
+    if args is None:
+        allocator.tune()  # only where the process is ours
+        args = sys.argv[1:]
+    args = list(args)
     if args == ["--version"]:
         return _guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:

@@ -20,6 +20,8 @@ KINDS = (
     ("crossing", "crossing"),
     ("oncoming", "oncoming"),
     ("sideswipe", "sideswipe"),
+    ("pedestrian", "into a pedestrian"),
+    ("cyclist", "into a cyclist"),
     ("other", "other"),
 )
 """Kinds of first collision (see :class:`symphony.metrics.CollisionKind`) and their words."""
@@ -52,7 +54,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     first = rows[0]
     for row in rows:
         if row["collision_rate"] > 0 and "collision_into_leader" in row:
-            parts = ", ".join(f"{row[f'collision_{kind}']:.1f} {text}" for kind, text in KINDS)
+            parts = ", ".join(f"{row[name]:.1f} {text}" for name, text in _kinds_of(row))
             console.print(
                 f"{escape(short_name(str(row['agent'])))}: collisions, % of rollouts: {parts}", style="dim"
             )
@@ -67,6 +69,11 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
 def short_name(agent: str) -> str:
     """An agent's name as tables show it: that of its folder."""
     return agent.rpartition("/")[2] or agent
+
+
+def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
+    """Names and words of the kinds a row has; older results know no pedestrians and cyclists."""
+    return [(f"collision_{kind}", text) for kind, text in KINDS if f"collision_{kind}" in row]
 
 
 def _cell(value: float, error: float | None, digits: int) -> str:

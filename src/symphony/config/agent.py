@@ -80,7 +80,8 @@ class DiscriminatorConfig:
         return {
             "gradient_penalty": self.gradient_penalty,
             "instance_noise": self.instance_noise,
-            "noise_keys": (OWN, OBJECTS),
+            # Of a network of the user's own, it is unknown what it reads.
+            "noise_keys": (OWN, OBJECTS) if self.instance_noise else (),
         }
 
 

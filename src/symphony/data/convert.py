@@ -14,9 +14,21 @@ from pathlib import Path
 from typing import Any
 
 from symphony.data import store_format
-from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT, oddities
+from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.engine import Engine
-from symphony.data.parts import ODD, Outcome, Recipe, Stored, Task, divide, elsewhere, here, odd_tags, skip
+from symphony.data.overlaps import TAG
+from symphony.data.parts import (
+    ODD,
+    Outcome,
+    Preparation,
+    Stored,
+    Task,
+    divide,
+    elsewhere,
+    here,
+    skip,
+    tags_of,
+)
 from symphony.data.report import Report, Skip
 from symphony.data.resample import MAX_SIGMA
 from symphony.data.sources import Reader, get_reader
@@ -46,6 +58,8 @@ def convert(
     interactive: int = 2,
     smooth: float = 0.0,
     append: bool = False,
+    exclude_overlaps: bool = False,
+    radius: float | None = None,
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
@@ -67,6 +81,9 @@ def convert(
         interactive: interactive agents a segment must have at its first step (N_I).
         smooth: sigma in seconds of the smoothing of tracks before they are resampled; 0 for none.
         append: add to the store if there is one, skipping the segments it holds.
+        exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`); they
+            are counted either way.
+        radius: metres around the ego's path that are kept, of map and agents; None for all.
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
             depend on it.
@@ -83,19 +100,23 @@ def convert(
         DataError: ``out`` exists already, or not one segment could be converted.
         SymphonyError: a worker process died; what is done stays, as after an interrupt.
     """
-    _check_arguments(rate, interactive, smooth, workers)
+    _check_arguments(rate, interactive, smooth, workers, radius)
     out = Path(out).absolute()
     options = dict(reader_options or {})
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
+    settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
+    settings |= {} if radius is None else {"radius": radius}
     paths = expand(files, reader.patterns)
     draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
     with closing(draft):
         report = draft.report
         try:
             if not draft.finished:
-                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before)
+                recipe = Preparation(
+                    reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius
+                )
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:
                 draft.finish(report)
@@ -108,7 +129,11 @@ def convert(
     raise _nothing(report)
 
 
-def _check_arguments(rate: float, interactive: int, smooth: float, workers: int) -> None:
+def _check_arguments(
+    rate: float, interactive: int, smooth: float, workers: int, radius: float | None
+) -> None:
+    if radius is not None and not 0 < radius < math.inf:
+        raise ConfigError(f"radius must be positive, is {radius}")
     if not 0 < rate < math.inf:
         raise ConfigError(f"rate must be positive, is {rate}")
     if not MIN_RATE <= rate <= MAX_RATE:
@@ -161,7 +186,9 @@ def _nothing(report: Report) -> DataError:
 class _Run:
     """Collects what the files give, in their order, whoever converts them."""
 
-    def __init__(self, draft: Draft, paths: list[str], recipe: Recipe, progress: Progress | None) -> None:
+    def __init__(
+        self, draft: Draft, paths: list[str], recipe: Preparation, progress: Progress | None
+    ) -> None:
         self.draft, self.report, self.progress, self.total = draft, draft.report, progress, len(paths)
         parts = divide([size for _, size in draft.job.files])
         tasks = [Task(recipe, tuple(paths[p.start : p.stop]), p.start, draft.parts) for p in parts]
@@ -201,11 +228,14 @@ class _Run:
                 if isinstance(outcome, Stored):
                     odd = outcome.store.tags(outcome.index).get(ODD, [])
                     writer.copy(outcome.store, outcome.index)
+                    overlaps = outcome.overlaps
                 else:
-                    odd = oddities(outcome)
-                    writer.append(outcome, tags=odd_tags(odd))
+                    found = tags_of(outcome)
+                    odd, overlaps = found.get(ODD, []), TAG in found
+                    writer.append(outcome, tags=found or None)
                 self.report.converted += 1
                 self.report.odd = dict(Counter(self.report.odd) + Counter(odd))
+                self.report.overlaps += overlaps
             except DataError as error:
                 self.report.skipped.append(skip(error, path, outcome.segment_id))
 
@@ -258,8 +288,8 @@ def info(path: str | Path) -> dict[str, Any]:
         Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each),
         ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
         many of these under each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is
-        unusual about how many of the segments) and ``unfinished`` (None, or how far a conversion is that will add to
-        the store).
+        unusual about how many of the segments), ``groups`` (recordings the segments are of), ``overlaps`` (segments
+        in whose log boxes overlap) and ``unfinished`` (None, or how far a conversion is that will add to the store).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -279,6 +309,8 @@ def info(path: str | Path) -> dict[str, Any]:
         "reasons": report.reasons,
         "problems": report.problems,
         "odd": report.odd,
+        "overlaps": report.overlaps,
+        "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),
     }

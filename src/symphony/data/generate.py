@@ -216,6 +216,7 @@ def harvest(task: Task) -> Harvest:
         except DataError as error:
             run.reasons[f"{error.field}: excluded by the paper's limits"] += 1
     taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
+    taken = [segment.replace(group=task.name) for segment in taken]
     return Harvest(task, taken, len(good), run.reasons, _cpu_seconds() - begin)
 
 

@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from symphony.data import overlaps
 from symphony.data import resample as resampling
 from symphony.data.bounds import oddities
+from symphony.data.crop import crop
 from symphony.data.engine import Engine, ordered_map
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
@@ -45,13 +47,18 @@ class Stored:
         """Its id."""
         return self.store.ids[self.index]
 
+    @property
+    def overlaps(self) -> bool:
+        """Whether boxes overlap in its log."""
+        return overlaps.TAG in self.store.tags(self.index)
+
 
 Outcome = RunSegment | Stored | Skip | None
 """What became of a record; None where the store held the segment before."""
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Preparation:
     """How the records of a file become segments.
 
     Attributes:
@@ -60,6 +67,8 @@ class Recipe:
         sigma: of the smoothing in seconds, 0 for none.
         interactive: interactive agents a segment must have (N_I).
         before: path of the store that is added to, and the segments it held; their ids are passed over.
+        exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
+        radius: metres around the ego's path that are kept (see :mod:`symphony.data.crop`); None for all.
     """
 
     reader: Reader
@@ -67,6 +76,8 @@ class Recipe:
     sigma: float
     interactive: int
     before: tuple[str, int] | None = None
+    exclude_overlaps: bool = False
+    radius: float | None = None
 
     def outcomes(self, path: str) -> Iterator[Outcome]:
         """One for each record of a file, in its order."""
@@ -84,6 +95,8 @@ class Recipe:
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
             segment = resampling.resample(segment, self.dt)
+            if self.radius is not None:
+                segment = crop(segment, self.radius)
             excluded = exclusion(segment, self.interactive)
         except DataError as error:
             return skip(error, path, segment.segment_id)
@@ -93,12 +106,16 @@ class Recipe:
             return skip(unexpected(error), path, segment.segment_id)
         if excluded is not None:
             return skip(excluded[1], path, segment.segment_id, excluded[0])
+        if self.exclude_overlaps and (pairs := len(overlaps.overlapping(segment))):
+            found = DataError(f"the boxes of {pairs} pairs of agents overlap in the log", field="agents")
+            return skip(found, path, segment.segment_id, overlaps.TAG)
         return segment
 
 
-def odd_tags(odd: list[str]) -> dict[str, Any] | None:
-    """What a segment is tagged with that has something unusual."""
-    return {ODD: odd} if odd else None
+def tags_of(segment: RunSegment) -> dict[str, Any]:
+    """What a segment is tagged with that has something unusual, or in whose log boxes overlap."""
+    odd = oddities(segment)
+    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {})
 
 
 def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:
@@ -134,7 +151,7 @@ class Task:
         folder: where parts lie.
     """
 
-    recipe: Recipe
+    recipe: Preparation
     files: tuple[str, ...]
     start: int
     folder: Path
@@ -175,14 +192,14 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
         if writer.has(outcome.segment_id):
             return writer.index_of(outcome.segment_id)
         try:
-            return writer.append(outcome, tags=odd_tags(oddities(outcome)))
+            return writer.append(outcome, tags=tags_of(outcome) or None)
         except DataError as error:
             outcome = skip(error, file, outcome.segment_id)
     return outcome.to_json() if isinstance(outcome, Skip) else PRESENT
 
 
 def open_part(path: Path) -> list[Iterator[Outcome]]:
-    """For each file of a part, what :meth:`Recipe.outcomes` gave."""
+    """For each file of a part, what :meth:`Preparation.outcomes` gave."""
     store = SegmentStore(path)
 
     def outcome(entry: Any) -> Outcome:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from symphony.data.overlaps import MANY
 from symphony.data.selection import EXCLUSIONS
 from symphony.errors import DataError
 
@@ -64,6 +65,8 @@ class Report:
         skipped: what was left out, the paper's exclusions included.
         settings: arguments of the conversion.
         odd: what is unusual, and about how many of the segments added.
+        overlaps: segments added in whose log a moving vehicle's box overlaps another (see
+            :mod:`symphony.data.overlaps`).
     """
 
     converted: int = 0
@@ -72,6 +75,18 @@ class Report:
     skipped: list[Skip] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
     odd: dict[str, int] = field(default_factory=dict)
+    overlaps: int = 0
+
+    @property
+    def warning(self) -> str:
+        """What the user should hear; empty if nothing."""
+        if self.overlaps <= MANY * self.converted:
+            return ""
+        share = 100 * self.overlaps / self.converted
+        return (
+            f"in {self.overlaps} of {self.converted} segments ({share:.1f} %) boxes overlap in the log: there even "
+            "its playback collides; --exclude-overlaps leaves them out"
+        )
 
     @property
     def reasons(self) -> dict[str, int]:
@@ -85,7 +100,7 @@ class Report:
 
     @property
     def exclusions(self) -> dict[str, int]:
-        """Sound segments left out under each of the paper's exclusions, all of which are listed."""
+        """Sound segments left out under each of the exclusions, all of which are listed."""
         found = Counter(skip.exclusion for skip in self.skipped)
         return {name: found[name] for name in EXCLUSIONS}
 
@@ -98,7 +113,14 @@ class Report:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Report:
         """The reverse of :meth:`to_json`; an empty mapping gives an empty report."""
-        kinds = {"converted": int, "present": int, "files": int, "settings": dict, "odd": dict}
+        kinds = {
+            "converted": int,
+            "present": int,
+            "files": int,
+            "settings": dict,
+            "odd": dict,
+            "overlaps": int,
+        }
         known = {key: value[key] for key in kinds if key in value}
         for key, found in known.items():
             if not isinstance(found, kinds[key]):
@@ -113,12 +135,12 @@ class Report:
         """This report joined to the one of an earlier conversion into the same store."""
         skipped = list(dict.fromkeys([*earlier.skipped, *self.skipped]))
         return Report(
-            earlier.converted + self.converted,
-            0,
-            earlier.files + self.files,
-            skipped,
-            self.settings,
-            dict(Counter(earlier.odd) + Counter(self.odd)),
+            converted=earlier.converted + self.converted,
+            files=earlier.files + self.files,
+            skipped=skipped,
+            settings=self.settings,
+            odd=dict(Counter(earlier.odd) + Counter(self.odd)),
+            overlaps=earlier.overlaps + self.overlaps,
         )
 
 

@@ -117,10 +117,10 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     if sigma == 0:
         return segment
     valid = segment.valid
-    position, slope, fitted = _local_line(segment.position.astype(np.float64), valid, segment.dt, sigma)
+    position, slope, fitted = local_line(segment.position.astype(np.float64), valid, segment.dt, sigma)
     velocity = np.where(fitted[..., None], slope[..., :2], segment.velocity)
     logged = segment.heading.astype(np.float64)
-    steady, _, _ = _local_line(_unwrapped(logged, valid)[..., None], valid, segment.dt, sigma)
+    steady, _, _ = local_line(_unwrapped(logged, valid)[..., None], valid, segment.dt, sigma)
     steady = steady[..., 0]
     speed = np.hypot(velocity[..., 0], velocity[..., 1])
     turn = wrap(np.arctan2(velocity[..., 1], velocity[..., 0]) - steady)
@@ -136,7 +136,7 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     )
 
 
-def _local_line(
+def local_line(
     values: Doubles, valid: NDArray[np.bool_], dt: float, sigma: float
 ) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
     """(value, slope, where a line could be fitted) at each step, of values [A, T, D]; values elsewhere."""

@@ -162,6 +162,8 @@ class RunSegment:
         interest: [I] int32 agents the source marks as interacting.
         predict: [J] int32 agents the source marks for prediction.
         file: name of the file it was read from, without folder.
+        group: the recording it is part of. Segments of one recording share it, may overlap in time and are no
+            independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
     """
 
     segment_id: str
@@ -184,6 +186,7 @@ class RunSegment:
     interest: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     predict: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     file: str = ""
+    group: str = field(default="", metadata={"hashed": False})
 
     @property
     def num_agents(self) -> int:
@@ -201,7 +204,7 @@ class RunSegment:
 
 
 def content_hash(segment: RunSegment) -> str:
-    """SHA-256 over every field, array dtypes and shapes included; equal content gives equal hashes."""
+    """SHA-256 over every field but ``group``, array dtypes and shapes included; equal content, equal hashes."""
     digest = hashlib.sha256()
     _feed(digest, segment)
     return digest.hexdigest()
@@ -210,6 +213,8 @@ def content_hash(segment: RunSegment) -> str:
 def _feed(digest: Any, value: Any) -> None:
     if dataclasses.is_dataclass(value):
         for item in dataclasses.fields(value):
+            if not item.metadata.get("hashed", True):
+                continue
             digest.update(item.name.encode() + b"=")
             _feed(digest, getattr(value, item.name))
     elif isinstance(value, np.ndarray):

@@ -22,6 +22,8 @@ from symphony.data.store_index import decoded, read_ids, read_indices, rows
 from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
+GROUP, NETWORK = "group", "network"
+"""Tags a segment's group is kept under: in this release, and by the generator before there were groups."""
 
 
 class StoreWriter:
@@ -85,7 +87,8 @@ class StoreWriter:
 
         Args:
             segment: validated here.
-            tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`.
+            tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the name
+                ``group``, where the segment's group is kept.
 
         Returns:
             Its index.
@@ -98,7 +101,7 @@ class StoreWriter:
         try:
             if self.has(segment.segment_id):
                 raise DataError(TWICE, field="segment_id")
-            return self._append(segment, json.dumps(tags, ensure_ascii=False) if tags else "")
+            return self._append(segment, _tags_text(segment, tags))
         except DataError as error:
             raise error.at(file=segment.file or None, segment=segment.segment_id) from error
 
@@ -237,6 +240,7 @@ class SegmentStore(Sequence[RunSegment]):
         parts.pop("tags")
         for name in ("segment_id", "source", "file"):
             parts[name] = decoded(bytes(parts[name]), name)
+        parts["group"] = _group(self._tags(row), parts["segment_id"])
         for name in ("position", "heading", "velocity", "valid"):
             parts[name] = parts[name].reshape(agents, steps, *parts[name].shape[1:])
         parts["signal_state"] = parts["signal_state"].reshape(lights, steps)
@@ -324,7 +328,10 @@ class SegmentStore(Sequence[RunSegment]):
 
     def tags(self, index: SupportsIndex) -> dict[str, Any]:
         """What was given as ``tags`` when the segment was appended."""
-        row = self._row(index)
+        found = self._tags(self._row(index))
+        return {name: value for name, value in found.items() if name != GROUP}
+
+    def _tags(self, row: int) -> dict[str, Any]:
         try:
             found = json.loads(self._text("tags", row) or "{}")
         except (ValueError, RecursionError) as error:
@@ -335,6 +342,15 @@ class SegmentStore(Sequence[RunSegment]):
 
     def _damaged(self, row: int, field: str, message: str) -> DataError:
         return DataError(message, file=self.path, segment=self._name(row), field=field)
+
+    @cached_property
+    def groups(self) -> NDArray[np.str_]:
+        """[segments] the recording each segment is part of: :attr:`RunSegment.group`.
+
+        Its own id where the store does not know; the simulated network where an earlier release generated it.
+        """
+        found = [_group(self._tags(i), name) for i, name in enumerate(self.ids)]
+        return np.array(found, np.str_)
 
     def _text(self, column: str, row: int) -> str:
         axis = SEGMENTS.axes[column]
@@ -435,6 +451,19 @@ def _span(values: NDArray[Any]) -> dict[str, float]:
 def _plain(segment: RunSegment) -> RunSegment:
     """Python scalars in place of NumPy's, which would enter the content hash."""
     return segment.replace(dt=float(segment.dt), ego=int(segment.ego), current_step=int(segment.current_step))
+
+
+def _tags_text(segment: RunSegment, tags: Mapping[str, Any] | None) -> str:
+    """JSON of the tags and the group, which has no column of its own: older stores and releases have none."""
+    if tags and GROUP in tags:
+        raise DataError(f"{GROUP!r} is no name for a tag", field="tags")
+    known = segment.group not in {"", segment.segment_id}
+    found = {**(tags or {}), **({GROUP: segment.group} if known else {})}
+    return json.dumps(found, ensure_ascii=False) if found else ""
+
+
+def _group(tags: Mapping[str, Any], segment_id: str) -> str:
+    return str(tags.get(GROUP) or tags.get(NETWORK) or segment_id)
 
 
 def _road_values(road: RoadMap) -> dict[str, NDArray[Any]]:

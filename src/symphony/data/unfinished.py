@@ -171,7 +171,8 @@ class Draft:
         """Put on record that ``report.files`` files are done; this survives whatever comes."""
         writer.sync()
         skipped = [skip.to_json() for skip in report.skipped[self._told :]]
-        counts = {name: getattr(report, name) for name in ("files", "converted", "present", "odd")}
+        names = ("files", "converted", "present", "odd", "overlaps")
+        counts = {name: getattr(report, name) for name in names}
         self._write(counts | {"segments": len(writer), "skipped": skipped})
         self._told = len(report.skipped)
 
@@ -257,10 +258,11 @@ def read_journal(folder: Path) -> Begun | None:
             if "finished" in line:
                 finished = True
                 continue
-            counts = [line[name] for name in ("files", "converted", "present", "segments")]
+            names = ("files", "converted", "present", "segments", "overlaps")
+            counts = [line.get(name, 0) if name == "overlaps" else line[name] for name in names]
             if not all(type(count) is int and count >= 0 for count in counts) or counts[0] > len(job.files):
                 raise ValueError(f"{counts} are no counts of {len(job.files)} files")
-            report.files, report.converted, report.present, segments = counts
+            report.files, report.converted, report.present, segments, report.overlaps = counts
             report.odd = dict(line.get("odd", {}))
             report.skipped += [Skip(**skip) for skip in line["skipped"]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

@@ -14,7 +14,7 @@ from tensordict.nn import (
 from tensordict.nn.probabilistic import interaction_type
 from torch.distributions import Categorical, Distribution
 
-from symphony.keys import ACTION, LOGITS, NOISE, OWN, VALID
+from symphony.keys import ACTION, LOG_PROB, LOGITS, NOISE, OWN, VALID
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.pooling import PoolMode
 from symphony.modules.sampling import inverse_cdf
@@ -46,7 +46,7 @@ class NoiseSampler(ProbabilisticTensorDictModule):
         distribution_class: type[Distribution] = Categorical,
         distribution_kwargs: dict[str, Any] | None = None,
         return_log_prob: bool = False,
-        log_prob_key: NestedKey = ("agents", "action_log_prob"),
+        log_prob_key: NestedKey = LOG_PROB,
     ) -> None:
         super().__init__(
             in_keys=parameters if isinstance(parameters, dict) else {"logits": parameters},
@@ -94,7 +94,7 @@ def discrete_policy(
     action_key: NestedKey = ACTION,
     noise_key: NestedKey = NOISE,
     return_log_prob: bool = False,
-    log_prob_key: NestedKey = ("agents", "action_log_prob"),
+    log_prob_key: NestedKey = LOG_PROB,
     pool: PoolMode = "auto",
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:

@@ -3,7 +3,8 @@
 How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 - One file, ``scenario_<ID>.parquet``, is one segment; ``segment_id`` is the scenario id. The map is
-  ``log_map_archive_<ID>.json`` in the same folder.
+  ``log_map_archive_<ID>.json`` in the same folder. The format names no log: scenarios with equal maps are windows
+  of one drive and form a group, named after the map's SHA-256.
 - Steps run from 0 to the last at which any track is present (the test split ends after the history). The time
   step is the span of the timestamps divided by their number less one: the format has no times of single steps.
   ``current_step`` is the last observed step, 49 in the dataset's 5 s of history at 10 Hz.
@@ -20,6 +21,7 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -97,7 +99,7 @@ class Argoverse2Reader(Reader):
     def __init__(self) -> None:
         if importlib.util.find_spec("pyarrow") is None:
             raise ConfigError(
-                "pyarrow is not installed; it comes with the extra: pip install 'symphony[argoverse2]'"
+                "pyarrow is not installed; it comes with the extra: pip install 'symphony-traffic[argoverse2]'"
             )
 
     def companions(self, path: Path) -> tuple[Path, ...]:
@@ -120,7 +122,8 @@ class Argoverse2Reader(Reader):
         city = read_map(map_path(path))
         # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
         with np.errstate(over="ignore", invalid="ignore"):
-            return _assemble(columns, tracks, city, name, path.name)
+            segment = _assemble(columns, tracks, city, name, path.name)
+        return segment.replace(group=hashlib.sha256(map_path(path).read_bytes()).hexdigest()[:16])
 
 
 def map_path(path: Path) -> Path:

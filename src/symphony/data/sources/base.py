@@ -26,6 +26,8 @@ class UnexpectedError(DataError):
 class Reader(ABC):
     """Turns the files of one format into run segments at the log's own rate.
 
+    A segment whose ``group`` a reader leaves empty is a group of its own.
+
     Attributes:
         name: name of the format, also :attr:`RunSegment.source`.
         patterns: file-name patterns the format's files go by, for searching a folder.
@@ -60,12 +62,16 @@ class Reader(ABC):
         """Further files that a file of this format is read together with, such as its map; none by default."""
         return ()
 
+    def optional(self, path: Path) -> tuple[Path, ...]:
+        """Those of the :meth:`companions` without which a file can be read, since many have none; none by default."""
+        return ()
+
     @staticmethod
     def _checked(item: Item, path: Path) -> Item:
         if isinstance(item, DataError):
             return item.at(file=path)
         try:
-            return validate(item)
+            return validate(item if item.group else item.replace(group=item.segment_id))
         except DataError as error:
             return DataError(error.message, file=path, segment=error.segment, field=error.field)
         except Exception as error:  # arrays of other kinds than a segment has

@@ -21,8 +21,12 @@ MAX_NUMBER = 1e8
 """Larger magnitudes are no metres, seconds or radians of a road."""
 
 
-def load_xml(path: Path) -> ET.Element:
+def load_xml(path: Path, what: str = "CommonRoad") -> ET.Element:
     """Parse a file that declares no document type, which rules out every kind of entity attack.
+
+    Args:
+        path: the file.
+        what: name of the format, for the error.
 
     Raises:
         DataError: the file is empty, too large, is not well-formed XML, or declares a document type.
@@ -33,9 +37,7 @@ def load_xml(path: Path) -> ET.Element:
         raise DataError("the file is empty", file=path)
 
     def refuse(*declaration: Any) -> None:
-        raise DataError(
-            "declares a document type, which CommonRoad files never do", file=path, field="DOCTYPE"
-        )
+        raise DataError(f"declares a document type, which {what} files never do", file=path, field="DOCTYPE")
 
     # ElementTree's fast parser has no hook for document types; a pass without any other handler costs little.
     guard = expat.ParserCreate()

@@ -30,8 +30,10 @@ def evenly(line: Doubles, count: int) -> Doubles:
     return np.stack([np.interp(where, along, line[:, k]) for k in range(2)], axis=-1)
 
 
-def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple[Doubles, ...]:
-    """Closed rings [P, 2] around the union of outlines, the inside on the left; holes run the other way.
+def drivable_rings(
+    outlines: Sequence[Doubles | shapely.Polygon], field: str = "lanelet"
+) -> tuple[Doubles, ...]:
+    """Closed rings [P, 2] around the union of outlines or polygons, inside on the left; holes run the other way.
 
     Slits and holes up to 2 * :data:`SLIT` wide are closed.
 
@@ -43,7 +45,9 @@ def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple
     try:
         # Shapely takes NaN on its way through outlines of no width for something to warn of.
         with np.errstate(invalid="ignore"):
-            polygons = shapely.make_valid(np.array([shapely.Polygon(outline) for outline in outlines]))
+            polygons = shapely.make_valid(
+                np.array([shapely.Polygon(outline) for outline in outlines], object)
+            )
             union = shapely.union_all(polygons)
             wider = union.buffer(SLIT, join_style="mitre")
             closed = wider.buffer(-SLIT, join_style="mitre").simplify(0.01)
@@ -92,3 +96,54 @@ def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
 def polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
     """Lines [P, 2 or 3] relative to an origin [2 or 3]; z is 0 where they have none."""
     return Polylines.of([to_float32(line - origin) for line in lines])
+
+
+CUT = 0.3
+"""Metres by which a ring may miss the cut it was closed along."""
+
+
+def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: NDArray[np.int32]) -> Doubles:
+    """[N, 2, 2] the line across each lane's end or start where no other lane goes on: there a map was cut.
+
+    Args:
+        bounds: left and right bound [P, 2] of each lane, in the direction of travel.
+        links: [E, 2] successors, lane indices (from, to).
+    """
+    goes, comes = set(links[:, 0].tolist()), set(links[:, 1].tolist())
+    found = [(left[-1], right[-1]) for k, (left, right) in enumerate(bounds) if k not in goes]
+    found += [(left[0], right[0]) for k, (left, right) in enumerate(bounds) if k not in comes]
+    return np.array(found, np.float64).reshape(-1, 2, 2)
+
+
+def opened(rings: Sequence[Doubles], cuts: Doubles) -> tuple[Doubles, ...]:
+    """Closed rings [P, 2] without their edges along cuts [N, 2, 2], in the same direction.
+
+    Traffic goes on beyond a cut, so that as road boundary it would put all of it off the road.
+    """
+    lines = shapely.linestrings(cuts) if len(cuts) else np.zeros(0, object)
+    tree = shapely.STRtree(lines)
+    found: list[Doubles] = []
+    for ring in rings:
+        near = tree.query(shapely.LineString(ring), predicate="dwithin", distance=CUT)
+        found += stretches(*_marked(ring, cuts[near], lines[near])) if len(near) else [ring]
+    return tuple(found)
+
+
+def _marked(ring: Doubles, cuts: Doubles, lines: NDArray[np.object_]) -> tuple[Doubles, NDArray[np.bool_]]:
+    """The ring with a vertex where each cut begins and ends, and which of its edges lie along none."""
+    shape = shapely.LineString(ring)
+    corners = shapely.points(cuts.reshape(-1, 2))
+    corners = corners[shapely.distance(shape, corners) <= CUT]
+    own = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ring, axis=0).T))])
+    spots = np.sort(shapely.line_locate_point(shape, corners))
+    spots = spots[np.diff(spots, prepend=-np.inf) > 1e-6]  # neighbouring cuts share their corners
+    new = spots[np.abs(spots[:, None] - own).min(axis=1, initial=np.inf) > 1e-6]
+    along = np.unique(np.concatenate([own, new]))
+    points = np.stack([np.interp(along, own, ring[:, k]) for k in range(2)], axis=-1)
+    step = np.diff(points, axis=0)
+    middle = shapely.points(points[:-1] + step / 2)
+    across = cuts[:, 1] - cuts[:, 0]
+    close = shapely.distance(middle[:, None], lines) <= CUT
+    lengths = np.hypot(*step.T)[:, None] * np.hypot(*across.T)
+    close &= np.abs(step @ across.T) >= 0.7 * lengths
+    return points, ~close.any(axis=1)

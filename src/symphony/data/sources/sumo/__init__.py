@@ -1,6 +1,6 @@
 """Simulated driving from SUMO: random networks and traffic, cut into run segments.
 
-SUMO's programs come with the optional extra ``symphony[sumo]`` and run as subprocesses in a temporary folder.
+SUMO's programs come with the optional extra ``symphony-traffic[sumo]`` and run as subprocesses in a temporary folder.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def sumo_home() -> Path:
     for folder in folders:
         if (folder / "bin").is_dir():
             return folder
-    raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony[sumo]'")
+    raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony-traffic[sumo]'")
 
 
 @cache
