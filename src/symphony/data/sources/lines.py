@@ -43,7 +43,7 @@ def drivable_rings(
         DataError: the union can't be formed, or would be beyond all measure; ``field`` says where the outlines
             come from.
     """
-    _check_effort(outlines, field)
+    _check_effort([ring for outline in outlines for ring in _rings_of(outline)], field)
     try:
         # Shapely takes NaN on its way through outlines of no width for something to warn of.
         with np.errstate(invalid="ignore"):
@@ -63,9 +63,18 @@ def drivable_rings(
     return tuple(rings)
 
 
+def _rings_of(outline: Doubles | shapely.Polygon) -> list[Doubles]:
+    """An outline itself, or the rings [P, 2] of a polygon."""
+    if isinstance(outline, shapely.Polygon):
+        return [np.asarray(ring.coords)[:, :2] for ring in (outline.exterior, *outline.interiors)]
+    return [outline[:, :2]]
+
+
 def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
     """Refuse outlines that are too many, or cross each other or themselves without end."""
     count = sum(map(len, outlines))
+    if count == 0:
+        return
     if count > MAX_EDGES:
         raise DataError(f"outlines of {count} points, at most {MAX_EDGES}", field=field)
     owner = np.repeat(np.arange(len(outlines)), [len(outline) for outline in outlines])
