@@ -226,6 +226,8 @@ COMPANIONS: dict[str, tuple[str, str | None, str]] = {
         KML.replace("7, 8", "17, 18").replace(">8<", ">18<"),
         "fits a lane",
     ),
+    "a lane without a name": ("k1_map.kml", KML.replace(">2<", "><", 1), "is not one lane"),
+    "a lane of two names": ("k1_map.kml", KML.replace(">2<", ">2, 3<", 1), "is not one lane"),
     "a group less": ("k1_map.kml", KML.replace("7, 8", "7"), "1 for 2 sinks"),
 }
 

@@ -35,6 +35,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import check_counts
 from symphony.data.segment import Bools, RoadMap, RunSegment
 from symphony.data.sources.base import Item, Reader, to_float32
 from symphony.data.sources.egos import busiest_first
@@ -61,8 +62,8 @@ FAR = 200.0
 """Metres between a recording and the box around its map beyond which the two don't belong together."""
 HISTORY = 9
 """The last step of a case's first second."""
-MAX_STEPS, MAX_STATES = 360_000, 20_000_000
-"""Steps of a recording, and agents times steps of a segment: few enough to allocate."""
+MAX_STEPS = 360_000
+"""Steps of a recording, which is cut into windows: ten hours at 10 Hz."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +176,7 @@ class InteractionReader(Reader):
         if not len(rows):
             raise DataError("nobody is there", field="track_id")
         ids, row = np.unique(rows.track, return_inverse=True)
-        if len(ids) * steps > MAX_STATES:
-            raise DataError(f"{len(ids)} tracks of {steps} steps, too many to read", field="track_id")
+        check_counts(len(ids), steps, "track_id")
         first = np.unique(row, return_index=True)[1]
         kind = rows.kind[first]
         if (rows.kind != kind[row]).any():

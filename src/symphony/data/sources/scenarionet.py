@@ -26,15 +26,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_STEPS, check_counts
 from symphony.data.segment import AgentType, Bools, RunSegment, SignalState
 from symphony.data.sources.base import Item, Reader, to_float32
 from symphony.data.sources.lines import Doubles
 from symphony.data.sources.safe_pickle import Array, load_plain
 from symphony.data.sources.scenarionet_map import Features, mapping, points, read_features, road_map
 from symphony.errors import DataError
-
-MAX_STEPS, MAX_STATES = 36_000, 20_000_000
-"""Steps, and agents times steps: few enough to allocate."""
 
 _TYPES = {
     "VEHICLE": AgentType.VEHICLE,
@@ -129,8 +127,7 @@ _STATE = (("position", 3), ("heading", 1), ("velocity", 2), ("length", 1), ("wid
 
 def _tracks(tracks: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int], Doubles, Bools]:
     """(names [A], types [A], states [A, T, 9] with 0 where not valid, valid [A, T]) of those valid at some step."""
-    if len(tracks) * steps > MAX_STATES:
-        raise DataError(f"{len(tracks)} tracks of {steps} steps, too many to read", field="tracks")
+    check_counts(len(tracks), steps, "tracks")
     names: list[str] = []
     kinds: list[int] = []
     states: list[Doubles] = []
