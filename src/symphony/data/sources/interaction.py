@@ -86,7 +86,8 @@ class InteractionReader(Reader):
         window: seconds of a segment. The rest of a recording counts if it is at least half as long.
         stride: seconds between the starts of windows; by default ``window``, so that they don't overlap.
         motion: ``"logged"`` takes velocities and headings as they are, and refuses a file where they are not those of
-            its positions; ``"positions"`` computes both, and takes the mean of states logged twice.
+            its positions; ``"positions"`` computes velocities, replaces headings that are far off the motion, and
+            takes the mean of states logged twice.
 
     Raises:
         ConfigError: a value out of range.
