@@ -1,7 +1,7 @@
 """Make the built-in data set with SUMO: ``python scripts/make_builtin.py``.
 
 Writes ``src/symphony/data/builtin/train`` and ``.../test`` anew and prints what is in them. The two share no road
-network: each network has a seed of its own. Needs the extra ``symphony[sumo]``.
+network: each network has a seed of its own. Needs the extra ``symphony-traffic[sumo]``.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.data.sources.sumo import generate_run
 from symphony.data.store import SegmentStore, StoreWriter
+from symphony.evaluation.logs import measure
 from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
-from symphony.trainers.quality import measure
 
 SplitName = Literal["train", "test"]
 DURATION = 150.0

@@ -13,21 +13,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from symphony.training.learner import Learner
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from helpers_runs import tiny
 from symphony import keys
+from symphony.agents.choice import choose
+from symphony.agents.networks import build_networks, dynamics_of
 from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
-from symphony.trainers import learner as learning
-from symphony.trainers import train
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.distributed import Processes, processes
-from symphony.trainers.learner import Learner
-from symphony.trainers.networks import build_networks, dynamics_of
-from symphony.trainers.selection import choose
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import learner as learning
+from symphony.training import train
+from symphony.training.processes import Processes, processes
 
 WORLD = 2
 LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "judge": "judge_loss"}

@@ -16,8 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from symphony.errors import DataError, SymphonyError
-from symphony.trainers.checkpoint import (
+from symphony.agents.checkpoint import (
     CheckpointError,
     checkpoints,
     latest,
@@ -25,7 +24,8 @@ from symphony.trainers.checkpoint import (
     prune,
     save_checkpoint,
 )
-from symphony.trainers.plain import decode, encode
+from symphony.agents.codec import decode, encode
+from symphony.errors import DataError, SymphonyError
 
 
 class Run:

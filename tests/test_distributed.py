@@ -16,10 +16,10 @@ import helpers_distributed
 from helpers_distributed import LOSSES, TRAINED
 from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
+from symphony.agents.checkpoint import checkpoints, latest, load_checkpoint
 from symphony.data.store import StoreWriter
-from symphony.trainers.checkpoint import checkpoints, latest, load_checkpoint
-from symphony.trainers.distributed import Processes, processes
-from symphony.trainers.tracking import read_metrics
+from symphony.training.logging import read_metrics
+from symphony.training.processes import Processes, processes
 
 Found = tuple[Path, list[dict[str, Any]]]
 

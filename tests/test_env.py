@@ -338,7 +338,7 @@ def test_step_gradient_matches_finite_differences() -> None:
 def test_constant_velocity_keeps_its_speed_and_course() -> None:
     for dynamics in (Bicycle(), Displacement()):
         env = make_env(straight_road(), dynamics=dynamics)
-        policy, now = ConstantVelocity(dynamics), env.start(torch.tensor([0]))
+        policy, now = ConstantVelocity(dynamics, env.dt), env.start(torch.tensor([0]))
         for _ in range(50):
             now = env.step(policy(now))["next"]
         # On a straight road at constant speeds that is the log itself.

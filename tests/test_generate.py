@@ -44,10 +44,11 @@ from symphony.data.sources import sumo
 from symphony.data.sources.sumo import demand, networks, roads
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError, DataError
-from symphony.trainers.quality import measure, shortfalls
+from symphony.evaluation.logs import measure, shortfalls
 
 needs_sumo = pytest.mark.skipif(
-    importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony[sumo]')"
+    importlib.util.find_spec("sumo") is None,
+    reason="SUMO is not installed (pip install 'symphony-traffic[sumo]')",
 )
 seeds = st.integers(0, MAX_SEED)
 numbers = st.integers(0, BLOCK - 1)

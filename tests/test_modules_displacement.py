@@ -19,11 +19,10 @@ from symphony.envs import Displacement, DrivingEnv, ObservationConfig, collate, 
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES
 from symphony.geometry.frames import rotate, wrap
 from symphony.keys import ACTION, NOISE, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, VALID
-from symphony.modules import BoundedDisplacement, ElementGroup, displacement_policy
+from symphony.modules import BoundedDisplacement, ElementGroup, SeededNoise, displacement_policy
 from symphony.modules.displacement import INSIDE, SMOOTH
 from symphony.objectives import BCLoss
 from symphony.streams import uniform
-from symphony.trainers.simulate import SeededNoise
 from test_env import moved
 
 GROUPS = (
@@ -271,7 +270,7 @@ def test_turning_the_world_changes_nothing(angle):
     sees = ObservationConfig(num_objects=5, num_points=40)
     for world in (segment, moved(segment, angle, 30.0, -12.0)):
         env = DrivingEnv(collate([scene(world, [0, 1, 2])]), Displacement(), sees)
-        now, draw = env.start(torch.tensor([0])), SeededNoise.of(env, 3)
+        now, draw = env.start(torch.tensor([0])), SeededNoise(3, env.dynamics.numbers)
         with torch.no_grad():
             for _ in range(8):
                 now = env.step(actor(draw(now)))["next"]

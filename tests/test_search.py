@@ -18,6 +18,8 @@ from torchrl.envs.utils import step_mdp
 
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
+from symphony.agents.agent import Agent
+from symphony.agents.networks import build_networks, observation_config
 from symphony.collectors import BeamSearchResult, KeepAll, KeepBest
 from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
 from symphony.data.segment import RunSegment
@@ -25,15 +27,14 @@ from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, DrivingEnv, scene
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.trainers import evaluate, simulate
-from symphony.trainers.agents import Agent
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.evaluation import simulated
-from symphony.trainers.networks import build_networks, observation_config
-from symphony.trainers.simulate import (
+from symphony.evaluation import evaluate
+from symphony.evaluation.evaluator import simulated
+from symphony.modules import SeededNoise
+from symphony.simulation import simulate
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import (
     ENDED,
     Rollouts,
-    SeededNoise,
     draw_goals,
     flag_score,
     rollouts_of,
@@ -351,7 +352,7 @@ def goals_of(
         return found[-1]
 
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["symphony.trainers.simulate"], "draw_goals", noted)
+        patch.setattr(sys.modules["symphony.simulation.rollouts"], "draw_goals", noted)
         state = simulated(agent, scenes, config).state
     assert len(found) == 1
     return found[0], state

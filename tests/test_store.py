@@ -355,7 +355,7 @@ def test_a_hundred_thousand_segments_open_at_once(folder: Path) -> None:
         else:
             os.truncate(path, len(raw) * count)
     start = time.perf_counter()
-    store = SegmentStore(folder)
+    store = SegmentStore(folder, check=False)  # the names are made up: nothing would match its hash
     segment = store[count - 1]
     opened = time.perf_counter() - start
     assert segment.segment_id == "name-099999"

@@ -16,18 +16,20 @@ from torch import nn
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
+from symphony.agents.choice import Best, choose, split_name
+from symphony.agents.networks import build_networks
 from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle
 from symphony.errors import ConfigError, DataError
-from symphony.trainers import evaluate, load_agent, train
-from symphony.trainers.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
-from symphony.trainers.dataset import SceneDataset
-from symphony.trainers.evaluation import judge
-from symphony.trainers.networks import build_networks
-from symphony.trainers.selection import Best, choose, split_name
-from symphony.trainers.tracking import read_metrics
-from symphony.trainers.validation import METRICS, Validator
+from symphony.evaluation import evaluate
+from symphony.evaluation.evaluator import judge
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.training import train
+from symphony.training.logging import read_metrics
+from symphony.training.validation import METRICS, Validator
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +105,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
 
     def script(*values: float) -> None:
         left = iter(values)
-        monkeypatch.setattr("symphony.trainers.validation.judge", lambda *_: Found(next(left)))
+        monkeypatch.setattr("symphony.training.validation.judge", lambda *_: Found(next(left)))
 
     return script
 

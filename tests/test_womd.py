@@ -215,6 +215,12 @@ def test_precision_far_from_the_origin(path: Path) -> None:
         for line in (feature.lane.polyline, feature.road_edge.polyline, feature.road_line.polyline):
             for point in line:
                 point.x += 4e6
+        for point in feature.crosswalk.polygon:
+            point.x += 4e6
+        if feature.HasField("stop_sign"):
+            feature.stop_sign.position.x += 4e6
+    for now in scenario.dynamic_map_states:
+        now.lane_states[0].stop_point.x += 4e6
     far = convert(path, scenario)
     np.testing.assert_allclose(far.position, near.position, atol=1e-5)
     np.testing.assert_allclose(far.road.lanes.points, near.road.lanes.points, atol=1e-5)

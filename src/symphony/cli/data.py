@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from symphony.cli.generate import Generate, Quality
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, printable
 
 _WINDOWS = ("window", "stride", "motion")
 """Options of the INTERACTION reader alone."""
@@ -74,6 +74,8 @@ class Convert:
             raise ConfigError("no files given")
         if not self.rate > 0:
             raise ConfigError(f"--rate must be positive, is {self.rate}")
+        if not 0.2 <= self.rate <= 200:
+            raise ConfigError(f"--rate must be between 0.2 and 200 steps per second, is {self.rate:g}")
         if self.interactive < 1:
             raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
         if not self.smooth >= 0:
@@ -171,6 +173,43 @@ class Info:
             _print_info(found)
 
 
+@app.command(name="verify")
+@dataclass(frozen=True)
+class Verify:
+    """Read a whole store and compare every segment with the hash that was written with it, and with the schema.
+
+    Training and evaluation do so for each segment when they first read it.
+    """
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of the store."""
+    json: bool = False
+    """Print the result as JSON."""
+
+    def run(self) -> None:
+        """Verify, showing how far it is, and print."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from symphony.data.store import SegmentStore
+
+        store = SegmentStore(self.store)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("segments"),
+        )
+        with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+            task = bar.add_task("Verifying", total=len(store))
+            store.verify(lambda done, total: bar.update(task, completed=done, total=total))
+        found = {"path": str(store.path), "segments": len(store), "checksum": store.checksum()}
+        if self.json:
+            _write(jsonlib.dumps(found, indent=2))
+        else:
+            _write(f"{len(store)} segments are what was written; checksum {found['checksum']}")
+
+
 @app.command(name="plot")
 @dataclass(frozen=True)
 class Plot:
@@ -193,7 +232,9 @@ class Plot:
         from symphony.data.selection import interactive_choice
         from symphony.data.store import SegmentStore
         from symphony.render import plot_segment
+        from symphony.render.style import picture_path
 
+        picture_path(self.out)
         store = SegmentStore(self.store)
         segment = store[segment_index(store, self.segment)]
         if not 0 <= self.step < segment.num_steps:
@@ -211,12 +252,18 @@ def _write(text: str) -> None:
     print(text)  # noqa: T201
 
 
+def _shown(text: str) -> str:
+    """Text from files for a table: neither markup nor what a terminal acts on."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
 def _print_report(report: Any, out: Path) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
-    table = Table("", "segments", title=escape(str(out)), title_justify="left", title_style="bold")
+    table = Table("", "segments", title=_shown(str(out)), title_justify="left", title_style="bold")
     table.columns[1].justify = "right"
     table.add_row("converted", str(report.converted))
     if report.present:
@@ -224,12 +271,14 @@ def _print_report(report: Any, out: Path) -> None:
     for reason, count in _exclusions(report.exclusions):
         table.add_row(f"excluded: {reason}", str(count))
     for reason, count in report.problems.items():
-        table.add_row(f"skipped: {escape(reason)}", str(count))
+        table.add_row(f"skipped: {_shown(reason)}", str(count))
+    for reason, count in report.odd.items():
+        table.add_row(f"odd: {_shown(reason)}", str(count))
     if report.overlaps:
         table.add_row("converted with boxes that overlap in the log", str(report.overlaps))
     Console().print(table)
     if report.warning:
-        Console(stderr=True).print(f"[yellow]warning:[/] {escape(report.warning)}", soft_wrap=True)
+        Console(stderr=True).print(f"[yellow]warning:[/] {_shown(report.warning)}", soft_wrap=True)
 
 
 def _exclusions(found: dict[str, int]) -> list[tuple[str, int]]:
@@ -247,7 +296,6 @@ def _unfinished_row(found: dict[str, int] | None) -> list[tuple[str, str]]:
 
 def _print_info(found: dict[str, Any]) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     def span(name: str, unit: str = "") -> str:
@@ -277,15 +325,16 @@ def _print_info(found: dict[str, Any]) -> None:
         *((f"  {reason}", str(count)) for reason, count in _exclusions(found["exclusions"])),
         ("skipped", f"{sum(found['problems'].values())}"),
         *((f"  {reason}", str(count)) for reason, count in found["problems"].items()),
+        *(("odd: " + what, str(count)) for what, count in found["odd"].items()),
         *([("boxes overlap in the log of", str(found["overlaps"]))] if found["overlaps"] else []),
         *_unfinished_row(found["unfinished"]),
     ]
     table = Table(
-        show_header=False, box=None, pad_edge=False, title=escape(found["path"]), title_style="bold"
+        show_header=False, box=None, pad_edge=False, title=_shown(found["path"]), title_style="bold"
     )
     table.title_justify = "left"
     for name, value in rows:
-        table.add_row(escape(name), escape(value))
+        table.add_row(_shown(name), _shown(value))
     Console().print(table)
 
 

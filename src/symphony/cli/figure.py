@@ -8,8 +8,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from symphony.cli.comparison import choose_evaluation, method_name
-from symphony.cli.evaluations import kept_evaluations, read_run
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 
@@ -21,7 +19,7 @@ app = tyro.extras.SubcommandApp()
 class Curvature:
     """Draw how often the policy, and the log, visit branching regions of each average curvature.
 
-    A panel for each run; left turns are positive (in the paper, right turns). With --data the runs are judged as
+    A panel for each run; left turns are positive (in the paper, right turns). With --data the runs are evaluated as
     `symphony evaluate` does, and keep it; without, what they keep already is drawn.
     """
 
@@ -50,11 +48,13 @@ class Curvature:
         """Judge where it is asked for, and draw."""
         import numpy as np
 
+        from symphony.agents.included import run_folder
         from symphony.cli.plot import run_names
+        from symphony.evaluation.comparison import method_name
+        from symphony.evaluation.records import read_run
         from symphony.metrics import jensen_shannon
         from symphony.render import plot_curvature
         from symphony.render.style import picture_path
-        from symphony.trainers.pretrained import run_folder
 
         picture_path(self.out)
         panels = {}
@@ -77,10 +77,17 @@ class Curvature:
             raise ConfigError(str(error)) from error
 
     def _record(self, run: Path, folder: Path) -> dict[str, Any]:
+        from symphony.evaluation.comparison import choose_evaluation
+        from symphony.evaluation.records import kept_evaluations
+
         if self.data is None:
             return choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]
-        from symphony.cli.evaluate import judge
+        from symphony.agents import load_agent
+        from symphony.cli.evaluate import evaluate_with_bar
+        from symphony.data.store import SegmentStore
+        from symphony.evaluation.records import evaluation_record, keep_evaluation
 
-        judged = judge(str(run), self.data, self.config)
-        judged.keep()
-        return judged.record
+        agent, store = load_agent(str(run), self.config.device), SegmentStore(self.data)
+        record = evaluation_record(agent, evaluate_with_bar(agent, store, self.config, baselines=True), store)
+        keep_evaluation(agent.name, record)
+        return record

@@ -78,9 +78,9 @@ class Generate:
         from rich.console import Console
         from rich.markup import escape
 
-        from symphony.cli.tables import write_json
         from symphony.data.generate import MADE_WITH, PRESETS
         from symphony.data.sources.sumo import sumo_version
+        from symphony.files import write_json
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
         console = Console()
@@ -142,7 +142,7 @@ class Quality:
 
     def run(self) -> None:
         """Measure and print."""
-        from symphony.cli.tables import write_json
+        from symphony.files import write_json
 
         quality = measured(self.store, self.interactive)
         print_quality(quality, title=str(self.store))
@@ -156,7 +156,7 @@ def measured(path: Path, interactive: int) -> dict[str, Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     from symphony.data.store import SegmentStore
-    from symphony.trainers.quality import measure
+    from symphony.evaluation.logs import measure
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("segments"))
     with Progress(*columns, console=Console(stderr=True)) as bar:

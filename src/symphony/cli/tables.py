@@ -1,11 +1,9 @@
-"""Tables and files of results."""
+"""Tables of results on the terminal."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 COLUMNS = (
@@ -37,27 +35,40 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     from rich.table import Table
 
     # Narrow enough for 80 columns, so the divergence goes without its error.
-    table = Table(title=escape(title) or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("agent", overflow="fold")
+    table = Table(
+        title=escape(title) or None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("agent", no_wrap=True)
     for _, heading, _ in COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         errors = {name: row.get(f"{name}_se") for name, _, _ in COLUMNS if name != "curvature_jsd"}
         cells = [_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
-        table.add_row(escape(str(row["agent"])), *cells)
+        table.add_row(escape(short_name(str(row["agent"]))), *cells)
     console = Console()
     console.print(table)
     first = rows[0]
     for row in rows:
         if row["collision_rate"] > 0 and "collision_into_leader" in row:
             parts = ", ".join(f"{row[name]:.1f} {text}" for name, text in _kinds_of(row))
-            console.print(f"{escape(str(row['agent']))}: collisions, % of rollouts: {parts}", style="dim")
+            console.print(
+                f"{escape(short_name(str(row['agent'])))}: collisions, % of rollouts: {parts}", style="dim"
+            )
     most = max(row["rollouts"] for row in rows)
     console.print(
         f"{first['segments']} run segments, {first['interactive']} interactive agents each, up to {most} "
         f"rollouts; ± standard error over segments; seed {first['seed']}",
         style="dim",
     )
+
+
+def short_name(agent: str) -> str:
+    """An agent's name as tables show it: that of its folder."""
+    return agent.rpartition("/")[2] or agent
 
 
 def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
@@ -70,24 +81,3 @@ def _cell(value: float, error: float | None, digits: int) -> str:
         return "–"
     text = f"{value:.{digits}f}"
     return text if error is None or math.isnan(error) else f"{text} ± {error:.{digits}f}"
-
-
-def write_json(path: Path, result: Any) -> None:
-    """Write a result as JSON; numbers that are not finite become null."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json_text(result), encoding="utf-8")
-
-
-def json_text(result: Any) -> str:
-    """A result as JSON; numbers that are not finite become null."""
-    return json.dumps(_finite(result), indent=2, allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -16,7 +16,7 @@ import numpy as np
 
 from symphony.data.plausibility import implausible, measure
 from symphony.data.segment import RunSegment, content_hash, validate
-from symphony.data.sources.base import Item, Reader
+from symphony.data.sources.base import Item, Reader, UnexpectedError
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import DataError
 
@@ -176,6 +176,8 @@ def _read(reader: Reader, path: Path, report: Conformance, check: str = "errors"
         report.fail(check, f"{path}: raises {type(error).__name__}: {error}")
     named = {str(path), *map(str, reader.companions(path))}
     for item in items:
+        if isinstance(item, UnexpectedError):
+            report.fail(check, f"{path}: raises {item.message}")
         if isinstance(item, DataError) and str(item.file) not in named:
             report.fail(check, f"{path}: the error names the file {item.file}: {item.message}")
         if isinstance(item, DataError) and not item.message:

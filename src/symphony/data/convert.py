@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from fnmatch import fnmatch
@@ -13,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from symphony.data import store_format
+from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.engine import Engine
-from symphony.data.overlaps import tags
-from symphony.data.parts import Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip
+from symphony.data.overlaps import TAG
+from symphony.data.parts import ODD, Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip, tags_of
 from symphony.data.report import Report, Skip
+from symphony.data.resample import MAX_SIGMA
 from symphony.data.sources import Reader, get_reader
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.data.unfinished import STORE, Draft, Job, folder_of, read_journal
@@ -24,6 +27,8 @@ from symphony.errors import ConfigError, DataError
 
 __all__ = ["Progress", "Report", "Skip", "convert", "expand", "info"]
 
+MIN_RATE, MAX_RATE = 1 / MAX_DT, 1 / MIN_DT
+MAX_WORKERS = 4096
 REASONS_SHOWN = 5
 """Reasons an error lists when nothing could be converted."""
 CHECKPOINT = 2.0
@@ -118,12 +123,16 @@ def _check_arguments(
         raise ConfigError(f"radius must be positive, is {radius}")
     if not 0 < rate < math.inf:
         raise ConfigError(f"rate must be positive, is {rate}")
+    if not MIN_RATE <= rate <= MAX_RATE:
+        raise ConfigError(f"rate must be between {MIN_RATE:g} and {MAX_RATE:g} steps per second, is {rate:g}")
     if not 0 <= smooth < math.inf:
         raise ConfigError(f"smooth must not be negative, is {smooth}")
-    if interactive < 1:
-        raise ConfigError(f"interactive must be at least 1, is {interactive}")
-    if workers < 1:
-        raise ConfigError(f"workers must be at least 1, is {workers}")
+    if smooth > MAX_SIGMA:
+        raise ConfigError(f"smooth must be at most {MAX_SIGMA:g} seconds, is {smooth:g}")
+    if not 1 <= interactive <= MAX_AGENTS:
+        raise ConfigError(f"interactive must be at least 1 and at most {MAX_AGENTS}, is {interactive}")
+    if not 1 <= workers <= MAX_WORKERS:
+        raise ConfigError(f"workers must be at least 1 and at most {MAX_WORKERS}, is {workers}")
 
 
 def _job(settings: Mapping[str, Any], paths: list[Path], out: Path, append: bool, dt: float) -> Job:
@@ -202,13 +211,15 @@ class _Run:
         else:
             try:
                 if isinstance(outcome, Stored):
+                    odd = outcome.store.tags(outcome.index).get(ODD, [])
                     writer.copy(outcome.store, outcome.index)
                     overlaps = outcome.overlaps
                 else:
-                    found = tags(outcome)
-                    writer.append(outcome, tags=found)
-                    overlaps = found is not None
+                    found = tags_of(outcome)
+                    odd, overlaps = found.get(ODD, []), TAG in found
+                    writer.append(outcome, tags=found or None)
                 self.report.converted += 1
+                self.report.odd = dict(Counter(self.report.odd) + Counter(odd))
                 self.report.overlaps += overlaps
             except DataError as error:
                 self.report.skipped.append(skip(error, path, outcome.segment_id))
@@ -248,6 +259,10 @@ def expand(files: Iterable[str | Path], patterns: tuple[str, ...]) -> list[Path]
         found += inside
     if not found:
         raise DataError("no files given")
+    for path in found:
+        # Reports are UTF-8; a name that is not could be neither written nor found again.
+        if any(0xD800 <= ord(letter) <= 0xDFFF for letter in path.name):
+            raise DataError("a file's name that is not UTF-8: give it another", file=path)
     return list(dict.fromkeys(found))
 
 
@@ -257,9 +272,9 @@ def info(path: str | Path) -> dict[str, Any]:
     Returns:
         Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each),
         ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
-        many of these under each of the paper's), ``problems`` (the reasons of the others), ``groups`` (recordings the
-        segments are of), ``overlaps`` (segments in whose log boxes overlap) and ``unfinished`` (None, or how far a
-        conversion is that will add to the store).
+        many of these under each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is
+        unusual about how many of the segments), ``groups`` (recordings the segments are of), ``overlaps`` (segments
+        in whose log boxes overlap) and ``unfinished`` (None, or how far a conversion is that will add to the store).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -278,6 +293,7 @@ def info(path: str | Path) -> dict[str, Any]:
         "exclusions": report.exclusions,
         "reasons": report.reasons,
         "problems": report.problems,
+        "odd": report.odd,
         "overlaps": report.overlaps,
         "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],

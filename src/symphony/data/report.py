@@ -64,6 +64,7 @@ class Report:
         files: files read.
         skipped: what was left out, the paper's exclusions included.
         settings: arguments of the conversion.
+        odd: what is unusual, and about how many of the segments added.
         overlaps: segments added in whose log a moving vehicle's box overlaps another (see
             :mod:`symphony.data.overlaps`).
     """
@@ -73,6 +74,7 @@ class Report:
     files: int = 0
     skipped: list[Skip] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
+    odd: dict[str, int] = field(default_factory=dict)
     overlaps: int = 0
 
     @property
@@ -112,14 +114,22 @@ class Report:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Report:
         """The reverse of :meth:`to_json`; an empty mapping gives an empty report."""
-        known = {
-            key: value[key]
-            for key in ("converted", "present", "files", "settings", "overlaps")
-            if key in value
+        kinds = {
+            "converted": int,
+            "present": int,
+            "files": int,
+            "settings": dict,
+            "odd": dict,
+            "overlaps": int,
         }
+        known = {key: value[key] for key in kinds if key in value}
+        for key, found in known.items():
+            if not isinstance(found, kinds[key]):
+                raise DataError(f"not a conversion report: {str(found)[:40]!r}", field=key)
         try:
-            return cls(**known, skipped=[Skip(**skip) for skip in value.get("skipped", ())])
-        except TypeError as error:
+            skipped = [Skip(**{k: _text(v) for k, v in skip.items()}) for skip in value.get("skipped", ())]
+            return cls(**known, skipped=skipped)
+        except (TypeError, AttributeError) as error:
             raise DataError(f"not a conversion report: {error}", field="skipped") from error
 
     def after(self, earlier: Report) -> Report:
@@ -130,8 +140,15 @@ class Report:
             files=earlier.files + self.files,
             skipped=skipped,
             settings=self.settings,
+            odd=dict(Counter(earlier.odd) + Counter(self.odd)),
             overlaps=earlier.overlaps + self.overlaps,
         )
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]!r} is no text")
+    return value
 
 
 def _count(skipped: list[Skip]) -> dict[str, int]:

@@ -3,16 +3,23 @@
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import Bicycle, Displacement
-from symphony.envs.observation import ObservationConfig
-from symphony.envs.scene import SceneBatch, collate, scene
+from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
+from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
+from symphony.envs.scene import SceneBatch, SceneSource, collate, scene
 
 __all__ = [
+    "CHOICE_FEATURES",
+    "OBJECT_FEATURES",
+    "POINT_FEATURES",
+    "ROUTE_FEATURES",
+    "SELF_FEATURES",
     "Bicycle",
     "ConstantVelocity",
     "Displacement",
     "DrivingEnv",
     "ObservationConfig",
     "SceneBatch",
+    "SceneSource",
     "collate",
     "scene",
 ]

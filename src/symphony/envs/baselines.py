@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.errors import ConfigError
 
 
 class ConstantVelocity(TensorDictModuleBase):
@@ -15,14 +16,16 @@ class ConstantVelocity(TensorDictModuleBase):
 
     Args:
         dynamics: action space to act in.
-        dt: seconds per step.
+        dt: seconds per step; needed for displacements only.
     """
 
     in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
     out_keys = [keys.ACTION]  # noqa: RUF012
 
-    def __init__(self, dynamics: Bicycle | Displacement, dt: float = 0.2) -> None:
+    def __init__(self, dynamics: Bicycle | Displacement, dt: float | None = None) -> None:
         super().__init__()
+        if dt is None and not isinstance(dynamics, Bicycle):
+            raise ConfigError("to keep a speed by displacements, the time step must be known")
         self.dynamics = dynamics
         self.dt = dt
 

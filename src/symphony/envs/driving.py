@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Literal
+
 import torch
 from jaxtyping import Bool, Float, Int
 from tensordict import TensorDict, TensorDictBase
@@ -23,9 +26,21 @@ from symphony.envs.observation import (
     observe,
 )
 from symphony.envs.routes import ROUTE_FEATURES, pick_routes, route_ahead, route_choices
-from symphony.envs.scene import SceneBatch
+from symphony.envs.scene import SceneBatch, SceneSource
+from symphony.envs.tables import Tables
+from symphony.errors import ConfigError
 from symphony.geometry.frames import forward_speed
 from symphony.streams import fold_in
+
+Event = Literal["collision", "offroad"]
+EVENTS = {"collision": keys.COLLISION, "offroad": keys.OFFROAD}
+"""What can end an episode."""
+
+
+def penalty(before: TensorDictBase, after: TensorDictBase) -> Float[Tensor, "*b N"]:
+    """Reward of -1 for an agent that collides or is off the road, else 0."""
+    bad = after.get(keys.COLLISION) | after.get(keys.OFFROAD)
+    return -bad.squeeze(-1).to(after.get(keys.STATE).dtype)
 
 
 class DrivingEnv(EnvBase):
@@ -33,48 +48,89 @@ class DrivingEnv(EnvBase):
 
     All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity
     (``stream``), the state of the interactive agents and the routes they follow. The environment holds only
-    constants, so forking a branch is an index and one instance serves every batch shape. An episode ends
-    (``truncated``) at the last logged step.
+    constants, so forking a branch is an index and one instance serves every batch shape. An episode ends at the last
+    logged step (``truncated``), or at what ``ends_on`` names (``terminated``).
 
     Args:
-        scenes: static data of B segments, all with the same number of interactive agents.
+        scenes: static data of B segments, all with the same number of interactive agents; or a source, from which
+            every reset of a whole batch draws as many as the batch has rows.
         dynamics: :class:`Bicycle` (joint discrete actions) or :class:`Displacement` (metres).
         observation: what the agents see.
-        dt: seconds per step; must be that of the scenes.
-        seed: of the scenes drawn by :meth:`reset` when none is named.
+        reward: of a step, from the state before it (with its action) and the state after it, ``[*b, N]``; by default
+            -1 for an agent that collides or is off the road.
+        ends_on: what ends the episode of a scene, for any of its interactive agents.
+        seed: of the scenes that :meth:`reset` draws; by default another one in every instance and process.
+        generator: draws them instead.
+        device: of the scenes from a source; others stay where they are.
 
     ``reset`` starts the scenes named in the ``scene`` entry of its argument, or draws them at random if there is
-    none; ``reset(state, set_state=True)`` starts from the given simulation state.
+    none; where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)``
+    starts from the given simulation state.
+
+    Raises:
+        ConfigError: for an unknown name in ``ends_on``, or both seed and generator.
     """
 
     batch_locked = False
     _supports_set_state = True
+    _scenes: SceneBatch | None = None
 
     def __init__(
         self,
-        scenes: SceneBatch,
+        scenes: SceneBatch | SceneSource,
         dynamics: Bicycle | Displacement | None = None,
         observation: ObservationConfig | None = None,
         *,
-        dt: float = 0.2,
-        seed: int = 0,
+        reward: Callable[[TensorDictBase, TensorDictBase], Tensor] | None = None,
+        ends_on: Sequence[Event] = (),
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(device=scenes.log_state.device, batch_size=[])
-        self.scenes = scenes
+        fixed = scenes if isinstance(scenes, SceneBatch) else None
+        super().__init__(device=device if fixed is None else fixed.log_state.device, batch_size=[])
+        if set(ends_on) - EVENTS.keys():
+            raise ConfigError(f"ends_on names {', '.join(EVENTS)}, not {', '.join(map(str, ends_on))}")
+        if seed is not None and generator is not None:
+            raise ConfigError("give a seed or a generator, not both")
+        self.source: SceneSource | None = None if isinstance(scenes, SceneBatch) else scenes
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.observation = ObservationConfig() if observation is None else observation
-        self.dt = dt
-        self.rng = torch.Generator(device=scenes.log_state.device)
+        self.reward = penalty if reward is None else reward
+        self.ends_on = tuple(EVENTS[name] for name in ends_on)
+        self._rng = torch.Generator() if generator is None else generator
+        if generator is None:
+            self._set_seed(seed)
+        if fixed is not None:
+            self.scenes = fixed
         self._make_specs()
-        self._set_seed(seed)
 
     @property
     def num_agents(self) -> int:
         """N, interactive agents per scene."""
+        if self.source is not None:
+            return self.source.interactive
         return self.scenes.interactive.shape[1]
 
+    @property
+    def scenes(self) -> SceneBatch:
+        """Those at hand.
+
+        Raises:
+            ConfigError: before the first reset of an environment that draws from a source.
+        """
+        if self._scenes is None:
+            raise ConfigError("no scenes yet: reset draws them from the source")
+        return self._scenes
+
+    @scenes.setter
+    def scenes(self, scenes: SceneBatch) -> None:
+        self._scenes = scenes
+        self.dt = float(scenes.dt[0])
+        """Seconds per step, that of the scenes."""
+
     def _make_specs(self) -> None:
-        n, config, device = self.num_agents, self.observation, self.scenes.log_state.device
+        n, config, device = self.num_agents, self.observation, self.device
 
         def floats(*shape: int) -> Unbounded:
             return Unbounded(shape=shape, dtype=torch.float32, device=device)
@@ -85,31 +141,35 @@ class DrivingEnv(EnvBase):
         def numbers() -> Unbounded:
             return Unbounded(shape=(1,), dtype=torch.int64, device=device)
 
-        seen = Composite(
-            {
-                "own": floats(n, SELF_FEATURES),
-                "objects": floats(n, config.num_objects, OBJECT_FEATURES),
-                "objects_mask": flags(n, config.num_objects),
-                "points": floats(n, config.num_points, POINT_FEATURES),
-                "points_mask": flags(n, config.num_points),
-            },
-            shape=(n,),
-        )
+        self._tables: Tables | None = None
+        seen = Composite(shape=(n,))
+        if config.own:
+            seen["own"] = floats(n, SELF_FEATURES)
+        for name, count, width in (
+            ("objects", config.num_objects, OBJECT_FEATURES),
+            ("points", config.num_points, POINT_FEATURES),
+        ):
+            if count:
+                seen[name], seen[f"{name}_mask"] = floats(n, count, width), flags(n, count)
         if config.route:
             seen["route"] = floats(n, ROUTE_FEATURES)
         if config.clearance:
-            seen["gap"], seen["road"] = floats(n, config.num_objects), floats(n, 5)
-            if config.foresight:
-                seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
+            seen["road"] = floats(n, 5)
+            if config.num_objects:
+                seen["gap"] = floats(n, config.num_objects)
+                if config.foresight:
+                    seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
 
         def goals() -> Unbounded:
             return Unbounded(shape=(n,), dtype=torch.int64, device=device)
 
-        agents = {"observation": seen, "valid": flags(n), "state": floats(n, 4), "goal": goals()}
+        agents = {"valid": flags(n), "state": floats(n, 4), "goal": goals()}
+        if not seen.is_empty():
+            agents["observation"] = seen
         outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
         progress = {"scene": numbers(), "step": numbers(), "stream": numbers()}
         self.observation_spec = Composite(
-            {**progress, "agents": Composite({**agents, **outcome}, shape=(n,))}
+            {**progress, "segment": numbers(), "agents": Composite({**agents, **outcome}, shape=(n,))}
         )
         self.state_spec = Composite(
             {
@@ -126,15 +186,16 @@ class DrivingEnv(EnvBase):
         self.done_spec = Composite({name: flags(1) for name in ("done", "terminated", "truncated")})
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.rng.manual_seed(seed)
+        if seed is None:
+            self._rng.seed()
+        else:
+            self._rng.manual_seed(seed)
 
     def to(self, device: torch.device | str | int) -> DrivingEnv:
-        """Move the environment, its scenes included; the draws of :meth:`reset` start anew from their seed."""
+        """Move the environment, its scenes included."""
         moved = super().to(device)
-        if moved.scenes.log_state.device != moved.device:
+        if moved._scenes is not None and moved._scenes.log_state.device != moved.device:
             moved.scenes = moved.scenes.to(moved.device)
-            moved.rng = torch.Generator(device=moved.device).manual_seed(self.rng.initial_seed())
         return moved
 
     def start(self, scene: Int[Tensor, "*b"], rollout: Int[Tensor, "*b"] | int = 0) -> TensorDict:
@@ -187,12 +248,11 @@ class DrivingEnv(EnvBase):
             return self._from_state(*self._read(tensordict))
         partial = tensordict.get("_reset", None)
         named = tensordict.get(keys.SCENE, None)
-        shape = tensordict.batch_size
-        if named is None or partial is not None:
-            scene = torch.randint(len(self.scenes), tuple(shape), generator=self.rng, device=self.rng.device)
-        else:
+        if named is not None and partial is None:
             scene = named.squeeze(-1)
-        rollout = torch.randint(1 << 31, tuple(shape), generator=self.rng, device=self.rng.device)
+        else:
+            scene = self._draw(tensordict.batch_size, renew=partial is None).to(self.device)
+        rollout = torch.randint(1 << 31, tuple(scene.shape), generator=self._rng).to(self.device)
         fresh = self.start(scene, rollout)
         if partial is None:
             return fresh
@@ -204,6 +264,15 @@ class DrivingEnv(EnvBase):
             default=None,
         )
 
+    def _draw(self, shape: torch.Size, *, renew: bool) -> Tensor:
+        """Rows of the scenes that a batch starts, those at hand or new ones of a source."""
+        if self.source is None or (not renew and self._scenes is not None):
+            return torch.randint(len(self.scenes), tuple(shape), generator=self._rng)
+        items = self.source.draw(shape.numel(), self._rng)
+        self.scenes = self.source.scenes(items).to(self.device)
+        # A source with fewer segments than the batch has rows gives some of them more than once.
+        return (torch.arange(shape.numel()) % len(items)).reshape(shape)
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         scene, step, stream, state, valid, goal = self._read(tensordict)
         index = self.scenes.interactive[scene]
@@ -211,9 +280,8 @@ class DrivingEnv(EnvBase):
         after = self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
         after = torch.where(valid[..., None], after, state)
         out = self._from_state(scene, step + 1, stream, after, valid, goal)
-        bad = out.get(keys.COLLISION) | out.get(keys.OFFROAD)
-        out.set(keys.REWARD, -bad.to(after.dtype))
-        return out
+        earned = self.reward(tensordict, out)
+        return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
@@ -238,9 +306,13 @@ class DrivingEnv(EnvBase):
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
         index = self.scenes.interactive[row]
         objects = objects_at(self.scenes, row, at, moved, index, real)
-        seen = observe(self.scenes, row, at, objects, index, self.observation)
+        seen = observe(self.scenes, row, at, objects, index, self.observation, self._kept())
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
+        flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
+        terminated = torch.zeros_like(truncated)
+        for key in self.ends_on:
+            terminated = terminated | flags[key].any(-1)
         observation = {name: value for name, value in seen._asdict().items() if value is not None}
         if self.observation.route:
             follows = goal.reshape(-1, goal.shape[-1])
@@ -253,7 +325,6 @@ class DrivingEnv(EnvBase):
         each = [*shape, self.num_agents]
         agents = TensorDict(
             {
-                "observation": TensorDict({k: back(v) for k, v in observation.items()}, batch_size=each),
                 "valid": valid,
                 "state": state,
                 "goal": goal,
@@ -261,16 +332,21 @@ class DrivingEnv(EnvBase):
                 "offroad": back(offroad)[..., None],
             },
             batch_size=each,
+            device=self.device,  # one without a device would be taken for a transfer, and waited for
         )
+        if observation:
+            parts = {name: back(value) for name, value in observation.items()}
+            agents.set("observation", TensorDict(parts, batch_size=each, device=self.device))
         return TensorDict(
             {
                 "scene": scene[..., None],
                 "step": step[..., None],
                 "stream": stream[..., None],
+                "segment": self.scenes.segment[scene][..., None],
                 "agents": agents,
-                "done": back(truncated)[..., None],
+                "done": back(truncated | terminated)[..., None],
                 "truncated": back(truncated)[..., None],
-                "terminated": back(torch.zeros_like(truncated))[..., None],
+                "terminated": back(terminated)[..., None],
             },
             batch_size=shape,
             device=self.device,
@@ -284,7 +360,13 @@ class DrivingEnv(EnvBase):
         if seen.road is not None:
             return collision, (seen.road[..., 0] > 0) & valid
         position = _rows_of(objects.state, index)[..., :2]
-        return collision, offroad_flags(self.scenes, scene, position) & valid
+        return collision, offroad_flags(self.scenes, scene, position, self._kept()) & valid
+
+    def _kept(self) -> Tables:
+        """What is looked up at each step of the present scenes."""
+        if self._tables is None or self._tables.scenes is not self.scenes:
+            self._tables = Tables(self.scenes, self.observation)
+        return self._tables
 
 
 def _rows_of(values: Tensor, index: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -51,6 +51,24 @@ _MARKS = {
 }
 
 
+class SceneSource(Protocol):
+    """Where an environment draws its scenes from, such as a store that is larger than memory.
+
+    Attributes:
+        interactive: N, interactive agents per scene.
+    """
+
+    interactive: int
+
+    def draw(self, count: int, rng: torch.Generator) -> list[int]:
+        """Numbers of different run segments at random (all, if there are fewer)."""
+        ...
+
+    def scenes(self, items: Sequence[int]) -> SceneBatch:
+        """The run segments of these numbers as one batch, which names them in ``segment``."""
+        ...
+
+
 class SceneBatch(TensorClass):
     """B run segments as padded tensors; a mask travels with every padded field.
 
@@ -65,17 +83,19 @@ class SceneBatch(TensorClass):
         point: [B, P, 2].
         point_direction: [B, P, 2] unit vector along the line; for lights from the stop point to where their lane
             leads.
-        point_type: [B, P] int64, :class:`PointType`.
+        point_type: [B, P] uint8, :class:`PointType`.
         point_speed: [B, P] speed limit of the lane, m/s, 0 where unknown.
-        point_light: [B, P] int64 row of Q for lights, else -1.
+        point_light: [B, P] int16 row of Q for lights, else -1.
         point_valid: [B, P].
-        light: [B, T, Q] int64, ``SignalState``.
+        light: [B, T, Q] uint8, ``SignalState``.
         edge_start: [B, E, 2] boundary segments, the drivable side on their left.
         edge_end: [B, E, 2].
-        edge_previous: [B, E] int64 segment that ends where this one starts, -1 if none.
-        edge_following: [B, E] int64.
+        edge_previous: [B, E] int32 segment that ends where this one starts, -1 if none.
+        edge_following: [B, E] int32.
         edge_valid: [B, E].
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
+        segment: [B] int64 number of the run segment among those that scenes are drawn from.
+        dt: [B] float64 seconds per step, the same in all scenes of a batch.
         route: [B, N, G, K, 2] points of the feasible routes of the interactive agents; G = 0 where not asked for.
         route_count: [B, N, G] int64 points that exist; 0 for padding.
         route_logged: [B, N] int64 the route nearest to what the log shows, -1 for none.
@@ -101,13 +121,19 @@ class SceneBatch(TensorClass):
     edge_following: Tensor
     edge_valid: Tensor
     stream: Tensor
+    segment: Tensor
+    dt: Tensor
     route: Tensor
     route_count: Tensor
     route_logged: Tensor
 
 
 def scene(
-    segment: RunSegment, interactive: int | Sequence[int] = 2, graph: LaneGraph | None = None
+    segment: RunSegment,
+    interactive: int | Sequence[int] = 2,
+    graph: LaneGraph | None = None,
+    *,
+    number: int = 0,
 ) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
@@ -115,6 +141,7 @@ def scene(
         segment: a validated run segment.
         interactive: how many agents are interactive (chosen by the paper's rule), or their rows.
         graph: of the segment's lanes; with it the scene holds the routes of its interactive agents.
+        number: of the segment among those that scenes are drawn from.
 
     Raises:
         DataError: if the segment has fewer usable agents.
@@ -141,13 +168,15 @@ def scene(
         "interactive": chosen.astype(np.int64),
         "interactive_valid": np.ones(len(chosen), bool),
         "last_step": np.array(segment.num_steps - 1),
-        "light": segment.signal_state.T.astype(np.int64),
+        "light": segment.signal_state.T.astype(np.uint8),
         "edge_start": start,
         "edge_end": end,
-        "edge_previous": previous,
-        "edge_following": following,
+        "edge_previous": previous.astype(np.int32),
+        "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
         "stream": np.array(stream_of(segment.segment_id)),
+        "segment": np.array(number),
+        "dt": np.array(segment.dt, np.float64),
         **_points(segment),
         **_routes(
             [] if graph is None else [route_table(segment, graph, int(a)) for a in chosen], len(chosen)
@@ -162,7 +191,14 @@ def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
     """Stack scenes into one batch, padded to the largest of each size.
 
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``.
+
+    Raises:
+        DataError: for scenes of different time steps.
     """
+    steps = torch.cat([item.dt for item in scenes])
+    if bool((steps != steps[0]).any()):
+        lengths = ", ".join(f"{dt:g} s" for dt in sorted(set(steps.tolist())))
+        raise DataError(f"segments of different time steps in one batch: {lengths}", field="dt")
     fields = {}
     for name in SceneBatch.__annotations__:
         values = [getattr(item, name) for item in scenes]
@@ -229,9 +265,9 @@ def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
     return {
         "point": np.concatenate(point).astype(np.float32),
         "point_direction": np.concatenate(direction).astype(np.float32),
-        "point_type": np.concatenate(kind).astype(np.int64),
+        "point_type": np.concatenate(kind).astype(np.uint8),
         "point_speed": np.concatenate(speed).astype(np.float32),
-        "point_light": light.astype(np.int64),
+        "point_light": light.astype(np.int16),
         "point_valid": np.ones(len(light), bool),
     }
 

@@ -6,6 +6,7 @@ from symphony.modules.discriminator import FORESIGHT, Discriminator, discriminat
 from symphony.modules.displacement import BoundedDisplacement, displacement_policy
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
+from symphony.modules.noise import SeededNoise
 from symphony.modules.policy import NoiseSampler, discrete_policy
 from symphony.modules.pooling import pool_elements
 from symphony.modules.rows import in_blocks, mlp
@@ -20,6 +21,7 @@ __all__ = [
     "RouteScores",
     "SceneEncoder",
     "SceneNetwork",
+    "SeededNoise",
     "discrete_policy",
     "discriminator",
     "displacement_policy",

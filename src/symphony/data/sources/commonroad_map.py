@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import check_signals
 from symphony.data.segment import Floats, LaneType, MarkType, RoadMap, SignalState
 from symphony.data.sources.base import pairs, to_float32
 from symphony.data.sources.commonroad_xml import (
@@ -229,6 +230,8 @@ def read_signals(
     turns = _turns(root)
     lights = {integer(node.get("id"), "trafficLight id"): node for node in root.findall("trafficLight")}
     found: dict[int, tuple[Doubles, NDArray[np.uint8]]] = {}
+    when = np.arange(first_step, first_step + steps)
+    cycles: dict[int, NDArray[np.uint8]] = {}
     for k, lane in enumerate(network.lanes):
         after = [network.index[ref] for ref in lane.successors if ref in network.index]
         stop = lane.center[-1] if lane.stop is None else lane.stop
@@ -238,11 +241,15 @@ def read_signals(
                 continue
             field = f"trafficLight {ref}"
             direction = (node.findtext("direction") or "all").strip().lower()
-            states = _cycle(node, np.arange(first_step, first_step + steps), field)
+            if ref not in cycles:
+                cycles[ref] = _cycle(node, when, field)
+            states = cycles[ref]
             for target in after or [k]:
                 turn = turns.get(network.lanes[target].lanelet_id)
                 if direction == "all" or turn is None or turn in direction:
                     found.setdefault(target, (stop, states))
+        check_signals(len(cycles), steps, "trafficLight")
+        check_signals(len(found), steps, "trafficLight")
     stops = np.array([stop - origin for stop, _ in found.values()]).reshape(-1, 2)
     return (
         np.array(list(found), np.int32),

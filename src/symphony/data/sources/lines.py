@@ -15,6 +15,10 @@ from symphony.errors import DataError
 
 Doubles = NDArray[np.float64]
 
+MAX_EDGES = 500_000
+MAX_MEETINGS = 2_000_000
+"""Edges of outlines, and pairs of them that may cross: a union's time and memory grow with both."""
+PROBES = 200
 SLIT = 0.1
 """Metres by which neighbouring areas may miss each other on either side and still bound no slit."""
 
@@ -34,13 +38,20 @@ def drivable_rings(
     Slits and holes up to 2 * :data:`SLIT` wide are closed.
 
     Raises:
-        DataError: the union can't be formed; ``field`` says where the outlines come from.
+        DataError: the union can't be formed, or would be beyond all measure; ``field`` says where the outlines
+            come from.
     """
+    _check_effort([line for outline in outlines for line in _edges(outline)], field)
     try:
-        polygons = shapely.make_valid(np.array([shapely.Polygon(outline) for outline in outlines], object))
-        union = shapely.union_all(polygons)
-        closed = union.buffer(SLIT, join_style="mitre").buffer(-SLIT, join_style="mitre").simplify(0.01)
-    except shapely.errors.ShapelyError as error:
+        # Shapely takes NaN on its way through outlines of no width for something to warn of.
+        with np.errstate(invalid="ignore"):
+            polygons = shapely.make_valid(
+                np.array([shapely.Polygon(outline) for outline in outlines], object)
+            )
+            union = shapely.union_all(polygons)
+            wider = union.buffer(SLIT, join_style="mitre")
+            closed = wider.buffer(-SLIT, join_style="mitre").simplify(0.01)
+    except (shapely.errors.ShapelyError, ValueError) as error:
         raise DataError(f"the union of the areas can't be formed: {error}", field=field) from error
     rings = []
     for part in shapely.get_parts(closed):
@@ -48,6 +59,30 @@ def drivable_rings(
             polygon = orient(part, 1.0)
             rings += [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
     return tuple(rings)
+
+
+def _edges(outline: Doubles | shapely.Polygon) -> list[Doubles]:
+    """The lines [P, 2] around it."""
+    if not isinstance(outline, shapely.Polygon):
+        return [outline]
+    return [shapely.get_coordinates(ring) for ring in (outline.exterior, *outline.interiors)]
+
+
+def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
+    """Refuse outlines whose edges cross each other without end: pairs whose boxes overlap are counted for a few."""
+    count = sum(map(len, outlines))
+    if count > MAX_EDGES:
+        raise DataError(f"outlines of {count} points, at most {MAX_EDGES}", field=field)
+    if count * count <= MAX_MEETINGS:
+        return
+    first = np.concatenate([outline[:-1] for outline in outlines])
+    second = np.concatenate([outline[1:] for outline in outlines])
+    boxes = shapely.box(*np.minimum(first, second).T, *np.maximum(first, second).T)
+    tree = shapely.STRtree(boxes)
+    probes = boxes[np.linspace(0, len(boxes) - 1, PROBES).astype(np.int64)]
+    meetings = np.mean([len(tree.query(probe)) for probe in probes]) * len(boxes)
+    if meetings > MAX_MEETINGS:
+        raise DataError(f"outlines that cross about {meetings:.2g} times", field=field)
 
 
 def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:

@@ -1,0 +1,23 @@
+"""Agents: their networks, their weights on disk, and how they are named."""
+
+from __future__ import annotations
+
+from symphony.agents.agent import Agent, build_agent, load_agent
+from symphony.agents.networks import (
+    discriminator_network,
+    dynamics_of,
+    goal_network,
+    observation_of,
+    policy_network,
+)
+
+__all__ = [
+    "Agent",
+    "build_agent",
+    "discriminator_network",
+    "dynamics_of",
+    "goal_network",
+    "load_agent",
+    "observation_of",
+    "policy_network",
+]

@@ -1,0 +1,151 @@
+"""Agents: networks with what it takes to simulate them, by name and on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from symphony.agents.checkpoint import load_checkpoint
+from symphony.agents.choice import choose, split_name
+from symphony.agents.included import PREFIX
+from symphony.agents.networks import (
+    discriminator_network,
+    dynamics_of,
+    goal_network,
+    observation_of,
+    policy_network,
+)
+from symphony.config import AgentSpec, SearchConfig, read_json
+from symphony.envs.baselines import ConstantVelocity
+from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.observation import ObservationConfig
+from symphony.errors import ConfigError
+
+PLAYBACK = "playback"
+"""Name of the logged trajectories themselves, evaluated like an agent."""
+FILE = "agent.json"
+"""Of a run's folder: the agent's specification."""
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A policy and what it needs around it.
+
+    Attributes:
+        name: as given by the user.
+        policy: writes actions; None for log playback.
+        spec: what its networks are and how it is simulated; None for baselines.
+        goals: draws routes from first states; None for agents that follow none.
+        discriminator: scores states; None for agents trained without.
+    """
+
+    name: str
+    policy: TensorDictModuleBase | None
+    spec: AgentSpec | None = None
+    goals: TensorDictModuleBase | None = None
+    discriminator: TensorDictModuleBase | None = None
+
+    @property
+    def dynamics(self) -> Bicycle | Displacement:
+        """The action space it acts in."""
+        return Bicycle() if self.spec is None else dynamics_of(self.spec)
+
+    @property
+    def observation(self) -> ObservationConfig:
+        """What it sees, what its discriminator sees included."""
+        return ObservationConfig.nothing() if self.spec is None else observation_of(self.spec)
+
+    @property
+    def interactive(self) -> int:
+        """How many agents a segment it was trained with (2 for baselines)."""
+        return 2 if self.spec is None else self.spec.agent.interactive
+
+    @property
+    def duration(self) -> int:
+        """Seconds of a segment it was trained with; 0 for all."""
+        return 0 if self.spec is None else self.spec.duration
+
+    @property
+    def search(self) -> SearchConfig:
+        """How branches are pruned, where there is a discriminator."""
+        return SearchConfig() if self.spec is None else self.spec.search
+
+    @property
+    def searches(self) -> bool:
+        """Whether it is meant to be simulated with the search."""
+        return self.spec is not None and self.spec.searches
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """Those of its networks that there are, by name."""
+        parts = {"policy": self.policy, "goals": self.goals, "discriminator": self.discriminator}
+        return {name: module for name, module in parts.items() if module is not None}
+
+    def to(self, device: torch.device) -> Agent:
+        """Move its networks to a device, in place."""
+        for module in self.modules.values():
+            module.to(device)
+        return self
+
+    def check_step(self, dt: float) -> None:
+        """Raise ConfigError if the agent learned another time step than ``dt`` seconds."""
+        if self.spec is not None and abs(self.spec.dt - dt) > 1e-6:
+            raise ConfigError(
+                f"{self.name} learned steps of {self.spec.dt:g} s and can't drive in steps of {dt:g} s; "
+                f"convert the logs with --rate {1 / self.spec.dt:g}"
+            )
+
+
+def build_agent(name: str, spec: AgentSpec) -> Agent:
+    """An agent with fresh networks; seed torch beforehand."""
+    return Agent(
+        name,
+        policy_network(spec),
+        spec,
+        goal_network(spec) if spec.goals else None,
+        None if spec.discriminator is None else discriminator_network(spec),
+    )
+
+
+def load_agent(name: str, device: str = "cpu") -> Agent:
+    """An agent by name.
+
+    Args:
+        name: ``playback``, ``constant_velocity``, ``pretrained:NAME`` (an agent that comes with the package), or the
+            folder of a run, of which the best checkpoint is taken if it was validated, else the last; ``RUN@last``,
+            ``RUN@best`` or ``RUN@3000`` (a step) names another.
+        device: where its weights go.
+
+    Raises:
+        ConfigError: if there is no such agent or checkpoint.
+        CheckpointError: if its weights can't be read.
+    """
+    if name == PLAYBACK:
+        return Agent(name, None)
+    if name == "constant_velocity":
+        return Agent(name, ConstantVelocity(Bicycle()))
+    folder, which = split_name(name)
+    agent = build_agent(name, read_spec(folder))
+    load_checkpoint(choose(folder, which), modules=agent.modules, partial=True, restore_rng=False)
+    for module in agent.modules.values():
+        module.eval()
+    return agent.to(torch.device(device))
+
+
+def read_spec(folder: Path) -> AgentSpec:
+    """The specification of the agent that a run trains.
+
+    Raises:
+        ConfigError: if the folder is no run, or the file is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise ConfigError(
+            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', '{PREFIX}NAME' or the folder of a "
+            f"run (one with an {FILE})"
+        )
+    return read_json(AgentSpec, path)

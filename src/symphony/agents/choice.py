@@ -1,0 +1,98 @@
+"""Which checkpoint of a run is its agent: the best by validation, the last, or one that is named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint
+from symphony.agents.included import is_pretrained, pretrained_folder
+from symphony.errors import ConfigError
+
+_STEP = re.compile(r"(?:step-)?(\d+)")
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best checkpoint so far.
+
+    Attributes:
+        step: updates it was made after.
+        infractions: its collision rate plus its off-road time, percent.
+    """
+
+    step: int
+    infractions: float
+
+    @classmethod
+    def of(cls, extra: Mapping[str, Any]) -> Best | None:
+        """What the extra values of a checkpoint tell; None if nothing was validated up to then.
+
+        Raises:
+            CheckpointError: they tell something else.
+        """
+        found = extra.get("best")
+        if found is None:
+            return None
+        values: Any = [found.get(name) for name in ("step", "infractions")] if isinstance(found, dict) else []
+        if [type(value) for value in values] != [int, float] or not min(values) >= 0:
+            raise CheckpointError("no step with its infractions", field="extra.best")
+        return cls(*values)
+
+
+def split_name(name: str) -> tuple[Path, str]:
+    """From ``RUN[@WHICH]``, the folder of a run and which of its checkpoints is meant ("" if it doesn't say).
+
+    Raises:
+        ConfigError: for ``pretrained:NAME``, if there is no such agent.
+    """
+    if is_pretrained(name):
+        known, _, which = name.partition("@")
+        return pretrained_folder(known), which
+    run, at, which = name.rpartition("@")
+    # A folder's own name may hold the sign.
+    return (Path(run), which) if at and not Path(name).is_dir() else (Path(name), "")
+
+
+def choose(folder: Path, which: str = "") -> Path:
+    """The checkpoint of a run that is meant.
+
+    The last one knows which is the best, so that there is no second record to fall out of step with it.
+
+    Args:
+        folder: of the run.
+        which: ``best``, ``last``, or a step such as ``3000`` or ``step-3000``; by default the best if the run was
+            validated, else the last.
+
+    Raises:
+        ConfigError: if there is no such checkpoint.
+        CheckpointError: if the last one can't be read.
+    """
+    found = checkpoints(folder / "checkpoints")
+    if not found:
+        raise ConfigError(f"{folder}: the run has no checkpoint yet")
+    steps = {int(path.name[-12:]): path for path in found}
+    held = f"it has those of the steps {', '.join(map(str, steps))}"
+    named = _STEP.fullmatch(which)
+    if named is not None:
+        if int(named[1]) not in steps:
+            raise ConfigError(f"{folder}: no checkpoint of step {int(named[1])}, {held}")
+        return steps[int(named[1])]
+    if which not in ("", "best", "last"):
+        raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
+    if which == "last":
+        return found[-1]
+    try:
+        best = Best.of(load_checkpoint(found[-1], partial=True, restore_rng=False).extra)
+    except CheckpointError as error:
+        raise error.at(file=found[-1] / MANIFEST) from error
+    if best is None:
+        if which == "best":
+            raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")
+        return found[-1]
+    if best.step not in steps:
+        raise CheckpointError(f"the best checkpoint, of step {best.step}, is gone; {held}", file=folder)
+    return steps[best.step]

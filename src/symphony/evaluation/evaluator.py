@@ -1,0 +1,259 @@
+"""The one evaluator: used by the trainer, the command line and the recipes."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from symphony.agents import Agent, load_agent
+from symphony.config import EvaluateConfig
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+from symphony.envs.scene import SceneBatch
+from symphony.errors import ConfigError, DataError
+from symphony.imports import load_object
+from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds
+from symphony.roadgraph import LaneGraph, visited_curvatures
+from symphony.simulation.demonstrations import SceneDataset, logged
+from symphony.simulation.driving import driven_by, search_kind
+from symphony.simulation.finite import NotFiniteError
+from symphony.simulation.rollouts import Rollouts
+
+BASELINES = ("playback", "constant_velocity")
+"""Evaluated beside every agent, on the agents it drives and for as long."""
+Metric = Callable[[SceneBatch, Rollouts], Tensor]
+"""A metric of a user's own: a number [B, K] per rollout, NaN where there is none."""
+
+
+class EvaluatedBatch(NamedTuple):
+    """Scenes and the very rollouts that the metrics are of.
+
+    Attributes:
+        items: numbers of the run segments in their dataset.
+        segments: the run segments.
+        scenes: B scenes, on the CPU.
+        rollouts: [B, K, ...], on the CPU.
+    """
+
+    items: list[int]
+    segments: list[RunSegment]
+    scenes: SceneBatch
+    rollouts: Rollouts
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What the evaluator found.
+
+    Attributes:
+        agent: its name.
+        metrics: accumulated over all run segments.
+        config: how it was evaluated.
+        interactive: agents per segment that acted.
+        search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
+        own: mean of each metric of the user's own per run segment, by import path.
+        seconds: CPU time of the simulation, what it costs.
+        baselines: the same of :data:`BASELINES`, where they were asked for.
+    """
+
+    agent: str
+    metrics: RolloutMetrics
+    config: EvaluateConfig
+    interactive: int
+    search: str
+    own: dict[str, list[float]] = field(default_factory=dict)
+    seconds: float = 0.0
+    baselines: tuple[Evaluation, ...] = ()
+
+    def numbers(self) -> dict[str, float | int | str]:
+        """The table row: rates in percent, distances in metres, divergence in nats, standard errors beside them."""
+        own: dict[str, float] = {}
+        for path, values in self.own.items():
+            found = np.array([value for value in values if np.isfinite(value)])
+            many = len(found) > 1
+            own[path] = float(found.mean()) if len(found) else np.nan
+            own[f"{path}_se"] = float(found.std(ddof=1) / np.sqrt(len(found))) if many else np.nan
+        return {
+            "agent": self.agent,
+            **self.metrics.compute(),
+            **own,
+            "interactive": self.interactive,
+            "search": self.search,
+            "trees": self.config.trees if self.search in ("tree", "oracle") else 0,
+            "seed": self.config.seed,
+        }
+
+
+def evaluate(
+    agent: Agent | str,
+    data: SegmentStore | Path,
+    config: EvaluateConfig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    baselines: bool = False,
+    observe: Callable[[EvaluatedBatch], None] | None = None,
+) -> Evaluation:
+    """Evaluate an agent on every run segment of a store (paper, section V-B).
+
+    Args:
+        agent: an agent, or the name of one (see :func:`symphony.agents.load_agent`).
+        data: a store, or its folder.
+        config: how.
+        progress: called with the segments done and their total.
+        baselines: evaluate :data:`BASELINES` on the same segments, too.
+        observe: called with every batch of rollouts, to draw or keep them.
+
+    Raises:
+        ConfigError: if the agent learned another time step than the store has.
+        DataError: if the store is empty, or a segment has too few agents for so many interactive ones.
+    """
+    config = EvaluateConfig() if config is None else config
+    agent = load_agent(agent, config.device) if isinstance(agent, str) else agent
+    store = data if isinstance(data, SegmentStore) else SegmentStore(data)
+    if len(store) == 0:
+        raise DataError("the store holds no run segments", file=store.path)
+    dataset = SceneDataset(
+        store,
+        config.interactive or agent.interactive,
+        agent.dynamics,
+        routes=agent.goals is not None,
+        duration=config.duration or agent.duration,
+        keep=config.batch,
+    )
+    return evaluate_dataset(agent, dataset, config, progress, baselines=baselines, observe=observe)
+
+
+def evaluate_dataset(
+    agent: Agent,
+    dataset: SceneDataset,
+    config: EvaluateConfig,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    baselines: bool = False,
+    observe: Callable[[EvaluatedBatch], None] | None = None,
+) -> Evaluation:
+    """Evaluate an agent on every run segment of a prepared dataset, as :func:`evaluate` does.
+
+    Args:
+        agent: the agent, on ``config.device``.
+        dataset: in the agent's action space, with routes if it follows goals; it decides how many agents act and
+            for how long.
+        config: how else.
+        progress: called with the segments done and their total.
+        baselines: evaluate :data:`BASELINES` too.
+        observe: called with every batch of rollouts.
+
+    Raises:
+        ConfigError: if the agent learned another time step than the dataset has.
+        DataError: if a segment has too few agents for so many interactive ones.
+        NotFiniteError: if a network of the agent puts out a number that is not finite.
+    """
+    agent.check_step(dataset.dt)
+    others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
+    everyone = [agent, *(other for other in others if other.name != agent.name)]
+    # Baselines always do the same, and have no discriminator to search by.
+    once = dataclasses.replace(config, rollouts=1, trees=1, search="none")
+    own = {path: load_object(path) for path in config.metric}
+    found = [
+        Evaluation(one.name, RolloutMetrics(), how, dataset.interactive, search_kind(one, how))
+        for one, how in zip(everyone, [config] + [once] * len(others), strict=False)
+    ]
+    seconds = [0.0] * len(everyone)
+    for first in range(0, len(dataset), config.batch):
+        items = list(range(first, min(first + config.batch, len(dataset))))
+        scenes = dataset.scenes(items).to(torch.device(config.device))
+        for k, (one, evaluation) in enumerate(zip(everyone, found, strict=True)):
+            began = time.process_time()
+            try:
+                rollouts = driven_by(one, scenes, evaluation.config)
+            except NotFiniteError as error:
+                raise error.named(dataset.segment(items[error.row]).segment_id) from error
+            seconds[k] += time.process_time() - began
+            _add(evaluation, dataset, items, scenes, rollouts, own)
+            if observe is not None and one is agent:
+                segments = [dataset.segment(i) for i in items]
+                observe(EvaluatedBatch(items, segments, scenes.cpu(), rollouts.cpu()))
+        if progress is not None:
+            progress(items[-1] + 1, len(dataset))
+    found = [dataclasses.replace(one, seconds=spent) for one, spent in zip(found, seconds, strict=True)]
+    # The evaluated agent itself where it is one of the baselines.
+    named = {evaluation.agent: evaluation for evaluation in found}
+    return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
+
+
+def _add(
+    evaluation: Evaluation,
+    dataset: SceneDataset,
+    items: list[int],
+    scenes: SceneBatch,
+    rollouts: Rollouts,
+    own: dict[str, Metric],
+) -> None:
+    """Add the rollouts of some run segments to what was found."""
+    log, log_valid = logged(scenes)
+    kinds = _kinds(scenes, rollouts, log_valid if evaluation.search == "log" else None)
+    away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
+    for path, metric in own.items():
+        values = metric(scenes, rollouts)
+        if values.shape != rollouts.state.shape[:2]:
+            shape = tuple(rollouts.state.shape[:2])
+            raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")
+        evaluation.own.setdefault(path, []).extend(values.double().nanmean(-1).tolist())
+    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
+    regions, regions_log = [], []
+    for b, item in enumerate(items):
+        graph = dataset.graph(item)
+        regions.append(_curvatures(graph, driven[b], counted[b]))
+        regions_log.append(_curvatures(graph, log[b], log_valid[b, 1:]))
+    evaluation.metrics.update(
+        [dataset.segment(i).segment_id for i in items],
+        collided=rollouts.collision.transpose(2, 3).cpu(),
+        offroad=rollouts.offroad.transpose(2, 3).cpu(),
+        displacement=away.transpose(2, 3).cpu(),
+        simulated=counted.transpose(2, 3),
+        logged=log_valid[:, 1:].transpose(1, 2),
+        curvature=regions,
+        curvature_log=regions_log,
+        kinds=kinds,
+    )
+
+
+def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> CollisionKinds:
+    """Who ran into whom, in the first collision of each agent."""
+    steps = rollouts.state.shape[-3]
+    if log_valid is None:
+        exists = scenes.interactive_valid[:, None, :, None].expand(-1, rollouts.state.shape[1], -1, steps)
+    else:
+        exists = log_valid.transpose(1, 2)[:, None]
+    subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None]
+    return collision_kinds(
+        (rollouts.collision & rollouts.counted).transpose(2, 3),
+        rollouts.state.transpose(2, 3),
+        exists,
+        subject,
+        scenes.log_state[:, None, :steps].transpose(2, 3),
+        scenes.log_valid[:, None, :steps].transpose(2, 3),
+        scenes.box_size[:, None],
+    )
+
+
+def _curvatures(graph: LaneGraph, state: Tensor, counted: Tensor) -> NDArray[np.float64]:
+    """Average curvature of every branching region that each trajectory visits.
+
+    Args:
+        graph: lanes.
+        state: [..., T + 1, N, 4].
+        counted: [..., T, N]; the first state counts wherever the second does.
+    """
+    valid = torch.cat([counted[..., :1, :], counted], -2)
+    path = state.transpose(-2, -3).numpy()
+    return visited_curvatures(graph, path[..., :2], path[..., 2], valid.transpose(-1, -2).numpy())

@@ -1,0 +1,257 @@
+"""Evaluations of runs on disk: each run keeps its own, as ``RUN/evaluations/<name>.json``.
+
+The name says how the run was judged, so that the same evaluation made again takes the place of the earlier one and
+different ones lie side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from symphony.agents.choice import choose, split_name
+from symphony.agents.included import is_pretrained
+from symphony.config import EvaluateConfig
+from symphony.errors import ConfigError, DataError
+from symphony.files import write_json
+
+if TYPE_CHECKING:
+    from symphony.agents import Agent
+    from symphony.data.store import SegmentStore
+    from symphony.evaluation import Evaluation
+
+FORMAT = 2
+"""Version of a kept evaluation."""
+FOLDER = "evaluations"
+
+_MEMORY = ("batch", "device")
+"""Settings that change no result."""
+_NAMED = ("search", "trees", "branches", "rule", "interactive", "rollouts", "duration", "seed")
+_PRUNING = ("prune_every", "temperature")
+"""Part of the name of the simulation; evaluations from before they could be set have none."""
+_PARTS: dict[str, tuple[str, ...]] = {
+    "run": ("updates",),
+    "data": ("name", "checksum"),
+    "config": _NAMED,
+    "playback": (),
+    "constant_velocity": (),
+    "curvature": ("policy", "log"),
+}
+"""What a kept evaluation must have."""
+
+
+def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> dict[str, Any]:
+    """An evaluation as JSON can hold it.
+
+    Args:
+        agent: that was evaluated.
+        result: what the evaluator found, with its baselines.
+        store: the run segments.
+
+    Returns:
+        The numbers of ``result`` themselves; ``playback`` and ``constant_velocity``: those of baselines; ``cost``:
+        seconds of CPU time for ``simulation``, all rollouts of all segments together; ``run``: ``method``, ``seed``,
+        ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was judged and whether
+        that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
+        store; ``config``: the settings of the evaluation, with what was left to the agent filled
+        in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``;
+        ``per_segment``: a row for each run segment.
+    """
+    visited, visited_log = result.metrics.curvature_histograms()
+    return {
+        "format": FORMAT,
+        **result.numbers(),
+        "run": _run_facts(agent.name),
+        "data": {"name": store.path.resolve().name, "checksum": store.checksum()},
+        "config": _filled_in(agent, result),
+        **{baseline.agent: baseline.numbers() for baseline in result.baselines},
+        "cost": {"simulation": result.seconds},
+        "curvature": {"policy": visited.tolist(), "log": visited_log.tolist()},
+        "per_segment": result.metrics.rows(),
+    }
+
+
+def _run_facts(name: str) -> dict[str, Any] | None:
+    folder, which = split_name(name)
+    if not (folder / "config.json").is_file():
+        return None
+    config = read_run(folder)
+    own, chosen = choose(folder), choose(folder, which)
+    return {
+        "method": config["method"],
+        "seed": config.get("seed", 0),
+        "interactive": run_interactive(config),
+        "duration": config.get("duration", 0),
+        "updates": updates_done(folder),
+        "checkpoint": int(chosen.name[-12:]),
+        "named": chosen != own,
+    }
+
+
+def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
+    config, settings = result.config, agent.search
+    filled = dataclasses.asdict(config) | {
+        "search": result.search,
+        "interactive": result.interactive,
+        "duration": config.duration or agent.duration,
+        "branches": 0,
+        "trees": 0,
+        "rule": "",
+        "prune_every": 0,
+        "temperature": 0.0,
+        "retries": 0,
+        "retry_above": 0.0,
+    }
+    if result.search not in ("none", "log"):
+        filled["branches"] = config.branches or settings.test_branches
+    if result.search in ("tree", "oracle"):
+        filled["trees"] = config.trees
+        used = config.pruning(settings)
+        filled["rule"], filled["prune_every"] = used.rule, used.prune_every
+        filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
+        filled["retries"] = config.retries
+        filled["retry_above"] = config.retry_above if config.retries else 0.0
+    return {name: value for name, value in filled.items() if name not in _MEMORY}
+
+
+def evaluation_name(record: dict[str, Any]) -> str:
+    """Name of an evaluation among those of its run; equal for equal data and settings only."""
+    config, data = record["config"], record["data"]
+    store = re.sub(r"[^A-Za-z0-9._]+", "_", data["name"])[:60] or "store"
+    parts = [store, data["checksum"][:12], simulation_name(config), f"{config['interactive']}agents"]
+    if config["duration"]:
+        parts.append(f"{config['duration']}s")
+    parts += [f"{config['rollouts']}rollouts", f"seed{config['seed']}"]
+    if record["run"]["named"]:
+        parts.append(f"step{record['run']['checkpoint']}")
+    for field in dataclasses.fields(EvaluateConfig):
+        value = config.get(field.name, field.default)
+        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY, "metric") and value != field.default:
+            parts.append(field.name if value is True else f"{field.name}={value}")
+    parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
+    return "-".join(parts)
+
+
+def simulation_name(config: dict[str, Any]) -> str:
+    """How rollouts came about, such as ``none`` or ``tree-1x16-best-every10``."""
+    if config["search"] == "best":
+        return f"best-of-{config['branches']}"
+    if config["search"] not in ("tree", "oracle"):
+        return config["search"]
+    words = [config["search"], f"{config['trees']}x{config['branches']}", config["rule"]]
+    if config.get("prune_every"):
+        words.append(f"every{config['prune_every']}")
+    if config.get("temperature"):
+        words.append(f"at{config['temperature']:g}")
+    return "-".join(words)
+
+
+def keep_evaluation(agent: str, record: dict[str, Any]) -> Path | None:
+    """Write an evaluation into the folder of its run and return the file.
+
+    Args:
+        agent: its name. A baseline has no folder, and the folder of an agent that comes with the package is not the
+            user's: nothing is written for them.
+        record: see :func:`evaluation_record`.
+    """
+    if record["run"] is None or is_pretrained(agent):
+        return None
+    file = split_name(agent)[0] / FOLDER / f"{evaluation_name(record)}.json"
+    # An interrupted write must not leave half a file where a table looks for a whole one.
+    write_json(file, record)
+    return file
+
+
+def kept_evaluations(run: Path) -> dict[str, dict[str, Any]]:
+    """The evaluations that a run keeps, by name, in the order of the names.
+
+    Raises:
+        DataError: one that can't be read.
+    """
+    return {file.stem: read_evaluation(file) for file in sorted((run / FOLDER).glob("[!.]*.json"))}
+
+
+def read_evaluation(file: Path) -> dict[str, Any]:
+    """A kept evaluation (see :func:`evaluation_record`).
+
+    Raises:
+        DataError: it can't be read or lacks something.
+    """
+    record = _read_object(file)
+    if record.get("format") != FORMAT:
+        raise DataError(
+            f"format {record.get('format')!r}, this version reads {FORMAT}", file=file, field="format"
+        )
+    for part, names in _PARTS.items():
+        held = record.get(part)
+        if not isinstance(held, dict):
+            raise DataError("is missing", file=file, field=part)
+        for name in names:
+            if name not in held:
+                raise DataError("is missing", file=file, field=f"{part}.{name}")
+    if not isinstance(record.get("segments"), int):
+        raise DataError("is missing", file=file, field="segments")
+    return record
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """The configuration of a run as it is written, of any version.
+
+    Raises:
+        DataError: it can't be read or names no method.
+    """
+    file = folder / "config.json"
+    config = _read_object(file)
+    if not isinstance(config.get("method"), str):
+        raise DataError("is missing", file=file, field="method")
+    return config
+
+
+def run_interactive(config: dict[str, Any]) -> int:
+    """Interactive agents per run segment, from the configuration of a run."""
+    agent = config.get("agent")
+    return agent.get("interactive", 2) if isinstance(agent, dict) else 2
+
+
+def updates_done(run: Path) -> int:
+    """Updates up to the last checkpoint of a run; 0 where there is none."""
+    found = (re.fullmatch(r"step-(\d+)", path.name) for path in (run / "checkpoints").glob("step-*"))
+    return max((int(match[1]) for match in found if match), default=0)
+
+
+def find_runs(folders: Iterable[Path]) -> list[Path]:
+    """Every run among folders, each once: a folder is a run or is searched for some.
+
+    Raises:
+        ConfigError: a folder without any.
+    """
+    found: dict[Path, Path] = {}
+    for folder in folders:
+        runs = _runs_below(folder)
+        if not runs:
+            raise ConfigError(f"{folder} holds no run: none has a config.json")
+        for run in runs:
+            found.setdefault(run.resolve(), run)
+    return [found[place] for place in sorted(found)]
+
+
+def _runs_below(folder: Path) -> list[Path]:
+    if (folder / "config.json").is_file():
+        return [folder]
+    if not folder.is_dir():
+        return []
+    return [run for inner in sorted(folder.iterdir()) if inner.is_dir() for run in _runs_below(inner)]
+
+
+def _read_object(file: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"not valid JSON ({error})", file=file) from error
+    if not isinstance(value, dict):
+        raise DataError("not a JSON object", file=file)
+    return value

@@ -1,0 +1,302 @@
+"""Scenes and expert states of a store, prepared once per segment and kept in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from symphony import keys
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.observation import ObservationConfig, objects_at, observe
+from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices
+from symphony.envs.scene import SceneBatch, collate, scene
+from symphony.errors import DataError
+from symphony.geometry.frames import forward_speed
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.experts import ExpertCache, Experts, fit_experts
+
+KEEP = 5000
+"""Segments held in memory once they are prepared: 90 kB each, 170 with routes, in the built-in data."""
+GRAPHS = 64
+"""Lane graphs held in memory."""
+
+
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
+    count = min(count, total)
+    return [k * total // count for k in range(count)]
+
+
+class SceneDataset:
+    """Random access to the scenes and experts of a store.
+
+    Args:
+        store: the run segments.
+        interactive: agents per segment that act.
+        dynamics: action space the experts are fitted to.
+        indices: rows of the store to use; all by default.
+        routes: whether scenes and experts come with their routes.
+        duration: seconds of each segment that are used; 0 for all.
+        keep: segments held in memory once they are prepared.
+
+    Raises:
+        DataError: on access, for a segment shorter than the duration.
+    """
+
+    def __init__(
+        self,
+        store: SegmentStore,
+        interactive: int = 2,
+        dynamics: Bicycle | Displacement | None = None,
+        indices: Sequence[int] | None = None,
+        *,
+        routes: bool = False,
+        duration: float = 0,
+        keep: int = KEEP,
+    ) -> None:
+        self.store = store
+        self.interactive = interactive
+        self.dynamics = Bicycle() if dynamics is None else dynamics
+        self.indices = list(range(len(store))) if indices is None else list(indices)
+        self.routes, self.duration = routes, duration
+        self.scene = lru_cache(keep)(self._scene)
+        self.experts = ExpertCache(self._experts, keep)
+        self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def dt(self) -> float:
+        """Seconds per step.
+
+        Raises:
+            DataError: if there is no segment, or segments differ in it; names one that does.
+        """
+        if not self.indices:
+            raise DataError("the store holds no run segments", file=self.store.path)
+        steps = self.store.time_steps[self.indices]
+        other = np.flatnonzero(steps != steps[0])
+        if len(other):
+            raise DataError(
+                f"has steps of {steps[other[0]]:g} s, others of {steps[0]:g} s",
+                file=self.store.path,
+                segment=self.store.ids[self.indices[other[0]]],
+                field="dt",
+            )
+        return float(steps[0])
+
+    @property
+    def decisions(self) -> int:
+        """Actions until the last logged step of the longest segment, or up to the duration."""
+        longest = int(self.store.num_steps[self.indices].max()) - 1
+        return min(longest, round(self.duration / self.dt)) if self.duration else longest
+
+    def segment(self, i: int) -> RunSegment:
+        """The run segment behind item ``i``, up to the duration."""
+        segment = self.store[self.indices[i]]
+        if not self.duration:
+            return segment
+        steps = round(self.duration / segment.dt) + 1
+        if segment.num_steps < steps:
+            has = (segment.num_steps - 1) * segment.dt
+            raise DataError(
+                f"has {has:g} s, {self.duration:g} are asked for",
+                file=self.store.path,
+                segment=segment.segment_id,
+            )
+        timed = ("position", "heading", "velocity", "valid", "signal_state")
+        return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
+
+    def graph(self, i: int) -> LaneGraph:
+        """The lane graph of item ``i``; segments on one map share it."""
+        return self._graph(int(self.store.map_index[self.indices[i]]))
+
+    def _scene(self, i: int) -> SceneBatch:
+        """Item ``i`` as a batch of one scene."""
+        graph = self.graph(i) if self.routes else None
+        return scene(self.segment(i), self.interactive, graph, number=i)
+
+    def scenes(self, items: Sequence[int]) -> SceneBatch:
+        """Several items as one padded batch."""
+        return collate([self.scene(i) for i in items])
+
+    def _experts(self, items: Sequence[int]) -> list[Experts]:
+        """The demonstrations of several items, fitted together."""
+        segments, graphs = [self.segment(i) for i in items], [self.graph(i) for i in items]
+        return fit_experts(segments, self.dynamics, graphs, routes=self.routes)
+
+    def draw(self, count: int, rng: torch.Generator) -> list[int]:
+        """Different items at random (all, if there are fewer)."""
+        return torch.randperm(len(self), generator=rng)[:count].tolist()
+
+    def sample_states(
+        self,
+        items: Sequence[int],
+        states: int,
+        observation: ObservationConfig,
+        rng: torch.Generator,
+        device: torch.device | str = "cpu",
+    ) -> TensorDict:
+        """A training batch: expert states drawn uniformly from some segments.
+
+        Returns:
+            TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
+        """
+        found = self.experts.many(items)
+        places = [expert.valid.nonzero(as_tuple=True) for expert in found]
+        sizes = torch.tensor([len(which) for which, _ in places])
+        pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
+        item = torch.repeat_interleave(torch.arange(len(items)), sizes)[pick]
+        which, when = (torch.cat(parts)[pick] for parts in zip(*places, strict=True))
+        ends = torch.tensor([len(expert.agent) for expert in found]).cumsum(0)
+        row = which + torch.cat([ends.new_zeros(1), ends[:-1]])[item]
+        # Segments may differ in length, so rows of states are looked up by their place in one flat list.
+        lengths = torch.cat([torch.full((len(e.agent),), e.states.shape[1]) for e in found])
+        begin = lengths.cumsum(0) - lengths
+        state = torch.cat([e.states.flatten(0, 1) for e in found])[begin[row] + when]
+        ordinal = torch.arange(len(lengths))
+        action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
+        action = action.long() if self.dynamics.discrete else action
+        agent = torch.cat([e.agent for e in found])[row]
+        tables = [table for expert in found for table in expert.routes]
+        taken = logged_routes(tables, row) if observation.route else None
+        return expert_batch(
+            self.scenes(items).to(device),
+            item.to(device),
+            when.to(device),
+            agent.to(device),
+            state.to(device),
+            observation,
+            action=action.to(device),
+            routes=None if taken is None else (taken[0].to(device), taken[1].to(device)),
+        )
+
+    def sample_goals(
+        self,
+        items: Sequence[int],
+        count: int,
+        observation: ObservationConfig,
+        rng: torch.Generator,
+        device: torch.device | str = "cpu",
+    ) -> TensorDict:
+        """A training batch for the goal policy: experts at their first state, their routes and the one they took.
+
+        Returns:
+            TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK`` and ``GOAL``
+            (-1 for vehicles on no lane).
+        """
+        each = self.experts.many(items)
+        found = [(i, expert, k) for i, expert in enumerate(each) for k in range(len(expert.agent))]
+        pick = torch.randint(len(found), (count,), generator=rng).tolist()
+        chosen = [found[k] for k in pick]
+        when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
+        tables = [e.routes[k] for _, e, k in chosen]
+        most = max(1, *(len(table.count) for table in tables))
+        points, counts = np.zeros((count, most, POINTS, 2), np.float32), np.zeros((count, most), np.int64)
+        for row, table in enumerate(tables):
+            points[row, : len(table.count)], counts[row, : len(table.count)] = table.points, table.count
+        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
+            device
+        )
+        batch = expert_batch(
+            self.scenes(items).to(device),
+            torch.tensor([i for i, _, _ in chosen], device=device),
+            when.to(device),
+            torch.stack([e.agent[k] for _, e, k in chosen]).to(device),
+            state,
+            observation,
+        )
+        features, mask = route_choices(
+            state[:, None],
+            torch.from_numpy(points)[:, None].to(device),
+            torch.from_numpy(counts)[:, None].to(device),
+            observation.distance_scale,
+        )
+        batch.set(keys.ROUTES, features)
+        batch.set(keys.ROUTES_MASK, mask)
+        batch.set(keys.GOAL, torch.tensor([[table.logged] for table in tables], device=device))
+        return batch
+
+    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor]:
+        """What the interactive agents of some segments did, as the fit to the action space has it.
+
+        Args:
+            items: the segments.
+            scenes: their scenes.
+
+        Returns:
+            States [B, T, N, 4] and where the log is valid [B, T, N]; agents that are no experts as logged.
+        """
+        state, valid = logged(scenes)
+        state, valid = state.clone(), valid.clone()
+        for b, expert in enumerate(self.experts.many(items)):
+            steps = expert.states.shape[1]
+            hit = expert.agent[:, None].to(scenes.device) == scenes.interactive[b]
+            which, place = hit.nonzero(as_tuple=True)
+            state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
+        return state, valid
+
+
+def logged_routes(tables: Sequence[RouteTable], row: Tensor) -> tuple[Tensor, Tensor]:
+    """Points [M, K, 2] and their number [M] (0 where there is none) of the routes that experts took."""
+    none = np.zeros((POINTS, 2), np.float32)
+    points = np.stack([table.points[table.logged] if table.logged >= 0 else none for table in tables])
+    count = np.array([table.count[table.logged] if table.logged >= 0 else 0 for table in tables])
+    return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
+
+
+def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
+    """What the interactive agents did in the log: states [B, T, N, 4] and validity [B, T, N]."""
+    steps = scenes.log_valid.shape[1]
+    index = scenes.interactive[:, None].expand(-1, steps, -1)
+    log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
+    heading, velocity = log[..., 2], log[..., 3:]
+    speed = forward_speed(velocity, heading)
+    valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
+    return torch.cat([log[..., :3], speed[..., None]], -1), valid
+
+
+def expert_batch(
+    scenes: SceneBatch,
+    scene_of: Tensor,
+    step: Tensor,
+    agent: Tensor,
+    state: Tensor,
+    observation: ObservationConfig,
+    *,
+    action: Tensor | None = None,
+    routes: tuple[Tensor, Tensor] | None = None,
+) -> TensorDict:
+    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and, from
+    points [M, K, 2] and counts [M], their routes, where given.
+    """
+    index, here = agent[:, None], state[:, None]
+    real = torch.ones_like(index, dtype=torch.bool)
+    objects = objects_at(scenes, scene_of, step, here, index, real)
+    seen = observe(scenes, scene_of, step, objects, index, observation)
+    batch = TensorDict({}, batch_size=[len(step)], device=state.device)
+    for key, value in (
+        (keys.OWN, seen.own),
+        (keys.OBJECTS, seen.objects),
+        (keys.OBJECTS_MASK, seen.objects_mask),
+        (keys.POINTS, seen.points),
+        (keys.POINTS_MASK, seen.points_mask),
+        (keys.VALID, real),
+        (keys.STATE, here),
+    ):
+        batch.set(key, value)
+    if action is not None:
+        batch.set(keys.ACTION, action[:, None])
+    if routes is not None:
+        points, count = routes
+        ahead = route_ahead(here, points[:, None], count[:, None], observation.distance_scale)
+        batch.set(keys.ROUTE, ahead)
+    return batch

@@ -1,0 +1,149 @@
+"""Closed-loop simulation, keeping only what is read afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from symphony import keys
+from symphony.envs.driving import DrivingEnv
+from symphony.modules import drawn_goals
+from symphony.streams import fold_in, uniform
+
+_GOALS = 1 << 40
+"""Number of the stream that goals draw from, far above those of rollouts and agents."""
+
+
+class Rollouts(NamedTuple):
+    """What became of the interactive agents. T simulated steps, after the first state.
+
+    Attributes:
+        state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
+        collision: [..., T, N].
+        offroad: [..., T, N].
+        counted: [..., T, N] steps that are judged: of real agents, up to the segment's last logged step.
+    """
+
+    state: Tensor
+    collision: Tensor
+    offroad: Tensor
+    counted: Tensor
+
+    def cpu(self) -> Rollouts:
+        """The same on the CPU."""
+        return Rollouts(*(part.cpu() for part in self))
+
+
+@torch.no_grad()
+def simulate(
+    env: DrivingEnv,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    start: TensorDictBase,
+    steps: int | None = None,
+) -> Rollouts:
+    """Roll a policy out from a start state.
+
+    Only states and flags are kept: the observations of sixteen rollouts would take gigabytes.
+
+    Args:
+        env: the environment.
+        policy: writes the action into the TensorDict it is given.
+        start: as returned by :meth:`DrivingEnv.start`, any batch shape.
+        steps: decisions; by default up to the last logged step of the longest scene.
+    """
+    steps = decisions_of(env, start) if steps is None else steps
+    now, states, collisions, offroads = start, [start.get(keys.STATE)], [], []
+    with set_exploration_type(ExplorationType.RANDOM):
+        for _ in range(steps):
+            now = step_mdp(env.step(policy(now)), exclude_reward=True)
+            states.append(now.get(keys.STATE))
+            collisions.append(now.get(keys.COLLISION).squeeze(-1))
+            offroads.append(now.get(keys.OFFROAD).squeeze(-1))
+    return Rollouts(
+        torch.stack(states, -3),
+        torch.stack(collisions, -2),
+        torch.stack(offroads, -2),
+        counted_steps(env, start, steps),
+    )
+
+
+@torch.no_grad()
+def draw_goals(
+    env: DrivingEnv, goals: TensorDictModuleBase | None, start: TensorDictBase, seed: int, tree: Tensor
+) -> Tensor:
+    """The route [..., N] each agent follows from a start state, -1 for none.
+
+    Args:
+        env: the environment.
+        goals: the goal policy; None takes the routes nearest to the log.
+        start: [...], one entry per draw.
+        seed: of the draw.
+        tree: [...] number of the draw within its scene, so that it is the same whatever the batch.
+    """
+    if goals is None:
+        return env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)]
+    seen = env.choices(start)
+    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _GOALS), tree[..., None])
+    place = torch.arange(env.num_agents, device=start.device)
+    seen.set(keys.GOAL_NOISE, uniform(seed, fold_in(stream, place), 0))
+    with set_exploration_type(ExplorationType.RANDOM):
+        seen = goals(seen)
+    return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
+
+
+def start_states(
+    env: DrivingEnv,
+    goals: TensorDictModuleBase | None,
+    *,
+    trees: int,
+    branches: int,
+    seed: int,
+    logged_goals: bool = False,
+) -> TensorDictBase:
+    """First states [B, trees, branches] of all scenes; branches of a tree share their goals, trees draw their own.
+
+    Args:
+        env: the environment.
+        goals: the goal policy; None for agents that follow none.
+        trees: per scene.
+        branches: per tree.
+        seed: of the goals.
+        logged_goals: take the routes nearest to the log instead.
+    """
+    device, scenes = env.scenes.device, len(env.scenes)
+    number = torch.arange(trees * branches, device=device).reshape(trees, branches)
+    scene = torch.arange(scenes, device=device)[:, None, None]
+    start = env.start(scene.expand(-1, trees, branches), number.expand(scenes, -1, -1))
+    if goals is None:
+        return start
+    tree = torch.arange(trees, device=device).expand(scenes, trees)
+    goal = draw_goals(env, None if logged_goals else goals, start[..., 0], seed, tree)
+    return env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
+
+
+def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
+    """What the evaluator reads, from the leaves [..., L, T] of a search that began in ``start`` [..., S], S >= L."""
+    start = start[..., : trajectories.shape[-2]]
+    state = torch.cat([start.get(keys.STATE)[..., None, :, :], trajectories.get(("next", *keys.STATE))], -3)
+    collision, offroad = (
+        trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)
+    )
+    return Rollouts(state, collision, offroad, counted_steps(env, start, collision.shape[-2]))
+
+
+def decisions_of(env: DrivingEnv, start: TensorDictBase) -> int:
+    """Actions until the last logged step of the longest scene."""
+    return int(env.scenes.last_step[start.get(keys.SCENE)].max())
+
+
+def counted_steps(env: DrivingEnv, start: TensorDictBase, steps: int) -> Tensor:
+    """Where [..., T, N] agents are real and their segment still has logged steps."""
+    step = start.get(keys.STEP) + torch.arange(1, steps + 1, device=start.device)
+    within = step <= env.scenes.last_step[start.get(keys.SCENE)]
+    return within[..., None] & start.get(keys.VALID)[..., None, :]

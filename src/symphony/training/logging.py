@@ -1,0 +1,108 @@
+"""Curves of a run: always a plain JSON-lines file, and Weights & Biases beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from numpy.typing import NDArray
+
+from symphony.files import naming, write_file
+
+
+class Tracker:
+    """Writes the metrics of a run.
+
+    Args:
+        folder: of the run; ``metrics.jsonl`` is written there.
+        settings: shown by Weights & Biases beside the curves.
+        wandb: ``offline``, ``online`` or ``disabled``. The environment variable ``WANDB_MODE`` overrides it, as
+            it does everywhere else.
+        after: keep only records up to this step of an earlier, interrupted run.
+
+    Attributes:
+        path: the file.
+        kept: records of that earlier run.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: dict[str, Any],
+        wandb: Literal["offline", "online", "disabled"] = "offline",
+        after: int = 0,
+    ) -> None:
+        self.path = folder / "metrics.jsonl"
+        self.kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
+        # Put in place as a whole, lest a kill meanwhile lose what is kept.
+        write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
+        with naming(self.path):
+            self._file = self.path.open("a", encoding="utf-8")
+        self._run = None
+        mode: Any = os.environ.get("WANDB_MODE", wandb)
+        if mode != "disabled":
+            import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
+
+            self._run = tracking.init(
+                project="symphony",
+                name=folder.name,
+                dir=str(folder),
+                config=settings,
+                mode=mode,
+                settings=tracking.Settings(silent=True, console="off"),
+            )
+
+    def log(self, step: int, values: Mapping[str, float | str]) -> None:
+        """Record numbers, and words, at an update. Raises DataError if the disk refuses."""
+        # JSON knows no NaN, which stands for statistics of nothing, and no infinity.
+        known = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in values.items()
+        }
+        with naming(self.path):
+            self._file.write(json.dumps({"step": step, **known}) + "\n")
+            self._file.flush()
+        if self._run is not None:
+            self._run.log(dict(values), step=step)
+
+    def preview(self, step: int, samples: Mapping[str, NDArray[Any]], video: Path) -> None:
+        """Give Weights & Biases, where it is used, histograms of samples [K] and an animation (gif)."""
+        if self._run is None:
+            return
+        import wandb as tracking  # noqa: PLC0415 - is there by now
+
+        found: dict[str, Any] = {"preview/rollout": tracking.Video(str(video), format="gif")}
+        found |= {f"preview/{name}": tracking.Histogram(x.tolist()) for name, x in samples.items() if len(x)}
+        self._run.log(found, step=step)
+
+    def sync(self) -> None:
+        """Wait until all records are on the disk: a checkpoint must not survive a power cut that they don't."""
+        with naming(self.path):
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Finish the files."""
+        try:
+            with naming(self.path):
+                self._file.close()
+        finally:
+            if self._run is not None:
+                self._run.finish()
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """The records of a run so far; a last line cut short by a kill is left out."""
+    path = folder / "metrics.jsonl"
+    if not path.is_file():
+        return []
+    records = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return records

@@ -1,0 +1,137 @@
+"""Training by several processes, as ``torchrun`` starts them: each draws batches of its own, gradients are averaged.
+
+The losses are wrapped in torch's DistributedDataParallel. Their means are over the entries of all processes, so that
+W processes with batches of B do what one would do with a batch of W x B, however uneven the shards are.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from symphony.errors import ConfigError
+from symphony.objectives.base import MaskedLoss
+from symphony.streams import stream_of
+
+_SEED_STRIDE = 1 << 20
+_PATIENCE = timedelta(days=1)
+"""For the others to arrive, one of which may be validating; that one has died torchrun notices by itself."""
+
+
+class SharedLoss(DistributedDataParallel):
+    """A loss whose gradients are averaged over all processes; its attributes are those of the loss."""
+
+    def __init__(self, loss: MaskedLoss) -> None:
+        # DDP can't look for unused parameters: a TensorDict of losses hides from it what they depend on.
+        super().__init__(loss)
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if name == "module":
+                raise
+            return getattr(self.module, name)
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Those that train one run together, seen from one of them.
+
+    Attributes:
+        device: where this one computes.
+        rank: number of this one.
+        count: how many there are.
+    """
+
+    device: torch.device
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the one that validates, writes and speaks."""
+        return self.rank == 0
+
+    def seed(self, seed: int) -> int:
+        """The seed of the data that this process draws, the run's own in the leading one."""
+        return seed + self.rank * _SEED_STRIDE
+
+    def reseed(self, seed: int, step: int) -> None:
+        """Make the global random numbers of an update those of (seed, update, process) alone.
+
+        A checkpoint holds those of the leading process only.
+        """
+        if self.count > 1:
+            torch.manual_seed(stream_of(f"update {seed} {self.rank} {step}"))
+
+    def share(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
+        """A loss that is that of the batches of all processes; itself where there is one process only."""
+        if self.count == 1:
+            return loss
+        loss.share_count = self._mean
+        return SharedLoss(loss)
+
+    def mean(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Means over the processes of the numbers each has under the same names; those that are NaN are left out.
+
+        What a loss reports becomes exactly its value on the joint batch. AUCs and what searches report become means
+        of the processes' own.
+        """
+        if self.count == 1 or not values:
+            return dict(values)
+        names = sorted(values)
+        own = torch.stack([values[name].detach().double() for name in names])
+        known = ~own.isnan()
+        both = torch.stack([own.nan_to_num(0.0, torch.inf, -torch.inf), known.double()])
+        dist.all_reduce(both)
+        total, number = both.unbind()
+        return dict(zip(names, (total / number).unbind(), strict=True))
+
+    def wait(self) -> None:
+        """Go on when all have got here."""
+        if self.count > 1:
+            # A reduction, as a barrier of NCCL guesses the device.
+            dist.all_reduce(torch.zeros((), device=self.device))
+
+    def _mean(self, number: Tensor) -> Tensor:
+        total = number.double()
+        dist.all_reduce(total)
+        return (total / self.count).float()
+
+
+@contextmanager
+def processes(device: torch.device) -> Iterator[Processes]:
+    """The processes this one was started with by ``torchrun``, or that have a process group already; else it alone.
+
+    Args:
+        device: asked for; ``cuda`` becomes the device of each process's own.
+
+    Raises:
+        ConfigError: if there are more processes than CUDA devices on this machine.
+    """
+    own = dist.is_available() and not dist.is_initialized() and dist.is_torchelastic_launched()
+    if not own and not (dist.is_available() and dist.is_initialized()):
+        yield Processes(device)
+        return
+    if device.type == "cuda":
+        place = int(os.environ.get("LOCAL_RANK", "0"))
+        if place >= torch.cuda.device_count():
+            raise ConfigError(f"process {place} of this machine has no CUDA device of its own")
+        device = torch.device("cuda", place)
+        torch.cuda.set_device(device)
+    if own:
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=_PATIENCE)
+    yield Processes(device, dist.get_rank(), dist.get_world_size())
+    if own:
+        # Not after an error: the others would be waited for.
+        dist.destroy_process_group()
