@@ -107,7 +107,8 @@ def test_lights_of_the_test_area(tmp_path: Path) -> None:
     assert segment.segment_id == "k1_001_t0"
     lane = segment.road.lane_id[segment.signal_lane].tolist()
     assert lane == [103, 104]
-    np.testing.assert_allclose(segment.signal_point + segment.origin, [(49, 2, 0), (49, 6, 0)], atol=1e-3)
+    # The stop line that the map names for the first lane, the stop point of the connection for the other.
+    np.testing.assert_allclose(segment.signal_point + segment.origin, [(50, 4, 0), (49, 6, 0)], atol=1e-3)
     assert segment.signal_state[0].tolist() == 20 * [SignalState.STOP] + 81 * [SignalState.GO]
     assert segment.signal_state[1].tolist() == 20 * [SignalState.UNKNOWN] + 81 * [SignalState.STOP]
     later = segments(taf(tmp_path, rows=track(3, steps=range(80))), window=2, stride=3)
