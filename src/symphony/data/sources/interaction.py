@@ -27,7 +27,7 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -54,7 +54,7 @@ from symphony.data.sources.interaction_tracks import (
     time_step,
 )
 from symphony.data.sources.lanelet2 import Projection, read_lanelet2
-from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, successors
+from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, stop_line, successors
 from symphony.data.sources.lines import Doubles
 from symphony.errors import ConfigError, DataError
 
@@ -87,7 +87,8 @@ class InteractionReader(Reader):
         window: seconds of a segment. The rest of a recording counts if it is at least half as long.
         stride: seconds between the starts of windows; by default ``window``, so that they don't overlap.
         motion: ``"logged"`` takes velocities and headings as they are, and refuses a file where they are not those of
-            its positions; ``"positions"`` computes both, and takes the mean of states logged twice.
+            its positions; ``"positions"`` computes velocities, replaces headings that are far off the motion, and
+            takes the mean of states logged twice.
 
     Raises:
         ConfigError: a value out of range.
@@ -260,6 +261,13 @@ def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
         lights = read_lights(
             files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection, until
         )
+        # A stop line that the map names is better than the end of a KML lane.
+        lines_of = [(after, stop_line(lanes[before], source.rules)) for before, after in links.tolist()]
+        stops = {lane: line for lane, line in lines_of if line is not None}
+        points = [
+            stops.get(lane, place) for lane, place in zip(lights.lane.tolist(), lights.point, strict=True)
+        ]
+        lights = replace(lights, point=np.array(points))
     reach = np.abs(np.concatenate([lane.ring for lane in lanes]) - origin).max(axis=0)
     away = np.hypot(*np.maximum(np.abs(rows.state[:, :2] - origin) - reach, 0).T)
     if float(np.median(away)) > FAR:

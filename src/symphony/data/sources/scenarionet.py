@@ -8,7 +8,9 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
   nuScenes drive share them), else the id.
 - The ego is the recording vehicle (``sdc_id``). Agents are in file order; their ids are the track's names if all are
   numbers, else their place in the file, as the ego's is. Tracks that are valid at no step are left out.
-- A box size is the median over the valid states. Cones, barriers and other things are of type OTHER.
+- A box size is the median over the valid states. An ego wider than long (ScenarioNet swaps the two for nuScenes) is
+  turned. The position of nuScenes' ego is that of its rear axle, as logged. Cones, barriers and other things are of
+  type OTHER.
 - Coordinates are taken relative to the ego's first position, rounded to metres, z as logged.
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes): see
   :func:`.scenarionet_map.successors` and :func:`.scenarionet_map.neighbors`.
@@ -89,7 +91,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         ego=row,
         agent_id=np.array([int(each) for each in names] if numbers else range(len(names)), np.int64),
         agent_type=np.array(kinds, np.uint8),
-        size=_sizes(states[..., 6:], valid),
+        size=_sizes(states[..., 6:], valid, row),
         position=to_float32(np.where(valid[..., None], states[..., :3] - origin, 0.0)),
         heading=to_float32(states[..., 3]),
         velocity=to_float32(states[..., 4:6]),
@@ -166,11 +168,11 @@ def numbers(value: Any, field: str, width: int) -> Doubles:
     return found[:, :width].astype(np.float64)
 
 
-def _sizes(sizes: Doubles, valid: Bools) -> NDArray[np.float32]:
-    """[A, 3] from [A, T, 3]."""
-    return to_float32(
-        np.array([np.median(size[mask], axis=0) for size, mask in zip(sizes, valid, strict=True)])
-    )
+def _sizes(sizes: Doubles, valid: Bools, ego: int) -> NDArray[np.float32]:
+    """[A, 3] from [A, T, 3]; the ego is at least as long as wide."""
+    found = np.array([np.median(size[mask], axis=0) for size, mask in zip(sizes, valid, strict=True)])
+    found[ego, :2] = np.sort(found[ego, :2])[::-1]
+    return to_float32(found)
 
 
 def _signals(
