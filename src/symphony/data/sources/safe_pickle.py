@@ -151,7 +151,7 @@ _NAMES: dict[tuple[str, str], Any] = {
 }
 
 
-class _Plain(pickle.Unpickler):  # noqa: S301 - it is what makes them safe
+class _Plain(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """One of a few names, none of which is what it says."""
         try:
