@@ -26,6 +26,10 @@ MEMORY = 256 * 2**20
 """Bytes of grids that are kept; those used longest ago go first."""
 
 
+MAPS = 10_000
+"""Maps that are remembered at all, with or without a grid."""
+
+
 class _Kept:
     """What is known of a map: how often it was asked for, and its grid once there is one."""
 
@@ -67,14 +71,11 @@ class GridCache:
             kept.asked += asked
             if not kept.made and kept.asked >= worth:
                 kept.grid, kept.made = make(*content), True
-                self._grow(kept)
+                self.used += _size(kept)
+            while (self.used > self.memory and len(self._kept) > 1) or len(self._kept) > MAPS:
+                _, oldest = self._kept.popitem(last=False)
+                self.used -= _size(oldest)
             return kept.grid
-
-    def _grow(self, newest: _Kept) -> None:
-        self.used += _size(newest)
-        while self.used > self.memory and len(self._kept) > 1:
-            _, oldest = self._kept.popitem(last=False)
-            self.used -= _size(oldest)
 
 
 def _size(kept: _Kept) -> int:
