@@ -33,7 +33,6 @@ LOW_TTC = 1.0
 """Seconds to a collision below which time counts as spent too near to one."""
 KIND_NAMES = {kind: kind.name.lower().replace("_", " ") for kind in CollisionKind}
 _WORST = (
-    "failed",
     "at_fault_collision",
     "collision",
     "red_lights",
@@ -64,9 +63,11 @@ class Report:
 
     def worst(self) -> list[Row]:
         """The runs, worst first; equal ones in their order."""
-        return sorted(
-            self.rows, key=lambda row: [-float(bool(row["failed"])), *(-_known(row[k]) for k in _WORST[1:])]
-        )
+
+        def badness(row: Row) -> list[float]:
+            return [-float(bool(row["failed"])), *(-_known(row[name]) for name in _WORST)]
+
+        return sorted(self.rows, key=badness)
 
     def breakdown(self) -> list[Row]:
         """Collisions by kind and so on, most frequent first."""
@@ -98,9 +99,8 @@ class Report:
         """The rows, worst first."""
         out = io.StringIO()
         rows = self.worst()
-        writer = csv.DictWriter(
-            out, fieldnames=list(rows[0]) if rows else ["segment", "rollout"], lineterminator="\n"
-        )
+        names = ("segment", "rollout", "group", "failed", *_NUMBERS)
+        writer = csv.DictWriter(out, names, lineterminator="\n")
         writer.writeheader()
         writer.writerows(
             {name: "" if value is None else value for name, value in row.items()} for row in rows
