@@ -46,18 +46,20 @@ class StaticMap {
     }
   }
 
-  // Draw what the camera sees onto a context with pixel coordinates.
-  draw(context, camera) {
+  // Draw what the camera sees onto a context with pixel coordinates; `above` is what lies on the map and doesn't
+  // move, of which `key` says when it has changed.
+  draw(context, camera, key, above) {
     const w = camera.width * (1 + 2 * MARGIN), h = camera.height * (1 + 2 * MARGIN);
     const [ox, oy] = this.origin ? camera.toScreen(this.origin.x, this.origin.y) : [0, 0];
     const inside = this.origin && this.origin.scale === camera.scale && this.origin.w === w && this.origin.h === h
       && Math.abs(ox - camera.width / 2) <= MARGIN * camera.width && Math.abs(oy - camera.height / 2) <= MARGIN * camera.height;
-    if (!inside) this.render(camera, w, h);
+    if (!inside || this.key !== key) this.render(camera, w, h, above);
+    this.key = key;
     const [x, y] = camera.toScreen(this.origin.x, this.origin.y);
     context.drawImage(this.canvas, x - w / 2, y - h / 2, w, h);
   }
 
-  render(camera, w, h) {
+  render(camera, w, h, above) {
     this.origin = { x: camera.x, y: camera.y, scale: camera.scale, w, h };
     this.drawn++;
     const ratio = camera.ratio, context = this.canvas.getContext("2d"), scale = camera.scale;
@@ -77,6 +79,7 @@ class StaticMap {
       context.beginPath(); context.arc(x, y, Math.max(4 * px, 0.5), 0, 7);
       context.fillStyle = "white"; context.fill(); context.strokeStyle = STOP; context.lineWidth = 2 * px; context.stroke();
     }
+    if (above) above(context);
     context.setTransform(1, 0, 0, 1, 0, 0);
   }
 }

@@ -5,23 +5,31 @@ const LIGHTS = { 1: "stop", 4: "stop", 7: "stop", 2: "caution", 5: "caution", 8:
 const LIGHT_COLORS = { stop: STOP, caution: "#e69f00", go: "#009e73" };
 
 class Scene {
-  constructor(replay) { this.replay = replay; this.map = new StaticMap(replay); }
+  constructor(replay) {
+    this.replay = replay; this.map = new StaticMap(replay);
+    this.colors = Array.from(replay.agents, row => replay.color(row));
+  }
 
   draw(context, camera, view) {
     const r = this.replay, ratio = camera.ratio;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.map.draw(context, camera);
-    this.toWorld(context, camera);
     this.px = 1 / camera.scale;
-    if (view.layers.routes) this.routes(context, view);
-    if (view.layers.lights) this.lights(context, view);
-    if (view.layers.rollouts) this.otherRollouts(context, view);
-    if (view.layers.trails) this.trails(context, view);
-    if (view.layers.log) this.ghosts(context, view);
+    const { routes, rollouts, trails, log, lights } = view.layers, one = routes ? view.agent : null;
+    this.map.draw(context, camera, [view.rollout, one, routes, rollouts, trails, log].join(), onMap => {
+      if (routes) this.routes(onMap, view);
+      if (rollouts) this.otherWays(onMap, view);
+      if (trails) this.ways(onMap, view);
+      if (log) this.logWays(onMap);
+    });
+    this.toWorld(context, camera);
+    if (lights) this.lights(context, view);
+    if (rollouts) this.otherRollouts(context, view);
+    if (trails) this.trails(context, view);
+    if (log) this.ghosts(context, view);
     for (let row = 0; row < r.size.length / 2; row++) {
       if (!r.rank.has(row)) this.box(context, row, r.logged(row, view.t), DARK[r.type[row]] || PLAYBACK, 1);
     }
-    for (const row of r.agents) this.box(context, row, r.state(view.rollout, row, view.t), r.color(row), 1);
+    r.agents.forEach((row, n) => this.box(context, row, r.simulated(view.rollout, n, view.t), this.colors[n], 1));
     if (view.branch) this.branch(context, view);
     this.selection(context, view);
     this.events(context, view);
@@ -61,12 +69,17 @@ class Scene {
     const r = this.replay;
     context.strokeStyle = INK; context.lineWidth = 1.1 * this.px;
     for (const row of r.agents) {
-      context.setLineDash([5 * this.px, 3 * this.px]);
-      this.way(context, "log", row, 0, r.states);
-      context.setLineDash([]);
       const state = r.logged(row, view.t);
       if (state) { this.outline(context, row, state); context.stroke(); }
     }
+  }
+
+  logWays(context) {
+    const r = this.replay;
+    context.strokeStyle = INK; context.lineWidth = 1.1 * this.px;
+    context.setLineDash([5 * this.px, 3 * this.px]);
+    for (const row of r.agents) this.way(context, "log", row, 0, r.states);
+    context.setLineDash([]);
   }
 
   // The steps of one agent as a line, left out where it isn't there.
@@ -83,29 +96,38 @@ class Scene {
 
   trails(context, view) {
     const r = this.replay, n = r.agents.length;
+    // The last seconds; all of the way lies on the map, pale.
+    const from = Math.max(0, Math.floor(view.t - 3 / r.dt));
     context.lineWidth = 2 * this.px;
     for (let i = 0; i < n; i++) {
-      context.strokeStyle = r.color(r.agents[i]);
-      context.globalAlpha = 0.85;
-      this.way(context, "sim", view.rollout * n + i, 0, Math.floor(view.t) + 1);
-      context.globalAlpha = 0.25;
-      this.way(context, "sim", view.rollout * n + i, Math.floor(view.t), r.states);
+      context.strokeStyle = this.colors[i];
+      this.way(context, "sim", view.rollout * n + i, from, Math.floor(view.t) + 1);
+    }
+  }
+
+  ways(context, view) {
+    const r = this.replay, n = r.agents.length;
+    context.lineWidth = 2 * this.px; context.globalAlpha = 0.3;
+    for (let i = 0; i < n; i++) { context.strokeStyle = this.colors[i]; this.way(context, "sim", view.rollout * n + i, 0, r.states); }
+    context.globalAlpha = 1;
+  }
+
+  otherWays(context, view) {
+    const r = this.replay, n = r.agents.length;
+    context.globalAlpha = this.faint(); context.lineWidth = 1.2 * this.px;
+    for (let k = 0; k < r.rollouts; k++) for (let i = 0; i < n && k !== view.rollout; i++) {
+      context.strokeStyle = this.colors[i]; this.way(context, "sim", k * n + i, 0, r.states);
     }
     context.globalAlpha = 1;
   }
 
+  faint() { return Math.min(0.5, 2.5 / Math.max(this.replay.rollouts, 1)); }
+
   otherRollouts(context, view) {
-    const r = this.replay, n = r.agents.length, alpha = Math.min(0.5, 2.5 / Math.max(r.rollouts, 1));
-    for (let k = 0; k < r.rollouts; k++) {
-      if (k === view.rollout) continue;
-      for (let i = 0; i < n; i++) {
-        const row = r.agents[i];
-        context.globalAlpha = alpha; context.strokeStyle = r.color(row); context.lineWidth = 1.2 * this.px;
-        this.way(context, "sim", k * n + i, 0, r.states);
-        this.box(context, row, r.simulated(k, i, view.t), r.color(row), alpha);
-      }
+    const r = this.replay, n = r.agents.length;
+    for (let k = 0; k < r.rollouts; k++) for (let i = 0; i < n && k !== view.rollout; i++) {
+      this.box(context, r.agents[i], r.simulated(k, i, view.t), this.colors[i], this.faint());
     }
-    context.globalAlpha = 1;
   }
 
   routes(context, view) {
