@@ -21,7 +21,7 @@ from helpers_segments import CAR, LANE_WIDTH, crossing, crossing_road, make_road
 from symphony.cli import main
 from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.errors import DataError
-from symphony.evaluation.contacts import HORIZON, World, contacts, time_to_collision, world_of
+from symphony.evaluation.contacts import HORIZON, contacts, time_to_collision
 from symphony.evaluation.driving import red_lights, wrong_way
 from symphony.evaluation.report import Report, add_segment, report, total_numbers
 from symphony.geometry import box_gap
@@ -29,6 +29,7 @@ from symphony.metrics import CollisionKind
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_files import About, RolloutWriter, save_rollouts
+from symphony.simulation.world import World, world_of
 
 ABOUT = About("made")
 DT = 0.2

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, figure, plot, profiles, report, table, train, view
+from symphony.cli import data, demo, evaluate, export, figure, plot, profiles, report, table, train, view
 from symphony.errors import ConfigError, SymphonyError
 
 __all__ = ["main"]
@@ -35,6 +35,7 @@ app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
 app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
+app.command(name="export")(export.Export)
 app.command(name="demo")(demo.Demo)
 
 

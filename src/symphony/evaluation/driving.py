@@ -13,10 +13,11 @@ import shapely
 from numpy.typing import NDArray
 
 from symphony.data.segment import RunSegment, SignalState
-from symphony.evaluation.contacts import Bools, Indices, Reals, World, lane_widths
+from symphony.evaluation.contacts import Bools, Indices, Reals, lane_widths
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.world import World
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 SAME_WAY = math.pi / 2

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType
 from symphony.errors import DataError
-from symphony.evaluation.contacts import Contacts, contacts, time_to_collision, world_of
+from symphony.evaluation.contacts import Contacts, contacts, time_to_collision
 from symphony.evaluation.driving import comfort, log_distance, progress, red_lights, wrong_way
 from symphony.metrics import CollisionKind
 from symphony.render.viewer import Event
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_files import RolloutFolder
+from symphony.simulation.world import world_of
 
 Judged = Literal["interactive", "ego"]
 Row = dict[str, Any]

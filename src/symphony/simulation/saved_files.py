@@ -121,7 +121,7 @@ class RolloutWriter:
             raise DataError("the rollouts of this segment are there already", file=self.path, segment=name)
         arrays, facts = tensors_of(saved)
         data = save(arrays, {KEY: json.dumps(facts, ensure_ascii=False)})
-        file = f"{SEGMENTS}/{_file_name(name)}"
+        file = f"{SEGMENTS}/{file_stem(name)}.safetensors"
         # What can't be read back must not be written.
         read_tensors(data, self.path / file, name)
         _write_bytes(self.path / file, data)
@@ -238,11 +238,12 @@ def load_rollouts(path: str | Path) -> RolloutFolder:
     return RolloutFolder(path)
 
 
-def _file_name(segment_id: str) -> str:
+def file_stem(segment_id: str) -> str:
+    """A name for files of a segment: safe on any system, another one for every segment."""
     name = quote(segment_id, safe="")
     if len(name) > _LONGEST:
         name = f"{name[: _LONGEST - 17]}-{hashlib.sha256(segment_id.encode()).hexdigest()[:16]}"
-    return f"{name}.safetensors"
+    return name
 
 
 def _write_bytes(path: Path, data: bytes) -> None:
