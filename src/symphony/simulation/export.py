@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+import zlib
 from itertools import groupby
 from typing import Any
 
@@ -50,10 +51,12 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
     """
     segment = saved.segment
     letters = "".join(word.capitalize() for word in re.findall("[A-Za-z]+", segment.segment_id)) or "Segment"
+    # The format's names have room for letters and numbers only: this one tells segments apart.
+    number = 1 + zlib.crc32(segment.segment_id.encode()) % 999_999
     root = ET.Element(
         "commonRoad",
         commonRoadVersion="2020a",
-        benchmarkID=f"ZAM_{letters[:60]}-1_{rollout + 1}_T-1",
+        benchmarkID=f"ZAM_{letters[:60]}-{number}_{rollout + 1}_T-1",
         timeStepSize=repr(float(segment.dt)),
         author="",
         affiliation="",
