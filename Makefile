@@ -9,13 +9,15 @@ export OMP_WAIT_POLICY := passive
 
 CORE := $(VENV)/.core
 DEV := $(VENV)/.dev
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+CONSTRAINTS ?= constraints.txt
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
+SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo table test lint format clean
+.PHONY: help setup demo table test test-lowest fuzz bench lint format docs clean
 
 help:  ## what there is
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
 
 setup: $(DEV)  ## create .venv with everything for development
 
@@ -30,23 +32,39 @@ PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile
 test: $(DEV)  ## run the tests, in a process per core
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
 
-lint: $(DEV)  ## style, types, imports between packages, file lengths
+FUZZ_ARGS ?= --inputs 2000
+
+fuzz: $(DEV)  ## feed damaged files to everything that reads files; goes on where it stopped
+	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/fuzz.py $(FUZZ_ARGS)
+
+# Python itself is tested in one version, and torch too: any other build of it is gigabytes.
+test-lowest:  ## run the tests with the lowest versions that pyproject.toml promises, in a .venv of their own
+	$(MAKE) test VENV=$(VENV)-lowest CONSTRAINTS=constraints-lowest.txt
+
+lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, file lengths
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/codespell $(SPELLED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/lint_length.py
+
+bench: $(DEV)  ## speed of simulation and search, in CPU time of one thread
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks/test_simulation_benchmark.py --benchmark-timer=time.process_time \
+		--benchmark-columns=median,iqr,rounds --benchmark-sort=name --benchmark-disable-gc
+docs: $(DEV)  ## build the pages of docs/ into out/site; broken links are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 format: $(DEV)  ## rewrite the files in the style that lint asks for
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
 clean:  ## remove .venv, caches and everything written by the targets above
-	rm -rf $(VENV) out build dist src/*.egg-info
+	rm -rf $(VENV) $(VENV)-lowest out build dist src/*.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
 	find src tests scripts recipes benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
-$(CORE): pyproject.toml constraints.txt
+$(CORE): pyproject.toml $(CONSTRAINTS)
 	@test -n "$(PYTHON)" || { echo "error: needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "error: $(PYTHON) is missing or older than Python 3.11; choose another with: make PYTHON=/path/to/python" >&2; exit 1; }
@@ -57,5 +75,5 @@ $(CORE): pyproject.toml constraints.txt
 	@touch $@
 
 $(DEV): $(CORE)
-	$(INSTALL) -e '.[dev]'
+	$(INSTALL) -e '.[dev,docs]'
 	@touch $@

@@ -13,12 +13,11 @@ import resource
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import torch
 
-from symphony.agents.networks import build_networks, observation_config
-from symphony.config import AgentConfig, DiscriminatorConfig, TrainConfig
+from symphony.agents import build_agent
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Displacement, DrivingEnv
@@ -36,18 +35,15 @@ VARIANTS = {
 def measure(variant: str, steps: int, rollouts: int, points: int, device: str) -> None:
     """Print peak MiB and seconds of one gradient."""
     torch.set_num_threads(1)
-    config = TrainConfig(
-        "mgail",
-        Path(),
-        Path(),
+    spec = AgentSpec(
+        action_space="displacement",
+        dt=0.2,
         agent=AgentConfig(num_points=points),
         discriminator=DiscriminatorConfig(features="foresight"),
     )
-    networks = build_networks(config)
-    for module in networks.present().values():
-        module.to(device)
+    networks = build_agent("measured", spec).to(torch.device(device))
     dataset = SceneDataset(SegmentStore(builtin_store("train")), 2, Displacement())
-    env = DrivingEnv(dataset.scenes(range(rollouts)).to(device), Displacement(), observation_config(config))
+    env = DrivingEnv(dataset.scenes(range(rollouts)).to(device), Displacement(), networks.observation)
     loss = MGAILLoss(networks.policy, networks.discriminator, env, horizon=steps, **VARIANTS[variant])
     start = env.start(torch.arange(rollouts, device=device))
     loss.horizon = 1

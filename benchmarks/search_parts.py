@@ -10,20 +10,19 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
-from symphony.agents.networks import build_networks, observation_config
+from symphony.agents import build_agent
 from symphony.collectors import KeepBest
-from symphony.config import AgentConfig, DiscriminatorConfig, TrainConfig
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.rollouts import search
+from symphony.simulation.search import search
 
 
 def main() -> None:
@@ -38,16 +37,16 @@ def main() -> None:
     parser.add_argument("--prune-every", type=int, default=10)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    config = TrainConfig(
-        "bc_ts_h",
-        Path(),
-        Path(),
+    spec = AgentSpec(
+        action_space="bicycle",
+        dt=0.2,
+        goals=True,
         agent=AgentConfig(num_points=arguments.points),
         discriminator=DiscriminatorConfig(features="foresight"),
     )
-    networks = build_networks(config)
+    networks = build_agent("measured", spec)
     dataset = SceneDataset(SegmentStore(builtin_store("train")), 2, routes=True)
-    env = DrivingEnv(dataset.scenes(range(arguments.scenes)), Bicycle(), observation_config(config))
+    env = DrivingEnv(dataset.scenes(range(arguments.scenes)), Bicycle(), networks.observation)
     scene = torch.arange(arguments.scenes)[:, None].expand(-1, arguments.branches)
     start = env.with_goals(env.start(scene, torch.arange(arguments.branches).expand(scene.shape)))
     spent: Counter[str] = Counter()

@@ -5,29 +5,29 @@ python -m pytest benchmarks/test_env_benchmark.py --benchmark-group-by=func
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from symphony.agents.networks import build_networks, observation_config
-from symphony.config import AgentConfig, TrainConfig
+from symphony.agents import build_agent
+from symphony.config import AgentConfig, AgentSpec
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
-from symphony.envs import Bicycle, DrivingEnv
+from symphony.envs import Bicycle, DrivingEnv, ObservationConfig
 from symphony.objectives import BCLoss
 from symphony.simulation.demonstrations import SceneDataset
 
 POINTS = pytest.mark.parametrize("points", [200, 1000])
 
 
-def parts(points: int) -> tuple[SceneDataset, DrivingEnv, Any, TrainConfig]:
+def parts(points: int) -> tuple[SceneDataset, DrivingEnv, Any, ObservationConfig]:
     torch.set_num_threads(1)
-    config = TrainConfig("bc", Path(), Path(), agent=AgentConfig(num_points=points))
+    spec = AgentSpec(action_space="bicycle", dt=0.2, agent=AgentConfig(num_points=points))
+    agent = build_agent("measured", spec)
     dataset = SceneDataset(SegmentStore(builtin_store("train")))
-    env = DrivingEnv(dataset.scenes(range(16)), Bicycle(), observation_config(config))
-    return dataset, env, build_networks(config).policy, config
+    env = DrivingEnv(dataset.scenes(range(16)), Bicycle(), agent.observation)
+    return dataset, env, agent.policy, agent.observation
 
 
 @POINTS
@@ -49,14 +49,12 @@ def test_policy(benchmark: Any, points: int) -> None:
 def test_sampling_of_a_training_batch(benchmark: Any) -> None:
     dataset, _, _, config = parts(200)
     rng = torch.Generator().manual_seed(0)
-    benchmark(dataset.sample_states, range(16), 1024, observation_config(config), rng)
+    benchmark(dataset.sample_states, range(16), 1024, config, rng)
 
 
 def test_update(benchmark: Any) -> None:
     dataset, _, policy, config = parts(200)
-    batch = dataset.sample_states(
-        range(16), 1024, observation_config(config), torch.Generator().manual_seed(0)
-    )
+    batch = dataset.sample_states(range(16), 1024, config, torch.Generator().manual_seed(0))
     loss = BCLoss(policy)
 
     def update() -> None:

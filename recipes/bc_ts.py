@@ -5,14 +5,12 @@ python recipes/bc_ts.py --data TRAIN --test TEST --out runs/bc_ts
 
 from __future__ import annotations
 
-from symphony.cli.recipe import judge, parse
-from symphony.training import train
+from symphony.cli.recipe import run
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the recipe."""
-    recipe = parse("bc_ts", __doc__, args)
-    judge(recipe, train(recipe.training))
+    run("bc_ts", __doc__, args)
 
 
 if __name__ == "__main__":

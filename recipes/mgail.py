@@ -5,14 +5,12 @@ python recipes/mgail.py --data TRAIN --test TEST --out runs/mgail
 
 from __future__ import annotations
 
-from symphony.cli.recipe import judge, parse
-from symphony.training import train
+from symphony.cli.recipe import run
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the recipe."""
-    recipe = parse("mgail", __doc__, args)
-    judge(recipe, train(recipe.training))
+    run("mgail", __doc__, args)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,12 @@ python recipes/mgail_ts_h.py --data TRAIN --test TEST --out runs/mgail_ts_h
 
 from __future__ import annotations
 
-from symphony.cli.recipe import judge, parse
-from symphony.training import train
+from symphony.cli.recipe import run
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the recipe."""
-    recipe = parse("mgail_ts_h", __doc__, args)
-    judge(recipe, train(recipe.training))
+    run("mgail_ts_h", __doc__, args)
 
 
 if __name__ == "__main__":

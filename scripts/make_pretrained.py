@@ -15,18 +15,18 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 
-from symphony.agents.agent import read_config
+from symphony.agents import build_agent
+from symphony.agents.agent import FILE, read_spec
 from symphony.agents.checkpoint import load_checkpoint, save_checkpoint
 from symphony.agents.choice import choose, split_name
 from symphony.agents.included import FOLDER, PREFIX, run_folder
-from symphony.agents.networks import build_networks
 from symphony.cli.tables import COLUMNS
-from symphony.config import EvaluateConfig, Rule, TrainConfig, to_json
+from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, to_json
 from symphony.data.generate import PRESETS
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, SymphonyError
@@ -44,6 +44,7 @@ class Source:
 
     Attributes:
         config: as the run has it.
+        spec: of its agent.
         step: updates after which its agent was saved.
         before: what it started from, in words; empty for new networks.
         data: checksum of what it learned from.
@@ -51,6 +52,7 @@ class Source:
     """
 
     config: TrainConfig
+    spec: AgentSpec
     step: int
     before: str
     data: str
@@ -79,39 +81,45 @@ def make(
         DataError: if one of the files can't be read.
     """
     source, which = split_name(run)
-    config, checkpoint = read_config(source), choose(source, which)
+    config, spec, checkpoint = read_run(source), read_spec(source), choose(source, which)
     step = int(checkpoint.name[-12:])
     record = _read_scores(source, scores)
-    known = Source(config, step, _before(source, config), _checksum(config.data), record)
+    known = Source(config, spec, step, _before(source, config), _checksum(config.data), record)
     out = replace(config, search=pruning.pruning(config.search))
     if record is not None:
         _check_scores(record, out, step)
-    networks = build_networks(out)
-    load_checkpoint(checkpoint, modules=networks.present(), partial=True, restore_rng=False)
+    changed = replace(spec, search=out.search)
+    modules = build_agent(name, changed).modules
+    load_checkpoint(checkpoint, modules=modules, partial=True, restore_rng=False)
 
     place = folder / name
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
-    (place / "config.json").write_text(to_json(plain(out)), encoding="utf-8")
+    (place / "config.json").write_text(to_json(without_paths(out)), encoding="utf-8")
+    (place / FILE).write_text(to_json(changed), encoding="utf-8")
     # A checkpoint holds random states too: always the same ones here, as nobody goes on from it.
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002
     torch.manual_seed(0)
-    save_checkpoint(place / "checkpoints", step=step, modules=networks.present())
+    save_checkpoint(place / "checkpoints", step=step, modules=modules)
     if record is not None:
         record = {key: value for key, value in record.items() if key != "per_segment"}
         record |= {"agent": PREFIX + name, "run": {**record["run"], "updates": step, "named": False}}
         (place / EVALUATIONS).mkdir()
         write_json(place / EVALUATIONS / f"{evaluation_name(record)}.json", record)
     parameters = {
-        part: sum(weights.numel() for weights in module.parameters())
-        for part, module in networks.present().items()
+        part: sum(weights.numel() for weights in module.parameters()) for part, module in modules.items()
     }
     (place / "README.md").write_text(card(name, known, out, parameters), encoding="utf-8")
     return place
 
 
-def plain(config: TrainConfig) -> TrainConfig:
+def read_run(folder: Path) -> TrainConfig:
+    """The configuration a run was started with."""
+    return read_json(TrainConfig, folder / "config.json")
+
+
+def without_paths(config: TrainConfig) -> TrainConfig:
     """The configuration with names in place of paths of the machine it was used on."""
     judged = config.validation
     if judged.data is not None:
@@ -154,7 +162,7 @@ def _before(run: Path, config: TrainConfig) -> str:
     folder = beside if (beside / "config.json").is_file() else run_folder(config.warm_start)
     if not (folder / "config.json").is_file():
         return words
-    earlier = read_config(folder)
+    earlier = read_run(folder)
     further = _before(folder, earlier)
     origin = f", itself from {further}" if further else ""
     return f"{words} ({method_name(earlier.method)}, {_count(earlier.steps)} updates{origin})"
@@ -197,18 +205,19 @@ def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, i
     method = method_name(config.method)
     parts = [
         f"# {PREFIX}{name}",
-        f"{method} (see the table of methods in the README of Symphony): {_method_words(config)} It drives "
+        f"{method} (see the table of methods in the README of Symphony): {_method_words(source.spec)} It drives "
         f"{config.agent.interactive} vehicles of a run segment at 5 Hz while all others follow their log.",
         f"```sh\nsymphony evaluate {PREFIX}{name} --data DIR\n```",
         "## Training",
         _training(source, config),
-        _settings(config, parameters),
+        _settings(config, source.spec, parameters),
         "## Scores",
         _scores(PREFIX + name, source.scores),
         "## Limits",
-        _limits(source.config, method),
+        _limits(source.config, source.spec, method),
         "## Files",
-        "`config.json`: all settings, with names in place of paths. `checkpoints/`: the weights as safetensors, each "
+        "`agent.json`: what the networks are and how it is simulated. `config.json`: all settings of the training, "
+        "with names in place of paths. `checkpoints/`: the weights as safetensors, each "
         "with its checksum in `checkpoint.json`, without the state of the optimizers. "
         + ("`evaluations/`: the scores above. " if source.scores else "")
         + "Licence: that of the package, Apache-2.0. Made by `scripts/make_pretrained.py`.",
@@ -216,12 +225,13 @@ def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, i
     return "\n\n".join(parts) + "\n"
 
 
-def _method_words(config: TrainConfig) -> str:
-    words = "adversarial imitation through the model" if config.adversarial else "behavioural cloning"
+def _method_words(spec: AgentSpec) -> str:
+    adversarial = spec.action_space == "displacement"
+    words = "adversarial imitation through the model" if adversarial else "behavioural cloning"
     extras = []
-    if config.hierarchical:
+    if spec.goals:
         extras.append("routes that a goal policy draws from the first state")
-    if config.searches:
+    if spec.searches:
         extras.append("a beam search that a discriminator prunes")
     return words + (f", with {' and '.join(extras)}." if extras else ".")
 
@@ -229,7 +239,7 @@ def _method_words(config: TrainConfig) -> str:
 def _training(source: Source, config: TrainConfig) -> str:
     own = source.config
     update = f"{own.segments} run segments and {_count(own.states)} expert states"
-    if own.adversarial:
+    if source.spec.action_space == "displacement":
         regression = min(own.mgail.regression, source.step)
         update = f"regression ({update}) in {_count(regression)} of them" if regression else ""
         rollouts = f"{own.mgail.rollouts} rollouts"
@@ -246,7 +256,7 @@ def _training(source: Source, config: TrainConfig) -> str:
             f" The checkpoint was chosen by {own.validation.segments} segments of "
             f"`{data_name(own.validation.data)}`."
         )
-    if own.searches:
+    if source.spec.searches:
         text += f" Searches in training had {own.search.branches} branches, pruned {_pruning(asdict(own.search))}."
         if config.search != own.search:
             text += (
@@ -261,22 +271,22 @@ def _pruning(search: dict[str, Any]) -> str:
     return words + (f" (temperature {search['temperature']:g})" if search["rule"] == "systematic" else "")
 
 
-def _settings(config: TrainConfig, parameters: dict[str, int]) -> str:
+def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) -> str:
     rows: list[tuple[str, Any]] = [
         (f"weights of the {part}", _count(number)) for part, number in parameters.items()
     ]
     rows += [(f"`agent.{key}`", value) for key, value in asdict(config.agent).items()]
     rows += [("`learning_rate`", config.learning_rate)]
-    if config.judged:
+    if spec.discriminator is not None:
         rows += [
             (f"`discriminator.{key}`", getattr(config.discriminator, key)) for key in ("features", "radius")
         ]
-    if config.adversarial:
+    if spec.action_space == "displacement":
         rows += [
             (f"`mgail.{key}`", getattr(config.mgail, key))
             for key in ("regression", "rollouts", "learning_rate", "cost", "expert_weight")
         ]
-    if config.searches:
+    if spec.searches:
         rows += [
             (f"`search.{key}`", getattr(config.search, key))
             for key in ("test_branches", "prune_every", "rule", "survivors")
@@ -287,7 +297,7 @@ def _settings(config: TrainConfig, parameters: dict[str, int]) -> str:
 
 def _scores(name: str, record: dict[str, Any] | None) -> str:
     if record is None:
-        return "It has not been judged."
+        return "It has not been evaluated."
     how, data = record["config"], record["data"]
     trees = "one search tree" if how["trees"] == 1 else f"{how['trees']} search trees"
     ways = {
@@ -300,6 +310,7 @@ def _scores(name: str, record: dict[str, Any] | None) -> str:
         "| " + " | ".join(["agent", *(heading.replace("\n", " ") for _, heading, _ in COLUMNS)]) + " |",
         "| --- " * (len(COLUMNS) + 1) + "|",
         _row(name, record),
+        _row("constant velocity", record["constant_velocity"]),
         _row("log playback", record["playback"]),
     ]
     test = data["name"]
@@ -331,7 +342,7 @@ def _row(name: str, numbers: dict[str, Any]) -> str:
     return f"| {' | '.join([name, *cells])} |"
 
 
-def _limits(config: TrainConfig, method: str) -> str:
+def _limits(config: TrainConfig, spec: AgentSpec, method: str) -> str:
     made = data_name(config.data).partition("/")[0] in PRESETS
     source = (
         "It knows only simulated towns: rule-made driving below about 13 m/s without freeways, pedestrians, "
@@ -344,7 +355,7 @@ def _limits(config: TrainConfig, method: str) -> str:
         source,
         f"It is one run of one seed, much smaller than the paper's {method}, and no figure of the paper.",
     ]
-    if config.searches:
+    if spec.searches:
         parts.append(
             "It is meant to be simulated with its search, which runs many branches at once and keeps those that look "
             "most like the log. Leaves of one tree share ancestors and are less diverse than independent rollouts, "
@@ -370,7 +381,6 @@ def main(args: Sequence[str] | None = None) -> None:
     )
     parser.add_argument(
         "--rule",
-        choices=get_args(Rule),
         default="agent",
         help="prune its trees so (default: as it was trained)",
     )

@@ -12,10 +12,9 @@ import runpy
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
 
 from symphony.cli import main as symphony
-from symphony.config import Method
+from symphony.config import METHODS
 from symphony.data.builtin import builtin_store
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
@@ -33,14 +32,16 @@ SIZES = {
     "--search.updates": "10",
     "--search.states": "64",
     "--discriminator.states": "64",
+    "--mgail.regression": "80",
+    "--mgail.head-start": "10",
+    "--mgail.rollouts": "4",
     "--rollouts": "4",
 }
 """In place of those of the profile ``smoke``."""
-ADVERSARIAL = {"--mgail.regression": "80", "--mgail.head-start": "10", "--mgail.rollouts": "4"}
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Train and judge every method, then print the table; returns the exit status of ``symphony table``."""
+    """Train and evaluate every method, then print the table; returns the exit status of ``symphony table``."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -49,14 +50,13 @@ def main(args: Sequence[str] | None = None) -> int:
     )
     arguments, further = parser.parse_known_args(args)
     out: Path = arguments.out
-    for method in get_args(Method):
+    for method in METHODS:
         run = out / method
         if (run / "config.json").is_file():
             shutil.rmtree(run)
-        sizes = {**SIZES, **(ADVERSARIAL if method.startswith("mgail") else {})}
         given = {word.partition("=")[0] for word in further}
         places = {"--data": builtin_store("train"), "--test": builtin_store("test"), "--out": run}
-        flags = {**places, "--profile": "smoke", **sizes}
+        flags = {**places, "--profile": "smoke", **SIZES}
         recipe = runpy.run_path(str(RECIPES / f"{method}.py"))
         kept = [str(word) for flag, value in flags.items() if flag not in given for word in (flag, value)]
         recipe["main"]([*kept, *further])

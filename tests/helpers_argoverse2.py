@@ -18,7 +18,7 @@ CARS = {"AV": (15.0, 0.0, 10.0), "101": (20.0, 3.6, 8.0), "102": (60.0, 7.2, -9.
 """Track -> start x, y and speed along x of the vehicles."""
 
 needs_pyarrow = pytest.importorskip(
-    "pyarrow", reason="pyarrow is not installed (pip install 'symphony[argoverse2]')"
+    "pyarrow", reason="pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')"
 )
 
 Columns = dict[str, list[Any]]

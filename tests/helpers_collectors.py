@@ -103,3 +103,22 @@ def starts(env: Walk, *rows: int, branches: int, seed: int = 0) -> TensorDictBas
     env.set_seed(seed)
     start = env.reset(TensorDict({}, rows)).unsqueeze(-1).expand(*rows, branches).clone()
     return give_streams(start)
+
+
+class FreshWalk(Walk):
+    """Seeded by whatever the process would draw next, as unseeded environments are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_seed(int(torch.randint(1 << 31, ())))
+
+
+class Weighted(nn.Module):
+    """Distance times a weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        return self.weight * distance(tensordict)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from symphony.training.learner import Learner
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -26,7 +27,6 @@ from symphony.errors import ConfigError
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.training import learner as learning
 from symphony.training import train
-from symphony.training.learner import Learner
 from symphony.training.processes import Processes, processes
 
 WORLD = 2

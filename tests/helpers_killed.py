@@ -16,18 +16,16 @@ from typing import Any
 
 import helpers_runs
 from symphony.config import TrainConfig, ValidationConfig
-from symphony.data.store import SegmentStore
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.training import train, validation
+from symphony.recipes import train
+from symphony.training import Trainer, validation
 from symphony.training import trainer as training
-from symphony.training.learner import Learner
 from symphony.training.logging import Tracker
 
 STEPS = 8
 OWNERS = {
-    "update": Learner,
+    "_update": Trainer,
     "log": Tracker,
-    "judge": validation,
+    "evaluate_dataset": validation,
     "fsync": os,
     "rename": Path,
     "replace": Path,
@@ -35,31 +33,32 @@ OWNERS = {
     "unlink": Path,
 }
 DEATHS = (
-    ("update", 1),
-    ("fsync", 4),  # in the first checkpoint, when some of its files are written
-    ("rename", 0),  # when all of them are
-    ("log", 2),  # after it, half a record being written
-    ("judge", 0),
-    ("replace", 1),  # while it is taken up again, its records being written anew
-    ("rmtree", 0),  # between the next checkpoint and the removal of old ones
-    ("unlink", 0),  # in the removal of an old one
+    ("_update", 1, ""),
+    ("fsync", 5, ""),  # in the first checkpoint, when some of its files are written
+    ("rename", 0, ""),  # when all of them are
+    ("log", 2, ""),  # after it, half a record being written
+    ("evaluate_dataset", 0, ""),
+    ("replace", 0, "metrics.jsonl"),  # while it is taken up again, its records being written anew
+    ("replace", 0, "agent.json"),  # and before that
+    ("rmtree", 0, ""),  # between the next checkpoint and the removal of old ones
+    ("unlink", 0, "checkpoint.json"),  # in the removal of an old one
 )
-"""Operations and how often each goes well before."""
+"""Operations, how often each goes well before, and the end of the names of the files that count."""
 
 
 def config(method: Any, store: Path, out: Path) -> TrainConfig:
     """Of a run with more checkpoints than are kept."""
-    judged = ValidationConfig(store, segments=1, rollouts=1)
+    judged = ValidationConfig(data=store, segments=1, rollouts=1)
     return helpers_runs.tiny(method, store, out, steps=STEPS, validation=judged, resume=True)
 
 
-def die_at(name: str, count: int, report: int) -> None:
+def die_at(name: str, count: int, file: str, report: int) -> None:
     """Have this process killed at an operation that went well so many times."""
     action: Callable[..., Any] = getattr(OWNERS[name], name)
     left = iter(range(count))
 
     def deadly(*args: Any, **options: Any) -> Any:
-        if next(left, None) is not None:
+        if not str(args[0]).endswith(file) or next(left, None) is not None:
             return action(*args, **options)
         if name == "log":
             args[0]._file.write('{"step": 3, "los')
@@ -71,7 +70,7 @@ def die_at(name: str, count: int, report: int) -> None:
     setattr(OWNERS[name], name, deadly)
 
 
-def live(settings: TrainConfig, dataset: SceneDataset, death: tuple[str, int] | None = None) -> int:
+def live(settings: TrainConfig, death: tuple[str, int, str] | None = None) -> int:
     """Train in a process of its own; returns how it ended."""
     child = os.fork()
     if child == 0:
@@ -79,7 +78,7 @@ def live(settings: TrainConfig, dataset: SceneDataset, death: tuple[str, int] | 
         try:
             if death is not None:
                 die_at(*death, os.dup(1))
-            train(settings, dataset)
+            train(settings)
             status = 0
         finally:
             os._exit(status)
@@ -90,13 +89,10 @@ def main(store: Path, out: Path, methods: list[str]) -> int:
     """Train each method in one go and in many."""
     os.fsync = lambda descriptor: None  # the kernel outlives us
     training.KEEP = 2
-    dataset = SceneDataset(SegmentStore(store))
-    for item in range(len(dataset)):
-        dataset.experts(item), dataset.scene(item)
     for method in methods:
         part, whole = (config(method, store, out / method / name) for name in ("killed", "whole"))
-        ends = [live(part, dataset, death) for death in DEATHS]
-        if ends != [-signal.SIGKILL] * len(DEATHS) or live(part, dataset) or live(whole, dataset):
+        ends = [live(part, death) for death in DEATHS]
+        if ends != [-signal.SIGKILL] * len(DEATHS) or live(part) or live(whole):
             return 1
     return 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ from torch import Tensor
 
 from symphony.agents import load_agent
 from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig
+from symphony.recipes import RECIPES
+from symphony.training import Processes, Trainer
 
 
 def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     """A configuration of the smallest networks and batches."""
     base = TrainConfig(
-        method,
+        method=method,
         data=store,
         out=out,
         steps=4,
@@ -33,14 +36,27 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     return replace(base, **changes)
 
 
+def build(config: TrainConfig) -> Trainer:
+    """What the recipe of a configuration builds, before any training."""
+    return RECIPES[config.method](config, Processes(torch.device("cpu")))
+
+
+def pieces(trainer: Trainer) -> dict[str, Any]:
+    """What the updates of a recipe use, by the names it gives them."""
+    found: dict[str, Any] = {}
+    todo: list[Any] = [phase.update for phase in trainer.phases]
+    while todo:
+        used = inspect.getclosurevars(todo.pop()).nonlocals
+        todo.extend(value for name, value in used.items() if name not in found and inspect.isfunction(value))
+        found |= used
+    return found
+
+
 def weights(run: Path | str) -> dict[str, Tensor]:
     """Copies of all weights of a run's agent."""
-    agent = load_agent(str(run))
-    found = {"policy": agent.policy, "goals": agent.goals, "discriminator": agent.discriminator}
     return {
         f"{name}.{key}": value.clone()
-        for name, module in found.items()
-        if isinstance(module, torch.nn.Module)
+        for name, module in load_agent(str(run)).modules.items()
         for key, value in module.state_dict().items()
     }
 

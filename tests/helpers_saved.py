@@ -6,17 +6,14 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import torch
 
-from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import Polylines, RunSegment
 from symphony.data.store import SegmentStore
-from symphony.envs.driving import DrivingEnv
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.rollouts import plant, pruning_rule, rollouts_of, search
+from symphony.simulation.driving import simulation
 from symphony.simulation.saved import SavedRollouts, SavedTrees, saved_rollouts
 from symphony.simulation.saved_files import About
 
@@ -73,39 +70,21 @@ def searched(
 @lru_cache
 def _searched(count: int, rollouts: int, branches: int, duration: int) -> tuple[About, list[SavedRollouts]]:
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
-    dataset = SceneDataset(
-        store, agent.interactive, agent.dynamics, range(count), routes=True, duration=duration
-    )
-    scenes = dataset.scenes(range(count))
-    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
-    start = plant(env, agent.goals, trees=1, branches=branches, seed=0)
-    rule = pruning_rule(agent.search)
-    with torch.no_grad():
-        found = search(
-            env,
-            agent.policy,
-            agent.discriminator,
-            start,
-            seed=0,
-            rule=rule,
-            prune_every=agent.search.prune_every,
-            leaves=rollouts,
-            keep_tree=True,
-        )
-    runs = rollouts_of(env, start, found.trajectories)
-    runs = type(runs)(*(part.flatten(1, 2) for part in runs))
-    goal = start.get(keys.GOAL)[:, :, :rollouts].flatten(1, 2)
+    indices = range(count)
+    dataset = SceneDataset(store, agent.interactive, agent.dynamics, indices, routes=True, duration=duration)
+    config = EvaluateConfig(rollouts=rollouts, branches=branches)
+    scenes = dataset.scenes(indices)
+    found = simulation(agent, scenes, config, keep_tree=True)
     saved = [
         saved_rollouts(
-            dataset.segment(b),
+            dataset.segment(b).replace(group=store.tags(b)["network"]),
             scenes,
-            runs,
+            found.rollouts,
             b,
-            goal=goal,
-            search=found,
+            goal=found.goal,
+            search=found.search,
             driver=AGENT,
-            group=store.tags(b)["network"],
         )
-        for b in range(count)
+        for b in indices
     ]
-    return About.of(AGENT, store, EvaluateConfig(rollouts=rollouts)), saved
+    return About.of(AGENT, store, config), saved

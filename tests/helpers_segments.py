@@ -273,9 +273,10 @@ def random_segment(
     )
     return make_segment(
         road,
-        np.where(valid[..., None], floats(agents, steps, 3), 0),
+        # Within the limits of speed even after smoothing: a metre or two from step to step.
+        np.where(valid[..., None], floats(agents, 1, 3) + floats(agents, steps, 3) / 50, 0),
         np.where(valid, floats(agents, steps), 0),
-        np.where(valid[..., None], floats(agents, steps, 2), 0),
+        np.where(valid[..., None], floats(agents, steps, 2) / 5, 0),
         float(rng.uniform(0.05, 0.5)),
         segment_id,
         source=str(rng.choice(["womd", "commonroad"])),

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from symphony.data.segment import RunSegment
+from symphony.data.segment import RoadMap, RunSegment
 from symphony.data.sources import get_reader
 from symphony.data.sources import womd_pb2 as pb
 from symphony.errors import DataError
+from symphony.geometry import segments_of, signed_distance
 
 FAR = np.array([-7792.0, 81234.0, -184.0])
 """Where the made WOMD scenarios lie: far enough that float32 would lose millimetres."""
@@ -169,3 +171,12 @@ def convert_xml(path: Path, *parts: str, **options: str) -> RunSegment:
     """Write a CommonRoad file of these parts and read it."""
     path.write_text(commonroad(*parts, **options), encoding="utf-8")
     return read_one("commonroad", path)
+
+
+def off_road(road: RoadMap, spots: NDArray[Any]) -> NDArray[np.float32]:
+    """[M] metres to the right of the nearest boundary, negative on its left, of points [M, 2]."""
+    cut = segments_of(road.boundary.points, road.boundary.offsets)
+    start, end, before, after = (torch.as_tensor(part)[None] for part in cut)
+    where = torch.as_tensor(np.ascontiguousarray(spots), dtype=torch.float32)[None]
+    known = torch.ones(start.shape[:2], dtype=torch.bool)
+    return signed_distance(where, start, end, known, before, after)[0].numpy()

@@ -15,19 +15,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from helpers_runs import tiny
+from helpers_runs import build, tiny
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony.agents.choice import choose
-from symphony.agents.networks import build_networks
 from symphony.cli import main
-from symphony.data.store import SegmentStore
 from symphony.errors import SymphonyError
 from symphony.objectives import BCLoss
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.training import train
+from symphony.recipes import train
+from symphony.training import Trainer
 from symphony.training.alarms import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, loss_of
-from symphony.training.learner import Learner
 from symphony.training.logging import read_metrics
 
 NAN, INF = math.nan, math.inf
@@ -67,17 +64,20 @@ def test_an_update_without_a_network_neither_counts_nor_forgives() -> None:
 
 def test_giving_up_names_the_loss() -> None:
     values = {"loss_bc": torch.tensor(2.0), "loss_policy": torch.tensor(NAN), **norms(policy=NAN)}
-    assert loss_of("policy", values) == "loss_policy"
-    assert loss_of("goals", values) is None
+    assert [loss_of(name) for name in ("policy", "goals")] == ["loss_policy", "loss_goals"]
     skips = Skips(in_row={"policy": PATIENCE - 1})
     with pytest.raises(TrainingError, match=r"policy network \(loss_policy is nan\)") as caught:
         skips.count(values)
     assert isinstance(caught.value, SymphonyError)
+    # Not that of another network, where its own is not known.
+    skips = Skips(in_row={"goals": PATIENCE - 1})
+    with pytest.raises(TrainingError, match="gradient of the goals network was not finite"):
+        skips.count({**values, **norms(goals=NAN)})
 
 
 def alarms(*values: float | None) -> list[str | None]:
     watch = Alarms()
-    return [watch.check({"auc": value}) for value in values]
+    return [watch.check({"discriminator_auc": value}) for value in values]
 
 
 def test_alarms_need_the_whole_window() -> None:
@@ -90,13 +90,13 @@ def test_alarms_need_the_whole_window() -> None:
     assert alarms(*[0.98] * 12) == alarms(*[0.52] * 12) == [None] * 12
     # Records without a value don't count.
     assert alarms(*[0.99] * 9, None, NAN, 0.99) == [None] * 11 + [strong]
-    assert Alarms().check({"loss_bc": 1.0}) is None
+    assert Alarms().check({"loss_policy": 1.0}) is None
 
 
 @given(st.lists(st.sampled_from([0.3, 0.51, 0.7, 0.99, None]), max_size=40), st.integers(0, 40))
 def test_a_run_that_goes_on_rings_as_if_it_had_not_stopped(values: list[float | None], stop: int) -> None:
-    later = Alarms({"auc": value} for value in values[:stop])
-    assert [later.check({"auc": value}) for value in values[stop:]] == alarms(*values)[stop:]
+    later = Alarms({"discriminator_auc": value} for value in values[:stop])
+    assert [later.check({"discriminator_auc": value}) for value in values[stop:]] == alarms(*values)[stop:]
 
 
 @pytest.fixture(scope="module")
@@ -106,38 +106,33 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def dataset(store: Path) -> SceneDataset:
-    return SceneDataset(SegmentStore(store))
-
-
 Altered = Callable[[Callable[[int], dict[str, float]]], None]
 
 
 @pytest.fixture
 def altered(monkeypatch: pytest.MonkeyPatch) -> Altered:
     """Let updates report other numbers than they found."""
-    update = Learner.update
+    update = Trainer._update
 
     def alter(numbers: Callable[[int], dict[str, float]]) -> None:
-        def altered_update(self: Learner, step: int) -> dict[str, Any]:
+        def altered_update(self: Trainer, step: int) -> dict[str, Any]:
             found = {name: torch.tensor(value) for name, value in numbers(step).items()}
             return {**update(self, step), **found}
 
-        monkeypatch.setattr(Learner, "update", altered_update)
+        monkeypatch.setattr(Trainer, "_update", altered_update)
 
     return alter
 
 
 def test_skipped_updates_are_recorded_and_told_once(
-    store: Path, dataset: SceneDataset, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
+    store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
 ) -> None:
     altered(lambda step: {"gradient_norm_policy": NAN} if step in (1, 2, 4) else {})
     settings = tiny("bc", store, tmp_path / "run", steps=6)
-    train(settings, dataset)
+    train(settings)
     # Those between two records count too.
     sparse = tiny("bc", store, tmp_path / "sparse", steps=6, log_every=3)
-    train(sparse, dataset)
+    train(sparse)
     assert [r["skipped_updates"] for r in read_metrics(sparse.out)] == [2, 3]
     whole = read_metrics(settings.out)
     assert [r["skipped_updates"] for r in whole] == [0, 1, 2, 2, 3, 3]
@@ -147,67 +142,65 @@ def test_skipped_updates_are_recorded_and_told_once(
     # A run that goes on counts on.
     shutil.rmtree(choose(settings.out, "6"))
     shutil.rmtree(choose(settings.out, "4"))
-    train(tiny("bc", store, settings.out, steps=6, resume=True), dataset)
+    train(tiny("bc", store, settings.out, steps=6, resume=True))
     assert [r["skipped_updates"] for r in read_metrics(settings.out)] == [0, 1, 2, 2, 3, 3]
 
 
 def test_a_skipped_update_leaves_weights_and_optimizer_as_they_were(
-    store: Path, dataset: SceneDataset, monkeypatch: pytest.MonkeyPatch
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = tiny("bc", store, Path())
-    networks = build_networks(settings)
-    learner = Learner(settings, networks, dataset, torch.device("cpu"))
-    learner.update(0)
+    trainer = build(tiny("bc", store, tmp_path / "run"))
+    trainer._update(0)
 
     def state() -> list[Tensor]:
-        adam = learner.optimizers["policy"].state_dict()["state"]
+        adam = trainer.optimizers["policy"].state_dict()["state"]
         moments = [value.clone() for entry in adam.values() for value in entry.values()]
-        return [*(p.detach().clone() for p in networks.policy.parameters()), *moments]
+        return [*(p.detach().clone() for p in trainer.agent.modules["policy"].parameters()), *moments]
 
     before, forward = state(), BCLoss.forward
     for poison in (NAN, INF):
         with monkeypatch.context() as patch:
             patch.setattr(BCLoss, "forward", lambda *a, p=poison: forward(*a).apply(lambda value: value * p))
-            assert Skips().count(learner.update(1)) == ["policy"]
+            assert Skips().count(trainer._update(1)) == ["policy"]
         assert all(torch.equal(a, b) for a, b in zip(before, state(), strict=True))
-    assert Skips().count(learner.update(1)) == []
+    assert Skips().count(trainer._update(1)) == []
     assert not torch.equal(before[0], state()[0])
 
 
 def test_training_gives_up_with_one_line(
     store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    altered(lambda step: {"gradient_norm_policy": NAN, "loss_bc": INF} if step >= 4 else {})
+    altered(lambda step: {"gradient_norm_policy": NAN, "loss_policy": INF} if step >= 4 else {})
     small = "--agent.hidden 8 --agent.head 8 --agent.num-points 12 --states 8 --checkpoint-every 2"
     command = f"train bc --data {store} --out {tmp_path}/run --wandb disabled {small}"
     assert main(command.split()) == 1
     *_, last = capsys.readouterr().err.strip().splitlines()
     assert last.startswith(
-        "symphony: error: the gradient of the policy network (loss_bc is inf) was not finite"
+        "symphony: error: the gradient of the policy network (loss_policy is inf) was not finite"
     )
     assert choose(tmp_path / "run").name.endswith(str(4 + PATIENCE - 2))
 
 
 def test_a_discriminator_that_has_won_raises_an_alarm(
-    store: Path, dataset: SceneDataset, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
+    store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    altered(lambda step: {"auc": 0.999 if step < WINDOW + 2 else 0.9})
+    altered(lambda step: {"discriminator_auc": 0.999 if step < WINDOW + 2 else 0.9})
     settings = tiny("bc_ts", store, tmp_path / "run", steps=WINDOW + 4, checkpoint_every=WINDOW + 2)
-    train(settings, dataset)
+    train(settings)
     ringing = [r["step"] for r in read_metrics(settings.out) if "alarm" in r]
     assert ringing == [WINDOW, WINDOW + 1, WINDOW + 2]
     assert capsys.readouterr().err.count(f"warning: {ALARMS['discriminator_too_strong']}") == 1
     before = (settings.out / "metrics.jsonl").read_text().splitlines()
     shutil.rmtree(choose(settings.out, str(WINDOW + 4)))
-    train(tiny("bc_ts", store, settings.out, steps=WINDOW + 4, checkpoint_every=2, resume=True), dataset)
+    train(tiny("bc_ts", store, settings.out, steps=WINDOW + 4, checkpoint_every=2, resume=True))
     after = (settings.out / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(a).get("alarm") for a in after] == [json.loads(b).get("alarm") for b in before]
 
 
 def test_the_line_of_progress_tells_speed_and_time_left(
-    store: Path, dataset: SceneDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train(tiny("bc", store, tmp_path / "run"), dataset)
+    train(tiny("bc", store, tmp_path / "run"))
     printed = capsys.readouterr()
     assert "updates/s" in printed.err
     assert "left 0:00:00" in printed.err

@@ -52,7 +52,9 @@ def hashes(items: list[Item]) -> list[str | None]:
 @pytest.mark.parametrize("name", readers())
 def test_things_that_are_no_files_of_the_format(name: str, tmp_path: Path) -> None:
     if name == "argoverse2":
-        pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install 'symphony[argoverse2]')")
+        pytest.importorskip(
+            "pyarrow", reason="pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')"
+        )
     empty, noise, text = tmp_path / "empty", tmp_path / "noise", tmp_path / "text"
     empty.touch()
     noise.write_bytes(np.random.default_rng(0).bytes(5000))

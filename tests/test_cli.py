@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import symphony.data.convert
+from helpers_interaction import public, track
 from helpers_segments import crossing, straight_road
 from symphony import __version__
 from symphony.cli import main
@@ -333,3 +334,23 @@ def test_every_vehicle_can_be_the_ego(
         found = json.loads(capsys.readouterr().out.split("converted", 1)[-1].split("┘", 1)[-1])["segments"]
         assert (found == 1) if egos == "one" else (found >= least)
     assert main(["data", "convert", "womd", file, "--out", out + "x", "--egos", "all"]) == 2
+
+
+def test_options_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [row for k in range(3) for row in track(k, x=-15 * k, y=2 + 4 * (k % 2), logged=0.5)]
+    file = str(public(tmp_path, rows))
+    command = ["data", "convert", "interaction", file, "--out"]
+    assert main([*command, str(tmp_path / "a"), "--window", "4"]) == 1
+    assert "0.50 times the speed of the positions" in capsys.readouterr().err
+    more = ["--motion", "positions", "--window", "4", "--stride", "2", "--egos", "all"]
+    assert main([*command, str(tmp_path / "a"), *more]) == 0
+    store = SegmentStore(tmp_path / "a")
+    # Of 11.9 s, windows begin at 0, 2 … 8 s, the last being 3.9 s long; three cars each.
+    assert len(store) == 5 * 3
+    assert store.num_maps == 1
+    assert set(store.groups.tolist()) == {"DR_X_000"}
+    assert main(["data", "info", str(tmp_path / "a")]) == 0
+    assert re.search(r"recordings +1\b", capsys.readouterr().out)
+    for option, value in (("--window", "4"), ("--stride", "2"), ("--motion", "positions")):
+        assert main(["data", "convert", "womd", file, "--out", str(tmp_path / "b"), option, value]) == 2
+        assert f"{option} is for interaction" in capsys.readouterr().err

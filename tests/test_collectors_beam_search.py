@@ -12,20 +12,24 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
-from torchrl.envs import PendulumEnv
+from torchrl.envs import ParallelEnv, PendulumEnv, SerialEnv, StepCounter, TransformedEnv
 
 from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, distance, noise, starts
 from symphony.collectors import (
     Aggregate,
+    BeamSearchCollector,
     KeepAll,
     KeepBest,
     KeyScore,
+    ReplaceBad,
     Systematic,
     beam_search,
     branch,
+    check_branching,
     lineage,
     max_then_sum,
     mean_then_sum,
+    with_rows,
 )
 from symphony.errors import ConfigError
 
@@ -188,6 +192,84 @@ def test_gradient_follows_the_survivors():
     assert torch.equal(at_root.ne(0).any(-1).any(-1), reached)
 
 
+class Counting(Walk):
+    """Moves farther with every step it takes, whatever the state it is given says."""
+
+    steps = 0
+
+    def _step(self, tensordict):
+        self.steps += 1
+        out = super()._step(tensordict)
+        return out.set(X, out.get(X) + self.steps)
+
+
+class Drawing(Walk):
+    """Draws from a generator of its own and the global one, and remembers nothing."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        drawn = torch.randn(out.get(X).shape, generator=self.rng)
+        return out.set(X, out.get(X) + drawn + torch.rand(drawn.shape))
+
+
+@pytest.mark.parametrize(
+    ("env", "why"),
+    [
+        (lambda: SerialEnv(2, Walk), "batch-locked"),
+        (lambda: ParallelEnv(2, Walk), "batch-locked"),
+        (lambda: TransformedEnv(Counting(), StepCounter()), r"another \('agents', 'x'\) when stepped"),
+        (Counting, r"another \('agents', 'x'\) when stepped"),
+    ],
+)
+def test_what_remembers_can_not_be_branched(env, why):
+    env, start = env(), starts(Walk(), 2, branches=4)
+    start.set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
+    refused = f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and ParallelEnv can't"
+    with pytest.raises(ConfigError, match=refused):
+        search(start, env=env)
+
+    def collect():
+        BeamSearchCollector(env, Policy(), score=distance, branches=4, frames_per_batch=4).next()
+
+    with pytest.raises(ConfigError, match=refused):
+        collect()
+
+
+def test_rows_are_taken_away_before_a_search():
+    """By the collector; the function gets its rows from the start."""
+    with pytest.raises(ConfigError, match=r"has a batch size, \[2\].*rows come from with_rows"):
+        search(starts(Walk(), 2, branches=4), env=with_rows(Walk(), [2]))
+
+
+@pytest.mark.parametrize("action", ["discrete", "continuous"])
+def test_an_environment_of_gymnasium_can_not_be_branched(action):
+    pytest.importorskip("gymnasium")
+    from torchrl.envs import GymEnv
+
+    env = GymEnv({"discrete": "CartPole-v1", "continuous": "Pendulum-v1"}[action])
+    with pytest.raises(ConfigError, match="GymEnv can't be branched"):
+        check_branching(env)
+
+
+def test_random_numbers_are_no_memory():
+    """Nor does looking for it cost any."""
+    for env in (Drawing(), Walk(), PendulumEnv(seed=0)):
+        state = (
+            env.reset(env.gen_params(batch_size=[3]), set_state=False)
+            if isinstance(env, PendulumEnv)
+            else starts(env, 3, branches=1)
+        )
+        torch.manual_seed(5)
+        own = env.rng.get_state() if isinstance(env, Walk) else None
+        before = state.clone()
+        check_branching(env, state)
+        assert_same(state, before)
+        drawn = torch.rand(3)
+        torch.manual_seed(5)
+        assert torch.equal(drawn, torch.rand(3))
+        assert own is None or torch.equal(own, env.rng.get_state())
+
+
 def test_lineage_by_hand():
     parents = torch.tensor([[[2, 0, 2], [1, 1, 0], [2, 1, 0]]])
     # the last pruning puts slots 2, 1, 0 into the leaves; slot 2 came from 0 and the others from 1; and so on
@@ -233,6 +315,37 @@ def test_groups_stay_apart():
             slots = (groups[row] == group).nonzero().squeeze(-1)
             alone = search(start[row, slots], rule=KeepBest(0.3))
             assert_same(found.trajectories[row, slots].exclude("goal"), alone.trajectories)
+
+
+def test_a_rule_may_mix_groups():
+    """Branches of a bad group take over the goal of the branch they are copied from; several numbers are one goal."""
+    start = starts(Walk(), 3, branches=6)
+    goals = torch.randint(3, (3, 6, 2), generator=torch.Generator().manual_seed(0))
+    start = start.set(("agents", "goal"), goals)
+    found = search(
+        start,
+        rule=ReplaceBad(2.0),
+        group_key=("agents", "goal"),
+        noise=torch.rand(3, 3, generator=torch.Generator().manual_seed(1)),
+    )
+    groups, mixed = goals, 0
+    for period in range(3):
+        parents, totals = found.parents[:, period], found.totals[:, period]
+        after = groups.gather(1, parents[..., None].expand(3, 6, 2))
+        for row, slot in (totals > 2.0).nonzero().tolist():
+            same = (groups[row] == groups[row, slot]).all(-1) & (totals[row] <= 2.0)
+            assert (
+                bool(same.any()) == bool((after[row, slot] == groups[row, slot]).all())
+                or not (totals[row] <= 2.0).any()
+            )
+            mixed += not bool(same.any())
+        groups = after
+    assert mixed > 0
+    assert torch.equal(
+        found.trajectories.get(("agents", "goal"))[:, :, -1],
+        goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)),
+    )
+    assert torch.equal(groups, goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)))
 
 
 def reseed(state, attempt):
@@ -325,7 +438,7 @@ def test_aggregates_by_hand():
         ({"retries": 1}, "retry_above"),
         ({"retry_above": 1.0}, "retry_above"),
         ({"group_key": "goal"}, "goal"),
-        ({"group_key": X}, "one number per branch"),
+        ({"group_key": X}, "integers, one or some per branch"),
         ({"group_key": STREAM}, None),
         ({"noise": torch.zeros(2, 2)}, "noise"),
         ({"rule": Systematic(1.0)}, "noise"),

@@ -5,17 +5,27 @@ from __future__ import annotations
 import functools
 import pickle
 import time
+from dataclasses import dataclass
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, PendulumEnv, StepCounter
 
 from helpers_collectors import ACTION, STREAM, Policy, Walk, X, distance, give_streams
-from symphony.collectors import BeamSearchCollector, KeepAll, KeepBest, KeyScore, Systematic, with_rows
+from symphony.collectors import (
+    BeamSearchCollector,
+    KeepAll,
+    KeepBest,
+    KeyScore,
+    Systematic,
+    beam_search,
+    branch,
+    with_rows,
+)
 from symphony.errors import ConfigError
 
 ROWS, STEPS, FRAMES = 3, 8, 3 * 8
@@ -294,42 +304,49 @@ def test_impossible_options_are_errors():
     class Locked(Walk):
         batch_locked = True
 
-    with pytest.raises(ConfigError, match="Locked has a batch size of its own"):
+    with pytest.raises(ConfigError, match="Locked can't be branched: it is batch-locked"):
         make(Locked)
     with pytest.raises(TypeError, match="unknown"):
         make(tree=3)
 
 
-@pytest.mark.slow
-def test_in_a_process_of_its_own():
-    """Built by a multi-process collector from the class with its arguments bound, as Ray does with kwargs."""
-    bound = functools.partial(
-        BeamSearchCollector,
-        score=distance,
-        branches=4,
+@dataclass(frozen=True)
+class DropWorst:
+    """A rule of one's own: the worst branch makes room for the best."""
+
+    def __call__(self, totals, noise=None):
+        slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
+        return slots.scatter(-1, totals.argmax(-1, keepdim=True), totals.argmin(-1, keepdim=True))
+
+
+def test_a_rule_and_an_aggregate_of_ones_own():
+    """Any callables; the collector's batch is the search's."""
+
+    def median(scores):
+        return scores.flatten(-2).median(-1).values
+
+    collector = make(
+        rule=DropWorst(), aggregate=median, leaves=4, frames_per_batch=4 * FRAMES, keep_tree=True
+    )
+    collector.set_seed(3)
+    batch = collector.next()
+    scores = batch.get("tree").get(EXTRAS[0])
+    env = make_env()
+    env.set_seed(3)
+    found = beam_search(
+        env.base_env,
+        Policy(),
+        distance,
+        give_streams(branch(env.reset(), 4).copy()),
+        steps=STEPS,
         prune_every=4,
-        prepare=give_streams,
+        rule=DropWorst(),
+        aggregate=median,
         slot_keys=[STREAM],
     )
-    collector = MultiSyncCollector(
-        [make_env],
-        Policy(),
-        collector_class=bound,
-        frames_per_batch=FRAMES,
-        total_frames=2 * FRAMES,
-        use_buffers=False,
-        auto_register_policy_transforms=False,
-        cat_results="stack",
-    )
-    try:
-        collector.set_seed(3)
-        batches = [batch.clone() for batch in collector]
-    finally:
-        collector.shutdown()
-    local = make(total_frames=2 * FRAMES)
-    local.set_seed(3)
-    local.reset()  # as the multi-process collector does after seeding
-    for one, other in zip(batches, local, strict=True):
-        assert one.shape == (1, ROWS, STEPS)
-        assert_same(one[0].exclude("collector"), other.exclude("collector"))
-        assert set(EXTRAS) <= set(one.keys(True, True))
+    assert_close(found.simulated_scores, scores)
+    assert_close(found.totals, scores.unflatten(2, (2, 4)).flatten(-2).median(-1).values.transpose(1, 2))
+    for totals, parents in zip(found.totals.flatten(0, 1), found.parents.flatten(0, 1), strict=True):
+        kept = [slot if slot != int(totals.argmax()) else int(totals.argmin()) for slot in range(4)]
+        assert parents.tolist() == kept
+    assert_close(batch.get(("next", *X)), found.trajectories.get(("next", *X)))

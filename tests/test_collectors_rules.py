@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import math
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from symphony.collectors import Aggregate, KeepAll, KeepBest, Systematic
+from symphony.collectors import Aggregate, KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
 from symphony.collectors.rules import group_members, prune
 from symphony.errors import ConfigError
 
@@ -111,6 +112,88 @@ def test_groups_are_pruned_as_if_alone(groups_and_totals, fraction, noise):
             assert torch.equal(parents[:, slots], alone)
 
 
+def replaced(totals, threshold, noise, groups):
+    """What :class:`ReplaceBad` is to do, slot by slot."""
+    slots = range(len(totals))
+    good = [i for i in slots if totals[i] <= threshold]
+    parents, turns = list(slots), {}
+    for i in slots:
+        if i in good or not good:
+            continue
+        pool = [k for k in good if groups[k] == groups[i]]
+        name = groups[i] if pool else "any"
+        pool = pool or good
+        parents[i] = pool[(math.floor(noise * len(pool)) + turns.get(name, 0)) % len(pool)]
+        turns[name] = turns.get(name, 0) + 1
+    return parents
+
+
+@st.composite
+def some_branches(draw):
+    number = draw(st.integers(1, 12))
+    totals = draw(st.lists(ODD, min_size=number, max_size=number))
+    return totals, draw(st.lists(st.integers(-2, 2), min_size=number, max_size=number))
+
+
+@given(some_branches(), ODD.filter(lambda x: not math.isnan(x)), NOISE, st.booleans())
+def test_replace_bad_by_hand(branches, threshold, noise, grouped):
+    totals, groups = branches
+    totals = torch.tensor([totals])
+    threshold = float(torch.tensor(threshold))
+    parents = prune(
+        ReplaceBad(threshold),
+        totals,
+        torch.tensor([noise], dtype=torch.float64),
+        groups=torch.tensor([groups]) if grouped else None,
+    )
+    groups = groups if grouped else [0] * len(groups)
+    assert parents[0].tolist() == replaced(totals[0].tolist(), threshold, noise, groups)
+
+
+@given(some_branches(), NUMBERS, NOISE)
+def test_replace_bad_leaves_the_good_alone(branches, threshold, noise):
+    totals, groups = (torch.tensor([values]) for values in branches)
+    noise, good = torch.tensor([noise]), totals <= threshold
+    parents = ReplaceBad(threshold)(totals, noise, groups)
+    slots = torch.arange(totals.shape[1])[None]
+    assert torch.equal(parents[good], slots[good])
+    if good.any():
+        assert good.gather(1, parents).all()
+        kept = groups.gather(1, parents) == groups
+        possible = ((groups[:, :, None] == groups[:, None]) & good[:, None]).any(-1)
+        assert torch.equal(kept | ~possible, torch.ones_like(kept))
+    else:
+        assert torch.equal(parents, slots)
+    assert torch.equal(parents, ReplaceBad(threshold)(totals, noise, groups))
+    everyone = ReplaceBad(math.inf)(totals.nan_to_num(), noise, groups)
+    assert torch.equal(everyone, slots)
+
+
+def test_replace_bad_takes_rows_apart_and_shares_copies_evenly():
+    totals, groups = torch.randn(4, 5, 16), torch.randint(3, (4, 5, 16))
+    noise = torch.rand(4, 5)
+    rule = ReplaceBad(0.2)
+    whole = rule(totals, noise, groups)
+    for index in ((0, 0), (3, 4), (2, 1)):
+        assert torch.equal(rule(totals[index], noise[index], groups[index]), whole[index])
+    plain = rule(totals, noise)
+    for row in range(4):
+        for column in range(5):
+            good = totals[row, column] <= 0.2
+            copies = torch.bincount(plain[row, column][~good], minlength=16)[good]
+            assert copies.max() - copies.min() <= 1
+    # the random start reaches every good branch
+    totals = torch.tensor([0.0, 9.0, 0.0, 0.0])
+    starts = ReplaceBad(1.0)(totals.expand(300, 4), (torch.arange(300) + 0.5) / 300)[:, 1]
+    assert torch.bincount(starts).tolist() == [100, 0, 100, 100]
+
+
+def test_the_example_of_a_rule_runs():
+    test = doctest.DocTestFinder().find(PruningRule, "PruningRule", globs={})[0]
+    results = doctest.DocTestRunner(verbose=False).run(test)
+    assert (results.failed, results.attempted) == (0, 3)
+
+
 @pytest.mark.parametrize(
     "groups", [[[0, 0, 1]], [[0, 0, 0, 1]], [[0, 0, 1, 1], [0, 1, 2, 3]], [[0, 1, 1, 2]]]
 )
@@ -125,6 +208,10 @@ def test_bad_parameters_are_errors():
             KeepBest(fraction)
     with pytest.raises(ConfigError, match="temperature"):
         Systematic(0.0)
+    with pytest.raises(ConfigError, match="threshold"):
+        ReplaceBad(math.nan)
+    with pytest.raises(ConfigError, match="noise"):
+        ReplaceBad(1.0)(torch.zeros(1, 2))
     with pytest.raises(ConfigError, match="time is one of max, mean, sum, last"):
         Aggregate("median")
     with pytest.raises(ConfigError, match="agents is one of"):

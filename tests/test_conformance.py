@@ -27,7 +27,7 @@ from symphony.errors import DataError
 
 needs_pyarrow = pytest.mark.skipif(
     importlib.util.find_spec("pyarrow") is None,
-    reason="pyarrow is not installed (pip install 'symphony[argoverse2]')",
+    reason="pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')",
 )
 
 
@@ -210,7 +210,8 @@ def flipped(pairs: Any) -> Any:
 
 
 BROKEN: dict[str, tuple[Callable[[RunSegment], RunSegment], set[str]]] = {
-    "milliseconds": (lambda s: s.replace(dt=s.dt * 1000), {"time step", "speed"}),
+    "milliseconds": (lambda s: s.replace(dt=s.dt * 1000), {"schema"}),
+    "seven times the time": (lambda s: s.replace(dt=s.dt * 7), {"time step", "speed"}),
     "twice the time": (lambda s: s.replace(dt=s.dt * 2), {"speed"}),
     "velocity in mph": (scaled("velocity", 2.237), {"speed"}),
     "velocity in km/h": (scaled("velocity", 3.6), {"speed"}),

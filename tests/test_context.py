@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
+from symphony.data import context as contexts
 from symphony.data.context import CONFLICT_GAP, Context, relations
+from symphony.data.resample import smooth
 from symphony.data.segment import RunSegment
 from symphony.data.selection import choices, interactive_agents, interactive_choice
 
@@ -259,3 +262,33 @@ def test_choices_are_counted_and_named() -> None:
     assert list(found["contexts"]) == ["merge", "crossing", "leader", "follower", "nearest"]
     for name, (context, _) in CASES.items():
         assert found["segments"][name] == {"context": context, "agents": [7, 8]}
+
+
+@pytest.mark.parametrize("tile", [1, 60, 5 * STEPS, 3 * STEPS**2])
+def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    cars = scene(
+        [
+            (NORTH, 30 * TIME + 50),
+            (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60),
+            (EAST, 15 * TIME + 120),
+            (NORTH, 80),
+        ]
+    )
+    segments = [cars, crossing(6, steps=60, seed=3), straight_road(9, steps=40)]
+    whole = [relations(each, np.arange(1, each.num_agents)) for each in segments]
+    monkeypatch.setattr(contexts, "TILE", tile)
+    for segment, expected in zip(segments, whole, strict=True):
+        found = relations(segment, np.arange(1, segment.num_agents))
+        for name in ("merge", "crossing", "leader", "follower"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert any(np.isfinite(each.merge).any() for each in whole)
+    assert any(np.isfinite(each.crossing).any() for each in whole)
+
+
+def test_a_log_of_ten_minutes_takes_little_memory() -> None:
+    log = straight_road(30, steps=6000, dt=0.1)
+    tracemalloc.start()
+    interactive_agents(smooth(log, 0.3), 2)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 300e6

@@ -283,7 +283,12 @@ def test_the_papers_exclusions_are_counted_apart(
     logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = convert(FakeReader(), logs, tmp_path / "store")
-    assert report.exclusions == {"playback_agents": 0, "roadgraph_points": 0, "interactive_agents": 1}
+    assert report.exclusions == {
+        "playback_agents": 0,
+        "roadgraph_points": 0,
+        "interactive_agents": 1,
+        "overlaps": 0,
+    }
     assert sum(report.problems.values()) + 1 == sum(report.reasons.values()) == len(report.skipped)
     assert json.loads(json.dumps(report.to_json()))["exclusions"] == report.exclusions
     found = converting.info(tmp_path / "store")

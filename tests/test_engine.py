@@ -170,7 +170,7 @@ def test_bad_arguments_are_refused_at_once(bad: dict[str, Any]) -> None:
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ConfigError, match=r"pip install 'symphony\[ray\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'symphony-traffic\[ray\]'"):
         ordered_map(slow_square, [1], engine="ray")
 
 

@@ -47,7 +47,8 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.logs import measure, shortfalls
 
 needs_sumo = pytest.mark.skipif(
-    importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony[sumo]')"
+    importlib.util.find_spec("sumo") is None,
+    reason="SUMO is not installed (pip install 'symphony-traffic[sumo]')",
 )
 seeds = st.integers(0, MAX_SEED)
 numbers = st.integers(0, BLOCK - 1)
@@ -95,6 +96,13 @@ def test_built_in_networks_are_in_no_plan() -> None:
         for i in range(len(store))
     }
     assert max(int(name.split("-")[1]) for name in names) < Plan(1).network(0).seed
+
+
+def test_segments_of_one_network_are_a_group() -> None:
+    for store in map(SegmentStore, (builtin_store("train"), builtin_store("test"))):
+        assert store.groups.tolist() == [store.tags(i)["network"] for i in range(len(store))]
+        assert 1 < len(set(store.groups.tolist())) < len(store)
+        assert store[0].group == store.groups[0]
 
 
 def test_kinds_take_turns() -> None:
@@ -292,6 +300,7 @@ def test_routes_go_straight_on_as_often_as_asked(tmp_path: Path) -> None:
 def test_crowded_segments_have_enough_interactive_agents() -> None:
     task = Plan(1, interactive=8).network(1)
     found = harvest(task)
+    assert {segment.group for segment in found.segments} == {task.name}
     assert found.task == task
     assert 0 < len(found.segments) <= min(PER_NETWORK, found.accepted)
     assert len({id(segment.road) for segment in found.segments}) > 1

@@ -12,29 +12,25 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
+from helpers_runs import build, pieces, same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from symphony import keys
-from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError, checkpoints
-from symphony.agents.networks import build_networks
 from symphony.cli import main
-from symphony.config import (
-    AgentConfig,
-    DiscriminatorConfig,
-    SearchConfig,
-    TrainConfig,
-    from_dict,
-    to_json,
-)
+from symphony.collectors import BeamSearchCollector
+from symphony.config import DiscriminatorConfig, SearchConfig, TrainConfig, read_json, to_json
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.envs.routes import POINTS
 from symphony.errors import ConfigError
+from symphony.recipes import train
+from symphony.render import curves
+from symphony.simulation import SearchReplay
 from symphony.simulation.demonstrations import SceneDataset, logged
-from symphony.training import train
-from symphony.training.learner import Learner
+from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
 NETWORKS = {
@@ -64,25 +60,6 @@ def dataset(store: Path) -> SceneDataset:
     return SceneDataset(SegmentStore(store), 2, Bicycle(), routes=True)
 
 
-def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
-    base = TrainConfig(
-        method,
-        data=store,
-        out=out,
-        steps=4,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        segments=2,
-        states=16,
-        goals=8,
-        search=SearchConfig(branches=2, prune_every=4, segments=2, updates=2, states=8, test_branches=2),
-        discriminator=DiscriminatorConfig(hidden=8, head=8, states=8),
-        checkpoint_every=2,
-        log_every=1,
-        wandb="disabled",
-    )
-    return replace(base, **changes)
-
-
 @pytest.fixture(scope="module")
 def trained(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """Runs made once each; never written to again."""
@@ -90,37 +67,20 @@ def trained(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
     def get(method: str) -> Path:
         if method not in runs:
-            runs[method] = train(config(method, store, tmp_path_factory.mktemp("runs") / method))
+            runs[method] = train(tiny(method, store, tmp_path_factory.mktemp("runs") / method))
         return runs[method]
 
     return get
-
-
-def weights(run: Path) -> dict[str, Tensor]:
-    agent = load_agent(str(run))
-    found = {"policy": agent.policy, "goals": agent.goals, "discriminator": agent.discriminator}
-    return {
-        f"{name}.{key}": value.clone()
-        for name, module in found.items()
-        if isinstance(module, torch.nn.Module)
-        for key, value in module.state_dict().items()
-    }
 
 
 def of(network: str, found: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value for name, value in found.items() if name.startswith(f"{network}.")}
 
 
-def equal(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
 @pytest.mark.parametrize("method", METHODS)
-def test_each_method_trains_its_networks(trained: Trained, store: Path, method: str) -> None:
+def test_each_method_trains_its_networks(trained: Trained, store: Path, tmp_path: Path, method: str) -> None:
     run = trained(method)
-    settings = config(method, store, run)
-    torch.manual_seed(settings.seed)
-    fresh = build_networks(settings).present()
+    fresh = build(tiny(method, store, tmp_path)).agent.modules
     assert set(fresh) == NETWORKS[method]
     after = weights(run)
     assert {name.split(".")[0] for name in after} == NETWORKS[method]
@@ -136,16 +96,24 @@ def test_each_method_trains_its_networks(trained: Trained, store: Path, method: 
 def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
     records = read_metrics(trained(method))
     assert [r["step"] for r in records] == [1, 2, 3, 4]
-    losses = {
-        "policy": "loss_distillation" if "ts" in method else "loss_bc",
-        "goals": "loss_goal",
-        "discriminator": "loss_discriminator",
-    }
-    for name, loss in losses.items():
+    learned = {"policy": "accuracy", "goals": "accuracy_top3", "discriminator": "auc"}
+    for name, statistic in learned.items():
+        loss = f"loss_{name}"
+        assert (f"{name}_{statistic}" in records[0]) == (name in NETWORKS[method])
         assert (loss in records[0]) == (name in NETWORKS[method])
         assert (f"gradient_norm_{name}" in records[0]) == (name in NETWORKS[method])
         if name in NETWORKS[method]:
             assert all(math.isfinite(r[loss]) and r[f"gradient_norm_{name}"] > 0 for r in records)
+    # Who searches learns from the survivors.
+    assert ("policy_nll_rollout" in records[0]) == ("search_offroad_kept" in records[0]) == ("ts" in method)
+    assert {name.removeprefix("loss_") for name in records[0] if name.startswith("loss_")} == NETWORKS[method]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
+    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
+    recorded = {name for record in read_metrics(trained(method)) for name in record}
+    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -159,9 +127,9 @@ def test_metrics_are_strict_json(trained: Trained, method: str) -> None:
 
 def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path) -> None:
     first = weights(trained("bc_ts_h"))
-    assert equal(weights(train(config("bc_ts_h", store, tmp_path / "again"))), first)
-    other = weights(train(config("bc_ts_h", store, tmp_path / "other", seed=1)))
-    assert not any(equal(of(n, other), of(n, first)) for n in ("policy", "goals", "discriminator"))
+    assert same_weights(weights(train(tiny("bc_ts_h", store, tmp_path / "again"))), first)
+    other = weights(train(tiny("bc_ts_h", store, tmp_path / "other", seed=1)))
+    assert not any(same_weights(of(n, other), of(n, first)) for n in ("policy", "goals", "discriminator"))
 
 
 def stopped(run: Path, out: Path, step: int) -> None:
@@ -179,8 +147,8 @@ def test_a_resumed_run_ends_like_an_uninterrupted_one(
     trained: Trained, store: Path, tmp_path: Path, method: str
 ) -> None:
     stopped(trained(method), tmp_path / "part", 2)
-    train(config(method, store, tmp_path / "part", resume=True))
-    assert equal(weights(tmp_path / "part"), weights(trained(method)))
+    train(tiny(method, store, tmp_path / "part", resume=True))
+    assert same_weights(weights(tmp_path / "part"), weights(trained(method)))
     assert [r["step"] for r in read_metrics(tmp_path / "part")] == [1, 2, 3, 4]
 
 
@@ -188,10 +156,10 @@ def test_so_does_one_whose_discriminator_sees_noise_and_a_penalty(store: Path, t
     judge = DiscriminatorConfig(
         hidden=8, head=8, states=8, instance_noise=0.1, gradient_penalty=0.1, features="foresight"
     )
-    whole = train(config("bc_ts", store, tmp_path / "whole", discriminator=judge))
+    whole = train(tiny("bc_ts", store, tmp_path / "whole", discriminator=judge))
     stopped(whole, tmp_path / "part", 2)
-    train(config("bc_ts", store, tmp_path / "part", discriminator=judge, resume=True))
-    assert equal(weights(tmp_path / "part"), weights(whole))
+    train(tiny("bc_ts", store, tmp_path / "part", discriminator=judge, resume=True))
+    assert same_weights(weights(tmp_path / "part"), weights(whole))
 
 
 def test_a_warm_start_takes_over_what_both_runs_have(trained: Trained, store: Path, tmp_path: Path) -> None:
@@ -199,29 +167,27 @@ def test_a_warm_start_takes_over_what_both_runs_have(trained: Trained, store: Pa
     still = DiscriminatorConfig(hidden=8, head=8, states=8, learning_rate=1e-30)
     changes: dict[str, Any] = {"learning_rate": 1e-30, "discriminator": still, "steps": 2, "seed": 9}
     source = trained("bc_h")
-    out = train(config("bc_ts_h", store, tmp_path / "warm", warm_start=source, **changes))
+    out = train(tiny("bc_ts_h", store, tmp_path / "warm", warm_start=source, **changes))
     after, before = weights(out), weights(source)
     for name in ("policy", "goals"):
-        assert equal(of(name, after), of(name, before))
-    torch.manual_seed(9)
-    fresh = build_networks(config("bc_ts_h", store, out, **changes))
-    assert fresh.discriminator is not None
-    new = {f"discriminator.{k}": v for k, v in fresh.discriminator.state_dict().items()}
-    assert equal(of("discriminator", after), new)
+        assert same_weights(of(name, after), of(name, before))
+    fresh = build(tiny("bc_ts_h", store, tmp_path / "fresh", **changes)).agent.modules["discriminator"]
+    new = {f"discriminator.{k}": v for k, v in fresh.state_dict().items()}
+    assert same_weights(of("discriminator", after), new)
     # And from one with more networks than are asked for.
-    out = train(config("bc_h", store, tmp_path / "less", warm_start=trained("bc_ts_h"), **changes))
-    assert equal(
+    out = train(tiny("bc_h", store, tmp_path / "less", warm_start=trained("bc_ts_h"), **changes))
+    assert same_weights(
         weights(out), {k: v for k, v in weights(trained("bc_ts_h")).items() if "discriminator" not in k}
     )
 
 
 def test_a_resumed_run_does_not_start_warm_again(trained: Trained, store: Path, tmp_path: Path) -> None:
-    whole = config("bc_ts", store, tmp_path / "whole", warm_start=trained("bc"))
+    whole = tiny("bc_ts", store, tmp_path / "whole", warm_start=trained("bc"))
     train(whole)
-    assert not equal(of("policy", weights(whole.out)), of("policy", weights(trained("bc_ts"))))
+    assert not same_weights(of("policy", weights(whole.out)), of("policy", weights(trained("bc_ts"))))
     stopped(whole.out, tmp_path / "part", 2)
     train(replace(whole, out=tmp_path / "part", resume=True))
-    assert equal(weights(tmp_path / "part"), weights(whole.out))
+    assert same_weights(weights(tmp_path / "part"), weights(whole.out))
 
 
 @pytest.mark.parametrize("kind", ["nowhere", "another shape"])
@@ -230,14 +196,14 @@ def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(
 ) -> None:
     source = tmp_path / "nowhere" if kind == "nowhere" else trained("bc_h")
     with pytest.raises((ConfigError, CheckpointError)):
-        train(config("bc", store, tmp_path / "run", warm_start=source))
+        train(tiny("bc", store, tmp_path / "run", warm_start=source))
     # Else the corrected command would be refused: the folder holds a run already.
     assert not (tmp_path / "run" / "config.json").exists()
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_configurations_survive_json(store: Path, tmp_path: Path, method: str) -> None:
-    settings = config(
+    settings = tiny(
         method,
         store,
         tmp_path,
@@ -245,13 +211,14 @@ def test_configurations_survive_json(store: Path, tmp_path: Path, method: str) -
         search=SearchConfig(updates=1, survivors="best"),
         discriminator=DiscriminatorConfig(features="paper", radius=7.5),
     )
-    assert from_dict(TrainConfig, json.loads(to_json(settings))) == settings
-    plain = replace(settings, warm_start=None)
-    assert from_dict(TrainConfig, json.loads(to_json(plain))) == plain
+    file = tmp_path / "config.json"
+    for one in (settings, replace(settings, warm_start=None)):
+        file.write_text(to_json(one))
+        assert read_json(TrainConfig, file) == one
 
 
 def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None:
-    saved = json.loads(to_json(config("bc_ts", store, tmp_path)))
+    saved = json.loads(to_json(tiny("bc_ts", store, tmp_path)))
     wrong: list[dict[str, Any]] = [
         {**saved, "format": 1},
         {**saved, "serach": {}},
@@ -261,28 +228,25 @@ def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None
         {**saved, "discriminator": {**saved["discriminator"], "features": "papre"}},
         {**saved, "search": {**saved["search"], "survivors": "some"}},
     ]
+    file = tmp_path / "config.json"
     for values in wrong:
-        with pytest.raises(ConfigError):
-            from_dict(TrainConfig, values)
+        file.write_text(json.dumps(values))
+        with pytest.raises(ConfigError, match=r"config\.json: "):
+            read_json(TrainConfig, file)
+    file.write_text(json.dumps(saved))
+    assert read_json(TrainConfig, file).method == "bc_ts"
 
 
 def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:
     for method in ("bc_ts", "bc_ts_h"):
         with pytest.raises(ConfigError, match="multiple of search"):
-            config(method, store, tmp_path, checkpoint_every=3)
+            build(tiny(method, store, tmp_path / "run", checkpoint_every=3))
+        assert not (tmp_path / "run").exists()
     for method in ("bc", "bc_h"):
-        config(method, store, tmp_path, checkpoint_every=3)
+        build(tiny(method, store, tmp_path / "run", checkpoint_every=3))
     for bad in ({"keep": 1.5}, {"keep": 0}, {"weight": -1}, {"branches": 0}, {"updates": 0}):
         with pytest.raises(ConfigError):
             SearchConfig(**bad)
-
-
-@pytest.mark.parametrize("method", METHODS[:3])
-def test_runs_may_share_one_dataset(
-    store: Path, dataset: SceneDataset, tmp_path: Path, trained: Trained, method: Any
-) -> None:
-    run = train(config(method, store, tmp_path / "run"), dataset)
-    assert equal(weights(run), weights(trained(method)))
 
 
 def test_the_command_line_trains_and_judges_a_method_with_search(store: Path, tmp_path: Path) -> None:
@@ -298,39 +262,46 @@ def test_the_command_line_trains_and_judges_a_method_with_search(store: Path, tm
     assert main(f"evaluate {out} --data {store} --rollouts 4 --search tree --branches 2".split()) == 1
 
 
-def test_learners_judge_states_up_to_the_end_of_each_scene(store: Path, dataset: SceneDataset) -> None:
+def searched(store: Path, out: Path, **changes: Any) -> tuple[dict[str, Tensor], SearchReplay]:
+    """What the first update of a run with search and goals records, and what it learned from."""
+    trainer = build(tiny("bc_ts_h", store, out, segments=3, **changes))
+    record = trainer._update(0)
+    return record, pieces(trainer)["replay"]
+
+
+def led_to(steps: TensorDictBase) -> TensorDictBase:
+    """The states after steps."""
+    after = steps.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL)
+    return after.set(keys.STEP, steps[keys.STEP] + 1).set(keys.STATE, steps[("next", *keys.STATE)])
+
+
+def test_searches_are_judged_up_to_the_end_of_each_scene(store: Path, tmp_path: Path) -> None:
     wide = SearchConfig(branches=4, segments=3, prune_every=4, updates=2, states=8)
-    settings = config("bc_ts_h", store, Path(), segments=3, search=wide)
-    torch.manual_seed(0)
-    learner = Learner(settings, build_networks(settings), dataset, torch.device("cpu"))
-    record = learner.update(0)
-    found = learner._found
-    assert found is not None
-    seen = found.env.at(found.simulated)
-    going = (seen[keys.STEP] <= found.env.scenes.last_step[seen[keys.SCENE]]) & seen[keys.VALID]
-    assert not going.all()
-    for name, key in (("collision", keys.COLLISION), ("offroad", keys.OFFROAD)):
-        share = seen[key].squeeze(-1)[going].float().mean()
-        torch.testing.assert_close(record[f"search_{name}_all"], share)
-    assert record["search_offroad_all"] > 0
+    record, replay = searched(store, tmp_path, search=wide)
+    env, found = replay.env, replay.found
+    for steps, kind in ((found["tree"], "all"), (found, "kept")):
+        seen = env.at(led_to(steps))
+        going = (seen[keys.STEP] <= env.scenes.last_step[seen[keys.SCENE]]) & seen[keys.VALID]
+        assert not going.all()
+        for name, key in (("collision", keys.COLLISION), ("offroad", keys.OFFROAD)):
+            share = seen[key].squeeze(-1)[going].float().mean()
+            torch.testing.assert_close(record[f"search_{name}_{kind}"], share)
+        assert record[f"search_offroad_{kind}"] > 0
 
 
-def test_what_learners_search_is_what_they_imitate(store: Path, dataset: SceneDataset) -> None:
+def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> None:
     """Actions of survivors lead from each of their states to the next."""
-    settings = config("bc_ts_h", store, Path(), segments=3)
-    torch.manual_seed(0)
-    learner = Learner(settings, build_networks(settings), dataset, torch.device("cpu"))
-    learner.update(0)
-    found = learner._found
-    assert found is not None
-    env, lived = found.env, found.survivors
+    _, replay = searched(store, tmp_path)
+    env, lived = replay.env, replay.found.exclude("tree", "collector")
     before, after = lived[..., :-1], lived[..., 1:]
     stepped = env.step(env.at(before).set(keys.ACTION, before[keys.ACTION]))["next"]
     assert torch.equal(stepped[keys.STATE], after[keys.STATE])
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
-    rows = found.env.scenes.route_logged[:, None, None].expand(*lived.shape, 2)
+    rows = env.scenes.route_logged[:, None, None].expand(*lived.shape, 2)
     assert torch.equal(lived[keys.GOAL], rows)
-    assert sorted(found.rank[0].tolist()) == [0, 1]
+    rank = replay.found["collector", "beam_rank"]
+    assert sorted(rank[0, :, 0].tolist()) == [0, 1]
+    assert (rank == rank[..., :1]).all()
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
@@ -411,14 +382,21 @@ def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneD
 def test_one_search_serves_as_many_updates_as_configured(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    searched: list[int] = []
-    real = Learner._search
+    started: list[int] = []
+    searches: list[int] = []
+    update, rollout = Trainer._update, BeamSearchCollector.rollout
 
-    def counted(self: Learner, step: int, rng: torch.Generator) -> Any:
-        searched.append(step)
-        return real(self, step, rng)
+    def noted(self: Trainer, step: int) -> dict[str, Tensor]:
+        started.append(step)
+        return update(self, step)
 
-    monkeypatch.setattr(Learner, "_search", counted)
-    settings = config("bc_ts", store, tmp_path / "run", steps=6, checkpoint_every=6)
+    def counted(self: BeamSearchCollector) -> TensorDictBase:
+        searches.append(started[-1])
+        return rollout(self)
+
+    monkeypatch.setattr(Trainer, "_update", noted)
+    monkeypatch.setattr(BeamSearchCollector, "rollout", counted)
+    settings = tiny("bc_ts", store, tmp_path / "run", steps=6, checkpoint_every=6)
     train(replace(settings, search=replace(settings.search, updates=3)))
-    assert searched == [0, 3]
+    assert started == [0, 1, 2, 3, 4, 5]
+    assert searches == [0, 3]

@@ -311,3 +311,65 @@ def test_the_table_refuses_kinds_of_other_collisions_or_for_a_part():
     update(metrics, "b", inputs, kinds)
     with pytest.raises(ValueError, match="for 3 of 6 segments"):
         metrics.compute()
+
+
+VEHICLE, WALKER, RIDER, THING = 1, 2, 3, 4
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [(VEHICLE, None), (WALKER, KIND.PEDESTRIAN), (RIDER, KIND.CYCLIST), (THING, None), (0, None)],
+)
+@pytest.mark.parametrize("name", CASES)
+def test_the_others_type_names_the_kind(name, other, expected):
+    agents, kind, _ = CASES[name]
+    types = torch.full((len(agents),), other)
+    types[0] = VEHICLE
+    found = collision_kinds(**stage(*agents), agent_type=types)
+    assert found.kind.tolist() == [int(kind if expected is None else expected)]
+
+
+def test_a_pedestrian_who_is_run_over_was_crossing_without_types():
+    walker = (12.0, -1.0, 90.0, 1.0)
+    inputs = stage(EGO, walker)
+    assert collision_kinds(**inputs).kind.tolist() == [KIND.CROSSING]
+    found = collision_kinds(**inputs, agent_type=torch.tensor([VEHICLE, WALKER]))
+    assert found.kind.tolist() == [KIND.PEDESTRIAN]
+    assert found.other.tolist() == [1]
+
+
+def test_types_of_another_shape_are_refused():
+    with pytest.raises(ValueError, match="agent_type is"):
+        collision_kinds(**stage(EGO, (12, 0, 0, 2)), agent_type=torch.ones(3, dtype=torch.int64))
+
+
+def test_being_hit_from_behind_counts_last():
+    """Of two collisions at the same step, whichever agent has which."""
+    for one in KIND:
+        for two in KIND:
+            pair = torch.tensor([int(one), int(two)])
+            zeros = torch.zeros(2, dtype=torch.int64)
+            kinds = CollisionKinds(pair, zeros, zeros, torch.zeros(2, dtype=torch.bool))
+            order = [*(k for k in KIND if k != KIND.REAR_ENDED), KIND.REAR_ENDED]
+            assert kinds.first()[0] == min((one, two), key=order.index)
+
+
+def test_agents_are_counted_one_by_one_and_the_ego_apart():
+    metrics, found, there = RolloutMetrics(), [], []
+    for number in (3, 4):
+        inputs = crowd(number)
+        kinds = collision_kinds(**inputs)
+        update(metrics, f"s{number}", inputs, kinds)
+        found.append(kinds.kind)
+        there.append(inputs["collided"].shape)
+    numbers = metrics.compute()
+    kind = torch.cat([each.flatten(0, -2) for each in found])
+    for who, part in (("ego", kind[:, :1]), ("others", kind[:, 1:])):
+        rate = numbers[f"{who}_collision_rate"]
+        assert rate == pytest.approx(100 * float((part >= 0).double().mean()))
+        rates = [numbers[f"{who}_collision_{k.name.lower()}"] for k in KIND]
+        assert sum(rates) == pytest.approx(rate)
+        for k in KIND:
+            assert rates[k] == pytest.approx(100 * float((part == k).double().mean()))
+    assert 0 < numbers["ego_collision_rate"] < 100
+    assert numbers["others_collision_rate_se"] > 0

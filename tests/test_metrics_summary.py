@@ -222,3 +222,74 @@ def test_divergence_laws():
     assert float(jensen_shannon(np.array([1, 0]), np.array([0, 3]))) == pytest.approx(math.log(2))
     assert np.isnan(jensen_shannon(np.array([0, 0]), np.array([0, 3])))
     assert np.isnan(jensen_shannon(np.array([1, 0]), np.array([0, 0])))
+
+
+def random_groups(count, seed):
+    return [f"g{k}" for k in np.random.default_rng(seed).integers(0, 3, count)]
+
+
+def test_errors_over_groups_by_hand():
+    """The sum of a group's segments is its one observation."""
+    inputs = random_inputs(11, batch=9)
+    groups = random_groups(9, 1)
+    found, plain = scored(inputs | {"groups": groups}).compute(), scored(inputs).compute()
+    assert found["groups"] == len(set(groups)) == 3
+    assert "groups" not in plain
+    assert [found[name] for name in NUMBERS] == [plain[name] for name in NUMBERS]
+    metrics = scored(inputs)
+    collided = np.array([metrics.segments[name].collided for name in inputs["segment_ids"]])
+    totals, weights = np.zeros((2, 3))
+    for group, hits in zip(groups, collided, strict=True):
+        totals[int(group[1])] += 100 * hits
+        weights[int(group[1])] += 4
+    residual = totals - found["collision_rate"] * weights
+    expected = np.sqrt(3 / 2 * (residual**2).sum()) / weights.sum()
+    assert found["collision_rate_se"] == pytest.approx(expected)
+    histograms = np.zeros((2, 3, 201))
+    for name, group in zip(inputs["segment_ids"], groups, strict=True):
+        for k, counts in enumerate((metrics.segments[name].histogram, metrics.segments[name].histogram_log)):
+            histograms[k, int(group[1])] += counts
+    left = [jensen_shannon(*(h.sum(0) - h[k] for h in histograms)) for k in range(3)]
+    jackknife = np.sqrt(2 / 3 * ((left - np.mean(left)) ** 2).sum())
+    assert found["curvature_jsd_se"] == pytest.approx(jackknife)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_group_each_is_as_no_groups(seed):
+    inputs = random_inputs(seed)
+    single = scored(inputs | {"groups": inputs["segment_ids"]}).compute()
+    plain = scored(inputs).compute()
+    assert single.pop("groups") == single["segments"]
+    assert single.keys() == plain.keys()
+    for name, value in plain.items():
+        assert single[name] == pytest.approx(value, nan_ok=True), name
+
+
+def test_copies_of_a_segment_in_one_group_tell_nothing_new():
+    """Without groups, four copies would halve the error."""
+    inputs = random_inputs(5)
+    copies = RolloutMetrics()
+    for k in range(4):
+        again = inputs | {"segment_ids": [f"{name}-{k}" for name in inputs["segment_ids"]]}
+        copies.update(**again, groups=inputs["segment_ids"])
+    once, found = scored(inputs).compute(), copies.compute()
+    assert found["groups"] == 7
+    for name in NUMBERS:
+        assert found[name] == pytest.approx(once[name])
+        assert found[f"{name}_se"] == pytest.approx(once[f"{name}_se"])
+
+
+def test_groups_for_a_part_are_refused():
+    one, two = random_inputs(6), random_inputs(7)
+    two["segment_ids"] = [f"t{k}" for k in range(7)]
+    metrics = scored(one | {"groups": random_groups(7, 0)}, two)
+    with pytest.raises(ValueError, match="groups were given for 7 of 14 segments"):
+        metrics.compute()
+    with pytest.raises(ValueError, match="2 groups for 7 segments"):
+        scored(one | {"groups": ["a", "b"]})
+
+
+def test_one_group_has_no_error():
+    found = scored(random_inputs(8) | {"groups": 7 * ["a"]}).compute()
+    assert found["groups"] == 1
+    assert all(math.isnan(found[f"{name}_se"]) for name in NUMBERS)

@@ -12,20 +12,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers_runs import same_weights, tiny, weights
+from helpers_runs import build, pieces, same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import latest
-from symphony.agents.networks import build_networks
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Displacement
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate
+from symphony.recipes import train
+from symphony.render import curves
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.training import train
-from symphony.training.learner import Learner
+from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
 METHODS = ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h")
@@ -36,7 +36,7 @@ JUDGED = EvaluateConfig(rollouts=2)
 Trained = Callable[..., Path]
 
 
-def config(method: Any, store: Path, out: Path = Path(), **changes: Any) -> TrainConfig:
+def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     """Two updates of regression, two of the discriminator alone, two of both."""
     return replace(tiny(method, store, out, steps=6, mgail=SHORT), **changes)
 
@@ -53,31 +53,21 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def dataset(store: Path) -> SceneDataset:
-    return SceneDataset(SegmentStore(store), 2, Displacement(), routes=True)
-
-
-@pytest.fixture(scope="module")
-def trained(store: Path, dataset: SceneDataset, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+def trained(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """Runs made once each; never written to again."""
     runs: dict[str, Path] = {}
 
     def get(method: str) -> Path:
         if method not in runs:
-            runs[method] = train(config(method, store, tmp_path_factory.mktemp("runs") / method), dataset)
+            runs[method] = train(config(method, store, tmp_path_factory.mktemp("runs") / method))
         return runs[method]
 
     return get
 
 
-def make(settings: TrainConfig, dataset: SceneDataset) -> Learner:
-    torch.manual_seed(settings.seed)
-    return Learner(settings, build_networks(settings), dataset, torch.device("cpu"))
-
-
-def copies(learner: Learner) -> dict[str, list[Tensor]]:
-    present = learner.networks.present()
-    return {name: [p.detach().clone() for p in module.parameters()] for name, module in present.items()}
+def copies(trainer: Trainer) -> dict[str, list[Tensor]]:
+    modules = trainer.agent.modules
+    return {name: [p.detach().clone() for p in module.parameters()] for name, module in modules.items()}
 
 
 def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> set[str]:
@@ -93,91 +83,108 @@ def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> se
 
 @pytest.mark.parametrize(("method", "checkpoint"), list(zip(METHODS, (3, 0, 0, 3), strict=True)))
 def test_each_phase_changes_the_networks_it_is_for(
-    store: Path, dataset: SceneDataset, method: str, checkpoint: int
+    store: Path, tmp_path: Path, method: str, checkpoint: int
 ) -> None:
-    learner = make(config(method, store, mgail=replace(SHORT, checkpoint=checkpoint)), dataset)
+    trainer = build(config(method, store, tmp_path, mgail=replace(SHORT, checkpoint=checkpoint)))
     goals = {"goals"} if method.endswith("_h") else set()
     phases = ({"policy"}, {"policy"}, {"discriminator"}, {"discriminator"}) + (
         {"policy", "discriminator"},
     ) * 2
     rates = []
     for step, phase in enumerate(phases):
-        before = copies(learner)
-        record = learner.update(step)
-        assert moved(before, copies(learner)) == phase | goals
-        assert ("loss_bc" in record) == (step < 2)
+        before = copies(trainer)
+        record = trainer._update(step)
+        assert moved(before, copies(trainer)) == phase | goals
+        assert {name.removeprefix("loss_") for name in record if name.startswith("loss_")} == phase | goals
         assert ("loss_discriminator" in record) == ("search_auc_collision" in record) == (step >= 2)
-        assert ("loss_mgail" in record) == ("loss_policy" in record) == (step >= 4)
+        assert ("policy_mgail_score" in record) == (step >= 4)
         assert all(not value.requires_grad for value in record.values())
         assert all(math.isfinite(v) for k, v in record.items() if k.startswith(("loss", "gradient")))
-        rates.append(learner.optimizers["policy"].param_groups[0]["lr"])
+        rates.append(trainer.optimizers["policy"].param_groups[0]["lr"])
     # The policy's rate starts anew with the second phase, at one of its own.
-    assert rates[0] == learner.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[5]
+    assert rates[0] == trainer.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[5]
 
 
 @pytest.mark.parametrize("method", ["mgail_h", "mgail_ts_h"])
 def test_goals_and_discriminator_learn_nothing_from_the_loss_of_the_policy(
-    store: Path, dataset: SceneDataset, method: str
+    store: Path, tmp_path: Path, method: str
 ) -> None:
-    learner = make(config(method, store), dataset)
+    trainer = build(config(method, store, tmp_path))
     for step in range(5):
-        learner.update(step)
-    found = learner._found
-    assert learner.mgail_loss is not None
-    assert found is not None
-    for module in learner.networks.present().values():
+        trainer._update(step)
+    used = pieces(trainer)
+    for module in trainer.agent.modules.values():
         module.zero_grad(set_to_none=True)
-    learner.mgail_loss(learner._replayed(found, torch.Generator()))["loss_mgail"].backward()
-    for name, module in learner.networks.present().items():
+    used["mgail_loss"](used["replay"].repeatable(3, torch.Generator()))["loss_mgail"].backward()
+    for name, module in trainer.agent.modules.items():
         with_gradient = [p.grad is not None for p in module.parameters()]
         assert all(with_gradient) if name == "policy" else not any(with_gradient)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_gradient_goes_along_what_survived(store: Path, dataset: SceneDataset, method: str) -> None:
+def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, method: str) -> None:
     """Rollouts that are simulated again lead through the very states that the search found."""
-    learner = make(config(method, store, mgail=replace(SHORT, rollouts=99)), dataset)
-    found = learner._search(4, torch.Generator().manual_seed(0))
-    assert (found.start.shape, found.survivors.shape[:2]) == ((2, 2), (2, 2))
-    begin = learner._replayed(found, torch.Generator().manual_seed(0))
+    trainer = build(config(method, store, tmp_path))
+    replay, policy = pieces(trainer)["replay"], trainer.agent.modules["policy"]
+    trainer.rng.manual_seed(0)
+    replay.refresh(4)
+    env, found = replay.env, replay.found
+    assert found.shape[:2] == (2, 2)
+    begin = replay.repeatable(99, torch.Generator().manual_seed(0))
     assert begin.shape == (4,)
-    paths, policy = found.survivors.flatten(0, 1), learner.networks.policy
-    now, states = begin.exclude("noise_plan"), []
+    paths, now, states = found.flatten(0, 1), begin.exclude("noise_plan"), []
     with torch.no_grad():
         for noise in begin["noise_plan"].unbind(1):
             states.append(now[keys.STATE])
-            now = found.env.step(policy(now.copy().set(keys.NOISE, noise)))["next"]
+            now = env.step(policy(now.copy().set(keys.NOISE, noise)))["next"]
     replayed = torch.stack(states, 1)
     # In an order of their own.
     same = (replayed[:, None] == paths[keys.STATE][None]).flatten(2).all(-1)
     assert same.any(1).all()
     assert same.any(0).all()
-    followed = found.env.scenes.route_logged[begin[keys.SCENE].squeeze(-1)]
+    followed = env.scenes.route_logged[begin[keys.SCENE].squeeze(-1)]
     expected = followed if method.endswith("_h") else torch.full_like(followed, -1)
     assert torch.equal(begin[keys.GOAL], expected)
 
 
-def test_settings_of_the_configuration_reach_the_loss(store: Path, dataset: SceneDataset) -> None:
+def test_settings_of_the_configuration_reach_the_loss(store: Path, tmp_path: Path) -> None:
     settings = MGAILConfig(cost="logit", truncate=4, checkpoint=2, react=True)
-    loss = make(config("mgail", store, mgail=settings), dataset).mgail_loss
-    assert loss is not None
+    loss = pieces(build(config("mgail", store, tmp_path, mgail=settings)))["mgail_loss"]
     assert (loss.cost, loss.truncate, loss.checkpoint, loss.detach_keys) == ("logit", 4, 2, [])
-    learner = make(config("mgail_h", store), dataset)
-    assert learner.mgail_loss is not None
-    assert set(learner.mgail_loss.detach_keys) == {keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE}
-    # Regression beside it, and more updates of the discriminator.
-    both = MGAILConfig(regression=0, head_start=0, rollouts=3, expert_weight=0.5, discriminator_updates=2)
-    learner, steps = make(config("mgail", store, mgail=both), dataset), []
-    learner.optimizers["discriminator"].register_step_post_hook(lambda *_: steps.append(1))
-    record = learner.update(0)
-    torch.testing.assert_close(record["loss_policy"], record["loss_mgail"] + 0.5 * record["loss_bc"])
-    assert len(steps) == 2
+    loss = pieces(build(config("mgail_h", store, tmp_path)))["mgail_loss"]
+    assert set(loss.detach_keys) == {keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_regression_beside_it_and_more_updates_of_the_discriminator(
+    store: Path, tmp_path: Path, method: str
+) -> None:
+    found = []
+    for weight in (0.5, 1.0):
+        both = MGAILConfig(
+            regression=0, head_start=0, rollouts=3, expert_weight=weight, discriminator_updates=2
+        )
+        trainer, steps = build(config(method, store, tmp_path, mgail=both)), []
+        trainer.optimizers["discriminator"].register_step_post_hook(lambda *_, steps=steps: steps.append(1))
+        found.append(trainer._update(0))
+        assert len(steps) == 2
+    for record in found:
+        torch.testing.assert_close(record["loss_policy"], record["loss_mgail"] + record["loss_regression"])
+    half, whole = found
+    torch.testing.assert_close(2 * half["loss_regression"], whole["loss_regression"])
+    assert half["loss_regression"] != 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
+    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
+    recorded = {name for record in read_metrics(trained(method)) for name in record}
+    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize(("method", "dies_at"), [("mgail", 5), ("mgail_ts_h", 3)])
 def test_a_killed_run_ends_like_an_unbroken_one(
     store: Path,
-    dataset: SceneDataset,
     trained: Trained,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -185,22 +192,22 @@ def test_a_killed_run_ends_like_an_unbroken_one(
     dies_at: int,
 ) -> None:
     whole = trained(method)
-    update = Learner.update
+    update = Trainer._update
 
-    def deadly(self: Learner, step: int) -> dict[str, Tensor]:
+    def deadly(self: Trainer, step: int) -> dict[str, Tensor]:
         if step == dies_at:
             raise KeyboardInterrupt
         return update(self, step)
 
     settings = config(method, store, tmp_path / "run", resume=True)
     with monkeypatch.context() as patched:
-        patched.setattr(Learner, "update", deadly)
+        patched.setattr(Trainer, "_update", deadly)
         with pytest.raises(KeyboardInterrupt):
-            train(settings, dataset)
+            train(settings)
     done = latest(settings.out / "checkpoints")
     assert done is not None
     assert int(done.name.removeprefix("step-")) == dies_at - 1
-    train(settings, dataset)
+    train(settings)
     assert same_weights(weights(settings.out), weights(whole))
     assert [r["step"] for r in read_metrics(settings.out)] == [1, 2, 3, 4, 5, 6]
 
@@ -221,33 +228,29 @@ def test_an_agent_is_judged_as_it_was_trained(trained: Trained, store: Path, met
     assert other["ade"] != usual["ade"]
 
 
-def test_adversarial_training_starts_from_a_regression(
-    store: Path, dataset: SceneDataset, tmp_path: Path
-) -> None:
-    plain = train(config("mgail", store, tmp_path / "plain", steps=2), dataset)
+def test_adversarial_training_starts_from_a_regression(store: Path, tmp_path: Path) -> None:
+    plain = train(config("mgail", store, tmp_path / "plain", steps=2))
     fresh = weights(plain)
-    out = train(config("mgail_ts", store, tmp_path / "warm", warm_start=plain, steps=2, mgail=STILL), dataset)
+    out = train(config("mgail_ts", store, tmp_path / "warm", warm_start=plain, steps=2, mgail=STILL))
     after = weights(out)
     assert after.keys() == fresh.keys()
     for name, value in after.items():
         assert torch.equal(value, fresh[name]) == name.startswith("policy.") or value.numel() < 2
     bicycle = train(tiny("bc", store, tmp_path / "bc", steps=1))
     with pytest.raises(SymphonyError):
-        train(config("mgail", store, tmp_path / "other", warm_start=bicycle), dataset)
+        train(config("mgail", store, tmp_path / "other", warm_start=bicycle))
 
 
-def test_the_duration_cuts_segments(store: Path) -> None:
-    data = SegmentStore(store)
-    short = SceneDataset(data, 2, Displacement(), routes=True, duration=1)
-    learner = make(config("mgail_h", store, duration=1), short)
+def test_the_duration_cuts_segments(store: Path, tmp_path: Path) -> None:
+    trainer = build(config("mgail_h", store, tmp_path, duration=1))
     for step in range(5):
-        learner.update(step)
-    found = learner._found
-    assert found is not None
-    assert found.survivors.shape == (2, 2, 5)
-    assert (found.env.scenes.last_step == 5).all()
-    assert found.logged.shape[1] == found.env.scenes.log_state.shape[1] == 6
-    whole = SceneDataset(data, 2, Displacement())
+        trainer._update(step)
+    replay, short = pieces(trainer)["replay"], trainer.data
+    scenes = replay.env.scenes
+    assert replay.found.shape == (2, 2, 5)
+    assert (scenes.last_step == 5).all()
+    assert scenes.log_state.shape[1] == short.fitted(scenes.segment.tolist(), scenes)[0].shape[1] == 6
+    whole = SceneDataset(SegmentStore(store), 2, Displacement())
     for item in range(3):
         cut, full = short.segment(item), whole.segment(item)
         assert (cut.position == full.position[:, :6]).all()
@@ -267,19 +270,21 @@ def test_a_segment_too_short_for_the_duration_is_named(store: Path, tmp_path: Pa
         assert caught.value.file == store
         assert caught.value.segment in ("straight-0", "crossing-0", "crossing-1")
     with pytest.raises(ConfigError, match="duration"):
-        config("mgail", store, duration=-1)
+        config("mgail", store, tmp_path, duration=-1)
 
 
 def test_an_agent_is_judged_for_the_duration_it_was_trained_with(
-    trained: Trained, store: Path, dataset: SceneDataset, tmp_path: Path
+    trained: Trained, store: Path, tmp_path: Path
 ) -> None:
     run = train(config("mgail", store, tmp_path / "run", duration=1, steps=1))
     agent = load_agent(str(run))
     assert agent.duration == 1
+    assert agent.spec is not None
 
     def numbers(of: int, asked: int, where: Path = store) -> Any:
         judged = replace(JUDGED, duration=asked)
-        return pytest.approx(evaluate(replace(agent, duration=of), where, judged).numbers(), nan_ok=True)
+        other = replace(agent, spec=replace(agent.spec, duration=of))
+        return pytest.approx(evaluate(other, where, judged).numbers(), nan_ok=True)
 
     assert numbers(1, 0) == numbers(0, 1).expected
     assert numbers(2, 1) == numbers(1, 0).expected
@@ -301,7 +306,7 @@ def test_eight_agents_train(tmp_path: Path) -> None:
     records = read_metrics(run)
     assert all(0 < r["gradient_norm_policy"] < math.inf for r in records)
     assert records[-1]["skipped_updates"] == 0
-    assert "loss_mgail" in records[-1]
+    assert "policy_mgail_score" in records[-1]
     found = evaluate(str(run), tmp_path / "store", JUDGED)
     assert found.interactive == 8
     assert math.isfinite(float(found.numbers()["ade"]))

@@ -98,7 +98,6 @@ def test_padding_gets_no_gradient_and_gives_none_that_is_not_finite():
     td[ROUTES] = routes
     td[GOAL] = drawn_goals(td[ROUTES_MASK].int().argmax(-1), td[ROUTES_MASK])
     loss = GoalLoss(network)
-    loss.set_keys(label=GOAL)
     loss(td)["loss_goal"].backward()
     assert all(torch.isfinite(p.grad).all() for p in loss.parameters())
     mask = td[ROUTES_MASK]
@@ -196,7 +195,6 @@ def test_it_learns_which_route_is_taken():
     label = best.masked_fill(~td[ROUTES_MASK], -torch.inf).argmax(-1)
     td[GOAL] = drawn_goals(label, td[ROUTES_MASK])
     loss = GoalLoss(network)
-    loss.set_keys(label=GOAL)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     first = loss(td)
     for _ in range(50):

@@ -137,7 +137,7 @@ def test_what_padded_agents_hold_has_no_influence():
 
 def test_it_agrees_with_torchrl_on_flat_keys():
     td = TensorDict(observation=torch.randn(20, 4), action=torch.randn(20, 2), batch_size=[20])
-    loss = BCLoss(gaussian_actor(), use_mask=False)
+    loss = BCLoss(gaussian_actor())
     loss.set_keys(action="action")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The name target_actor_network_params", UserWarning)
@@ -150,7 +150,7 @@ def test_it_agrees_with_torchrl_on_flat_keys():
 def test_flat_keys_and_other_labels():
     actor = categorical_actor(observation="observation", logits="logits", action="action")
     td = TensorDict(observation=torch.randn(20, 4), goal=torch.randint(7, (20,)), batch_size=[20])
-    loss = BCLoss(actor, use_mask=False)
+    loss = BCLoss(actor)
     loss.set_keys(action="goal")
     logits = actor[0](td.clone())["logits"]
     torch.testing.assert_close(loss(td)["loss_bc"], functional.cross_entropy(logits, td["goal"]))
@@ -169,7 +169,7 @@ def test_accepted_keys():
 @pytest.mark.parametrize("name", ["action", "valid"])
 @pytest.mark.parametrize("key", ["flat", ("deeply", "nested", "key")])
 def test_each_key_can_be_set(name, key):
-    loss = BCLoss(categorical_actor())
+    loss = BCLoss(categorical_actor(), use_mask=True)
     td = batch(5)
     assert len(loss.in_keys) == 3
     reference = loss(td)["loss_bc"]
@@ -252,6 +252,28 @@ def test_deepcopy_is_independent():
     assert loss(td)["loss_bc"] == value != clone(td)["loss_bc"]
 
 
+def test_a_mask_counts_where_there_is_one():
+    """And must be there if it is demanded, or read by the network anyway; False never reads it."""
+    td = batch(20)
+    assert not td[VALID].all()
+    masked, bare = BCLoss(categorical_actor())(td)["loss_bc"], td.exclude(VALID)
+    everyone = td.clone().set(VALID, torch.ones_like(td[VALID]))
+    for loss, data in (
+        (BCLoss(categorical_actor()), bare),
+        (BCLoss(categorical_actor(), use_mask=False), td),
+    ):
+        torch.testing.assert_close(loss(data)["loss_bc"], BCLoss(categorical_actor())(everyone)["loss_bc"])
+        assert not torch.isclose(loss(data)["loss_bc"], masked)
+    torch.testing.assert_close(BCLoss(categorical_actor(), use_mask=True)(td)["loss_bc"], masked)
+    assert VALID not in BCLoss(categorical_actor(), use_mask=False).in_keys
+    # A network that reads the mask: what is without one can't be told from what is to be trained on.
+    reading = BCLoss(categorical_actor(observation=VALID), use_mask=None)
+    with pytest.raises(KeyError, match="use_mask=False"):
+        reading._mask(bare)
+    reading.set_keys(valid="other")
+    assert reading._mask(bare) is None
+
+
 def test_torchrl_masks_count_too():
     td = batch(4, 5)
     td[VALID] = torch.ones_like(td[VALID])
@@ -279,7 +301,7 @@ def test_bad_arguments_are_refused(arguments, message):
 def test_bad_inputs_are_refused():
     with pytest.raises(ValueError, match="needs an actor whose distribution"):
         BCLoss(gaussian_actor(), label_smoothing=0.1)
-    loss, td = BCLoss(categorical_actor()), batch(5)
+    loss, td = BCLoss(categorical_actor(), use_mask=True), batch(5)
     with pytest.raises(KeyError, match="use_mask=False"):
         loss(td.exclude(VALID))
     with pytest.raises(KeyError, match="no expert action"):

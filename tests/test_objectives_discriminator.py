@@ -48,7 +48,7 @@ def batch(*shape, agents=3):
 def fixed(score, simulated, **arguments):
     """A loss on given logits."""
     network = TensorDictModule(nn.Identity(), in_keys=["x"], out_keys=["score"])
-    loss = DiscriminatorLoss(network, use_mask=False, **arguments)
+    loss = DiscriminatorLoss(network, **arguments)
     loss.set_keys(score="score", simulated="simulated")
     return loss(TensorDict(x=score, simulated=simulated, batch_size=[]))
 
@@ -166,7 +166,7 @@ def test_only_the_discriminator_receives_a_gradient():
 @pytest.mark.parametrize("arguments", [{}, PENALTY, {**PENALTY, "penalty_on": "both", "reduction": "none"}])
 def test_it_keeps_the_contract_of_torchrl(arguments):
     check_contract(
-        lambda: DiscriminatorLoss(discriminator(), **arguments),
+        lambda: DiscriminatorLoss(discriminator(), use_mask=True, **arguments),
         batch(20),
         "loss_discriminator",
         parameters=4,
@@ -320,7 +320,7 @@ def test_noise_is_for_training_and_follows_its_generator():
     # A linear judge sees noise of the stated spread.
     wide = TensorDict(x=torch.zeros(20000), simulated=torch.ones(20000, dtype=torch.bool), batch_size=[])
     network = TensorDictModule(lambda x: x.square(), in_keys=["x"], out_keys=["score"])
-    loss = DiscriminatorLoss(network, instance_noise=0.5, noise_keys=["x"], use_mask=False)
+    loss = DiscriminatorLoss(network, instance_noise=0.5, noise_keys=["x"])
     loss.set_keys(score="score", simulated="simulated")
     torch.manual_seed(0)
     assert loss(wide)["score_simulated"] == pytest.approx(0.25, rel=0.05)
@@ -350,7 +350,7 @@ def test_bad_inputs_are_refused():
     with pytest.raises(KeyError, match="no flag under"):
         loss(td.exclude(SIMULATED))
     with pytest.raises(KeyError, match="use_mask=False"):
-        loss(td.exclude(VALID))
+        DiscriminatorLoss(discriminator(), use_mask=True)(td.exclude(VALID))
     wrong = td.clone()
     wrong[SIMULATED] = wrong[SIMULATED].float()
     with pytest.raises(ValueError, match=r"flag .* is torch.float32"):

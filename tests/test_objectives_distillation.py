@@ -185,7 +185,7 @@ def test_it_keeps_the_contract_of_torchrl(continuous, survivors):
     if survivors == "all":
         td = td.exclude(RANK)
     check_contract(
-        lambda: DistillationLoss(actor(), survivors=survivors),
+        lambda: DistillationLoss(actor(), survivors=survivors, use_mask=True),
         td,
         "loss_distillation",
         parameters=2 if continuous else 4,

@@ -19,7 +19,8 @@ from helpers_objectives import check_contract
 from symphony.objectives import GoalLoss
 
 ROUTES, LOGITS = ("agents", "routes"), ("agents", "goal_logits")
-MASK, LABEL, VALID = ("agents", "routes_mask"), ("agents", "route"), ("agents", "valid")
+MASK, LABEL, VALID = ("agents", "routes_mask"), ("agents", "goal"), ("agents", "valid")
+SET = ("agents", "goal_set")
 
 
 class Choice(nn.Module):
@@ -59,7 +60,7 @@ def fixed(logits):
     network = TensorDictModule(nn.Identity(), in_keys=[LOGITS], out_keys=[LOGITS])
     td = TensorDict(batch_size=[])
     td[LOGITS] = logits
-    return GoalLoss(network, use_mask=False), td
+    return GoalLoss(network), td
 
 
 @pytest.mark.parametrize("shape", [(40,), (8, 5)])
@@ -99,6 +100,56 @@ def test_by_hand():
     torch.testing.assert_close(out["accuracy_top3"], torch.tensor(2 / 3))
     p, q = torch.tensor([0.5, 0.25, 0.25]), torch.tensor([0.4, 0.3, 0.2, 0.1])
     torch.testing.assert_close(out["entropy"], -((p * p.log()).sum() + (q * q.log()).sum()) / 3)
+
+
+def one_hot(td):
+    """The same labels as sets of one."""
+    td = td.clone()
+    td[SET] = torch.arange(td[MASK].shape[-1]) == td[LABEL][..., None]
+    del td[LABEL]
+    return td
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_a_set_of_one_is_that_label(reduction):
+    td, results = batch(30), []
+    for data in (td, one_hot(td)):
+        network = goal_network()
+        out = GoalLoss(network, reduction=reduction)(data)
+        out["loss_goal"].sum().backward()
+        results.append([*(v.detach() for v in out.values()), *(p.grad for p in network.parameters())])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_of_several_right_goals_the_probabilities_are_added():
+    probability = torch.tensor([[0.4, 0.3, 0.2, 0.1], [0.4, 0.3, 0.2, 0.1], [0.25, 0.25, 0.5, 0.0]])
+    loss, td = fixed(probability.log().clamp(min=-50).requires_grad_())
+    td[MASK] = torch.tensor([[1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]]).bool()
+    td[SET] = torch.tensor([[0, 1, 0, 1], [1, 0, 0, 1], [1, 1, 1, 0]]).bool()
+    td[LABEL] = torch.tensor([99, -1, 3])  # not read
+    out = loss(td)
+    torch.testing.assert_close(out["loss_goal"], -torch.tensor([0.4, 0.5, 1.0]).log().mean())
+    torch.testing.assert_close(out["accuracy"], torch.tensor(2 / 3))
+    torch.testing.assert_close(out["accuracy_top3"], torch.tensor(1.0))
+    # Whatever goals are right, all of them become likelier together: the posterior shares the gradient out.
+    (gradient,) = torch.autograd.grad(out["loss_goal"], td[LOGITS])
+    share = torch.where(td[SET], probability, 0.0)
+    share = share / share.sum(-1, keepdim=True)
+    torch.testing.assert_close(gradient, (probability - share) / 3, atol=1e-6, rtol=0)
+
+
+def test_the_gradient_of_sets_is_right():
+    td = batch(4)
+    td[SET] = td[MASK] & (torch.rand(td[MASK].shape) < 0.6)
+    assert td[SET].sum(-1).max() > 1
+    assert not td[SET].any(-1).all()
+    network = TensorDictModule(nn.Identity(), in_keys=[LOGITS], out_keys=[LOGITS])
+
+    def value(logits):
+        return GoalLoss(network)(td.clone().set(LOGITS, logits))["loss_goal"]
+
+    logits = torch.randn(td[MASK].shape, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(value, [logits])
 
 
 def test_what_does_not_count_has_no_influence():
@@ -172,7 +223,7 @@ def test_training_it_learns_which_goal_is_taken():
 
 
 def test_it_keeps_the_contract_of_torchrl():
-    check_contract(lambda: GoalLoss(goal_network()), batch(20), "loss_goal", parameters=3)
+    check_contract(lambda: GoalLoss(goal_network(), use_mask=True), batch(20), "loss_goal", parameters=3)
 
 
 def test_the_key_of_the_logits_can_be_set():
@@ -194,6 +245,10 @@ def test_bad_inputs_are_refused():
         td[LABEL][2, 1] = label
         with pytest.raises(ValueError, match=r"at \[2, 1\] is not one of the feasible"):
             loss(td)
+    td[SET] = td[MASK] | (torch.arange(6) == 3)
+    with pytest.raises(ValueError, match="is not one of the feasible"):
+        loss(td)
+    del td[SET]
     td[MASK] = td[MASK][..., :4]
     with pytest.raises(ValueError, match=r"mask of goals .* has shape \(5, 3, 4\).*\(5, 3, 6\)"):
         loss(td)

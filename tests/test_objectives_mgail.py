@@ -22,7 +22,7 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.keys import ACTION, NOISE, OBJECTS, OWN, POINTS, SCORE, STATE, VALID
 from symphony.modules import NoiseSampler, discriminator, displacement_policy
 from symphony.objectives import MGAILLoss
-from symphony.simulation.rollouts import ENDED, search
+from symphony.simulation.search import ENDED, search
 from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]
@@ -46,7 +46,7 @@ def _env():
 
 def actor():
     torch.manual_seed(0)
-    return displacement_policy(SELF_FEATURES, GROUPS, hidden=8, head=(8,)).double()
+    return displacement_policy(SELF_FEATURES, GROUPS, dt=0.2, hidden=8, head=(8,)).double()
 
 
 def judge():
@@ -298,7 +298,7 @@ def walkers(agents, **arguments):
 def test_it_keeps_the_contract_of_torchrl(agents, arguments):
     td = starts(Walk(agents), 5, branches=1)[:, 0]
     td[VALID] = torch.ones(5, agents, dtype=torch.bool)
-    check_contract(lambda: walkers(agents, **arguments), td, "loss_mgail", parameters=4)
+    check_contract(lambda: walkers(agents, use_mask=True, **arguments), td, "loss_mgail", parameters=4)
 
 
 # Of tensordict, about what scenes are made of.
@@ -324,7 +324,7 @@ def test_keys_of_numbers_and_scores_can_be_set(env):
     reference = make(env)(td)["loss_mgail"]
     network = discriminator(*SIZES, hidden=8, head=(8,), out_key="s").double()
     network.load_state_dict(judge().state_dict())
-    policy = displacement_policy(SELF_FEATURES, GROUPS, hidden=8, head=(8,), noise_key="u").double()
+    policy = displacement_policy(SELF_FEATURES, GROUPS, dt=0.2, hidden=8, head=(8,), noise_key="u").double()
     policy.load_state_dict(actor().state_dict())
     loss = MGAILLoss(policy, network, env)
     with pytest.raises(KeyError, match="no score"):

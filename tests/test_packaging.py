@@ -9,18 +9,23 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def pins() -> dict[str, str]:
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
+RUNTIME = ["core", *(extra for extra in PROJECT["optional-dependencies"] if extra not in {"dev", "docs"})]
+
+
+def pins(file: str = "constraints.txt") -> dict[str, str]:
+    lines = (ROOT / file).read_text().splitlines()
     found = [line.split("==") for line in lines if line and not line.startswith("#")]
     assert len(dict(found)) == len(found), "pinned twice"
     return {canonicalize_name(name): version for name, version in found}
@@ -44,22 +49,43 @@ def make(*arguments: str, cwd: Path = ROOT, **environment: str) -> subprocess.Co
     )
 
 
+def needs(extra: str) -> list[Requirement]:
+    lines = PROJECT["dependencies"] if extra == "core" else PROJECT["optional-dependencies"][extra]
+    return [Requirement(line) for line in lines]
+
+
+@pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
 @pytest.mark.parametrize("extra", ["core", *PROJECT["optional-dependencies"]])
-def test_every_dependency_is_pinned_within_its_range(extra: str) -> None:
-    extras = PROJECT["optional-dependencies"]
-    for line in PROJECT["dependencies"] if extra == "core" else extras[extra]:
-        need = Requirement(line)
-        version = pins()[canonicalize_name(need.name)]
-        assert need.specifier.contains(version, prereleases=True), f"{line}: pinned to {version}"
+def test_every_dependency_is_pinned_within_its_range(extra: str, file: str) -> None:
+    for need in needs(extra):
+        version = pins(file)[canonicalize_name(need.name)]
+        assert need.specifier.contains(version, prereleases=True), f"{need}: pinned to {version}"
+
+
+def test_the_lowest_versions_are_those_promised() -> None:
+    lowest = {
+        canonicalize_name(need.name): next(part.version for part in need.specifier if part.operator == ">=")
+        for extra in ("core", *PROJECT["optional-dependencies"])
+        for need in needs(extra)
+    }
+    assert pins("constraints-lowest.txt") == pins() | lowest
+
+
+@pytest.mark.parametrize("extra", RUNTIME)
+def test_the_next_major_release_is_not_promised(extra: str) -> None:
+    for need in needs(extra):
+        major = Version(pins()[canonicalize_name(need.name)]).major
+        assert not need.specifier.contains(f"{major + 1}.0", prereleases=True), need
 
 
 def test_pins_are_plain_versions() -> None:
     # A build tag such as +cpu is found on some package indices only.
-    assert all(re.fullmatch(r"[0-9][0-9a-z.]*", version) for version in pins().values())
+    for file in ("constraints.txt", "constraints-lowest.txt"):
+        assert all(re.fullmatch(r"[0-9][0-9a-z.]*", version) for version in pins(file).values())
 
 
 def test_pins_reach_everything_the_core_needs() -> None:
-    todo, seen = ["symphony"], set()
+    todo, seen = [need.name for need in needs("core")], set()
     while todo:
         name = canonicalize_name(todo.pop())
         if name in seen:
@@ -69,7 +95,7 @@ def test_pins_reach_everything_the_core_needs() -> None:
             need = Requirement(line)
             if need.marker is None or need.marker.evaluate({"extra": ""}):
                 todo.append(need.name)
-    assert seen - {"symphony"} - set(pins()) == set()
+    assert seen - set(pins()) == set()
 
 
 def test_a_python_too_old_is_named(tmp_path: Path) -> None:
@@ -99,13 +125,24 @@ def test_without_any_python_the_message_says_what_is_needed(tmp_path: Path) -> N
         ("demo", ["bin/symphony demo --out out/demo"]),
         ("table", ["bin/python scripts/make_table.py --out out/table"]),
         ("test", ["bin/python -m pytest"]),
-        ("lint", ["ruff check", "ruff format --check", "mypy", "lint-imports", "scripts/lint_length.py"]),
+        (
+            "lint",
+            [
+                "ruff check",
+                "ruff format --check",
+                "codespell",
+                "mypy",
+                "lint-imports",
+                "scripts/lint_length.py",
+            ],
+        ),
+        ("docs", ["bin/mkdocs build --strict"]),
     ],
 )
 def test_targets_set_themselves_up_once(target: str, commands: list[str], tmp_path: Path) -> None:
     first = make("--dry-run", target, f"VENV={tmp_path}").stdout
     assert [line for line in first.splitlines() if "-c constraints.txt -e" in line]
-    assert ("[dev]" in first) == (target not in {"demo", "table"})
+    assert ("[dev,docs]" in first) == (target not in {"demo", "table"})
     (tmp_path / ".core").touch()
     (tmp_path / ".dev").touch()
     again = make("--dry-run", target, f"VENV={tmp_path}").stdout
@@ -113,6 +150,17 @@ def test_targets_set_themselves_up_once(target: str, commands: list[str], tmp_pa
     for command in commands:
         assert command in first
         assert command in again
+
+
+def test_the_lowest_versions_have_a_venv_of_their_own(tmp_path: Path) -> None:
+    venv = tmp_path / "venv"
+    shown = make("--dry-run", "test-lowest", f"VENV={venv}").stdout
+    installs = [line for line in shown.splitlines() if " -e " in line]
+    assert installs
+    for line in installs:
+        assert "-c constraints-lowest.txt" in line
+        assert f"{venv}-lowest/bin" in line
+    assert f"{venv}-lowest/bin/python -m pytest" in shown
 
 
 @pytest.mark.parametrize("changed", ["pyproject.toml", "constraints.txt"])
@@ -127,6 +175,31 @@ def test_a_change_of_the_dependencies_installs_again(changed: str, tmp_path: Pat
     later = (venv / ".dev").stat().st_mtime + 10
     os.utime(tmp_path / changed, (later, later))
     assert make("--dry-run", "test", cwd=tmp_path).stdout.count("pip install") == 2
+
+
+def test_a_wheel_holds_all_of_the_package(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copyfile(ROOT / name, source / name)
+    ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    shutil.copytree(ROOT / "src", source / "src", ignore=ignored)
+    code = "from setuptools.build_meta import build_wheel; build_wheel('..')"
+    done = subprocess.run(
+        [sys.executable, "-W", "default", "-c", code], cwd=source, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("symphony_traffic-*.whl")
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    package = ROOT / "src"
+    files = {
+        str(file.relative_to(package))
+        for file in (package / "symphony").rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
+    }
+    assert held == files
+    for part in ("py.typed", "data/builtin/test/store.json", "pretrained/bc_ts_h/config.json"):
+        assert f"symphony/{part}" in held
 
 
 def test_ci_runs_lint_then_tests(tmp_path: Path) -> None:

@@ -26,14 +26,14 @@ from symphony.collectors.result import BeamSearchResult, lineage
 from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError
-from symphony.evaluation.evaluator import simulated
+from symphony.recipes import train
 from symphony.render import SearchTree, plot_curves, plot_genealogy, plot_search, plot_tree
 from symphony.render.curves import DASHES, PANELS, panels_of, read_curves, run_colors, smoothed
 from symphony.render.genealogy import rows
 from symphony.render.style import AGENT_COLORS, new_figure
 from symphony.render.tree import FATES, STROKES, score_colors
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.training import train
+from symphony.simulation.driving import simulated
 
 EVERY, BRANCHES, STEPS = 2, 4, 5
 PARENTS = np.array([[0, 1, 0, 1], [2, 0, 2, 3], [3, 3, 2, 2]])
@@ -341,16 +341,21 @@ def records(count: int = 30, **metrics: float) -> list[dict[str, float]]:
 
 def test_every_metric_has_a_panel_and_every_run_two_lines(tmp_path: Path) -> None:
     runs = {
-        "one": records(auc=0.1, loss_bc=1.0, mine=3.0),
-        "two": records(5, auc=0.2, search_collision_all=1.0, search_collision_kept=0.5),
+        "one": records(discriminator_auc=0.1, policy_accuracy=1.0, mine=3.0),
+        "two": records(5, discriminator_auc=0.2, search_collision_all=1.0, search_collision_kept=0.5),
     }
     figure = plot_curves(runs, tmp_path / "curves.png")
     titles = {axes.get_title(loc="left"): axes for axes in figure.axes}
-    assert list(titles) == ["BC loss", "discriminator AUC", "search: share in collision", "mine"]
-    assert gids_of_lines(titles["discriminator AUC"]) == ["raw-auc-one", "auc-one", "raw-auc-two", "auc-two"]
-    assert gids_of_lines(titles["BC loss"]) == ["raw-loss_bc-one", "loss_bc-one"]
+    assert list(titles) == ["accuracy", "discriminator AUC", "search: share in collision", "mine"]
+    assert gids_of_lines(titles["discriminator AUC"]) == [
+        "raw-discriminator_auc-one",
+        "discriminator_auc-one",
+        "raw-discriminator_auc-two",
+        "discriminator_auc-two",
+    ]
+    assert gids_of_lines(titles["accuracy"]) == ["raw-policy_accuracy-one", "policy_accuracy-one"]
     assert len(titles["search: share in collision"].lines) == 4
-    raw, strong = titles["BC loss"].lines
+    raw, strong = titles["accuracy"].lines
     assert raw.get_xdata().tolist() == [20 * k for k in range(1, 31)]
     assert raw.get_ydata().tolist() == list(range(30))
     assert raw.get_alpha() < 0.5
@@ -427,14 +432,14 @@ def test_what_belongs_together_shares_a_panel_and_how_it_ran_comes_last() -> Non
         ["validation_ade", "validation_min_sade"],
         ["loss_mgail", "loss_policy"],
         [f"gradient_norm_{name}" for name in ("policy", "discriminator", "goals")],
-        [f"show_speed_log_p{q}" for q in (10, 50, 90)],
+        [f"preview_speed_log_p{q}" for q in (10, 50, 90)],
     ):
         assert len({names[name] for name in group}) == 1
     # More lines could not be told apart.
     assert max(len(metrics) for _, metrics in PANELS) <= len(DASHES)
-    present = ["skipped_updates", "updates_per_second", "mine", "learning_rate", "auc"]
+    present = ["skipped_updates", "updates_per_second", "mine", "learning_rate", "discriminator_auc"]
     order = [name for _, metrics in panels_of(present) for name in metrics]
-    assert order == ["auc", "mine", "updates_per_second", "learning_rate", "skipped_updates"]
+    assert order == ["discriminator_auc", "mine", "updates_per_second", "learning_rate", "skipped_updates"]
 
 
 # The command line
@@ -451,7 +456,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make_run(method: Any, store: Path, out: Path) -> Path:
     config = TrainConfig(
-        method,
+        method=method,
         data=store,
         out=out,
         steps=2,
@@ -497,9 +502,9 @@ def test_command_line_shows_the_tree_that_an_evaluation_searches(
     run: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rule: str
 ) -> None:
     run = Path(shutil.copytree(run, tmp_path / "run"))
-    settings = json.loads((run / "config.json").read_text())
+    settings = json.loads((run / "agent.json").read_text())
     settings["search"]["rule"] = rule
-    (run / "config.json").write_text(json.dumps(settings))
+    (run / "agent.json").write_text(json.dumps(settings))
     drawn: list[SearchTree] = []
     monkeypatch.setattr(symphony.render, "plot_search", lambda segment, tree, path: drawn.append(tree))
     args = [
@@ -530,7 +535,19 @@ def test_command_line_shows_the_tree_that_an_evaluation_searches(
 
 def test_command_line_draws_curves(run: Path, run_without_search: Path, tmp_path: Path) -> None:
     file = tmp_path / "curves.png"
-    assert call("curves", run, run_without_search, "--out", file, "--metrics", "accuracy", "auc") == 0
+    assert (
+        call(
+            "curves",
+            run,
+            run_without_search,
+            "--out",
+            file,
+            "--metrics",
+            "policy_accuracy",
+            "discriminator_auc",
+        )
+        == 0
+    )
     assert file.stat().st_size > 5_000
 
 
@@ -541,8 +558,8 @@ def test_command_line_draws_curves(run: Path, run_without_search: Path, tmp_path
         ({"--segment": "2"}, "segment 2: the store holds 2 segments"),
         ({"--out": "tree.docx"}, ".png"),
         ({"--data": "nowhere"}, "nowhere"),
-        ({"--branches": "0"}, "--branches must be at least 1"),
-        ({"--prune-every": "-1"}, "--prune-every must not be negative"),
+        ({"--branches": "-1"}, "branches must not be negative"),
+        ({"--prune-every": "-1"}, "prune-every must not be negative"),
     ],
     ids=lambda case: "-".join(case) if isinstance(case, dict) else "",
 )

@@ -19,16 +19,15 @@ from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents import included as pretrained
 from symphony.agents import load_agent
-from symphony.agents.agent import read_config
 from symphony.agents.checkpoint import checkpoints, parts_of
 from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.cli.train import Train
-from symphony.config import EvaluateConfig, MGAILConfig, ValidationConfig
+from symphony.config import AgentSpec, EvaluateConfig, MGAILConfig, ValidationConfig, to_json
 from symphony.data.generate import PRESETS
 from symphony.data.store import StoreWriter
 from symphony.errors import ConfigError
-from symphony.training import train
+from symphony.recipes import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = pretrained.pretrained_names()
@@ -70,7 +69,7 @@ def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.Te
         store,
         folder / f"{request.param}-0",
         warm_start=first,
-        validation=ValidationConfig(store, segments=1, rollouts=1),
+        validation=ValidationConfig(data=store, segments=1, rollouts=1),
         **adversarial,
     )
     out = train(second)
@@ -115,9 +114,9 @@ def test_an_agent_is_its_run_without_what_only_training_needs(run: Path, made: P
     for name, content in contents(made).items():
         assert str(tmp_path.parent).encode() not in content, name
         assert b"/tmp" not in content, name
-    config = read_config(made)
+    config = make_pretrained.read_run(made)
     assert (str(config.data), str(config.out)) == ("town/train", run.name)
-    assert str(config.warm_start) == read_config(run).warm_start.name  # type: ignore[union-attr]
+    assert str(config.warm_start) == make_pretrained.read_run(run).warm_start.name  # type: ignore[union-attr]
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, made: Path, tmp_path: Path) -> None:
@@ -137,7 +136,7 @@ def test_the_card_says_what_was_done_and_found(run: Path, made: Path, store: Pat
         record["data"]["checksum"],
         f"{record['ade']:.2f} ± {record['ade_se']:.2f}",
         "with seed 0",
-        f"the run `{read_config(run).warm_start.name}`",  # type: ignore[union-attr]
+        f"the run `{make_pretrained.read_run(run).warm_start.name}`",  # type: ignore[union-attr]
         "2 updates",
         "every 3 steps by rule `best`",
         "which it was not trained with",
@@ -177,7 +176,7 @@ def test_its_name_works_wherever_an_agent_is_named(made: Path, store: Path, tmp_
     figure = ["figure", "curvature", "pretrained:tiny", "--out"]
     assert main([*figure, str(tmp_path / "a.png")]) == 0
     assert main([*figure, str(tmp_path / "b.png"), *data, "--rollouts", "2"]) == 0
-    method = read_config(made).method
+    method = make_pretrained.read_run(made).method
     start = tiny(method, store, tmp_path / "further", warm_start=Path("pretrained:tiny"), learning_rate=1e-30)
     start = dataclasses.replace(start, mgail=MGAILConfig(head_start=0, rollouts=2, learning_rate=1e-30))
     further = weights(train(start))
@@ -203,8 +202,8 @@ def test_unknown_names(name: str, message: str, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
     for known in ("tiny", "other"):
         (tmp_path / known).mkdir()
-        settings = {"method": "bc", "data": "x", "out": "y"}
-        (tmp_path / known / "config.json").write_text(json.dumps(settings))
+        spec = AgentSpec(action_space="bicycle", dt=0.2)
+        (tmp_path / known / "agent.json").write_text(to_json(spec))
     (tmp_path / "no_agent").mkdir()
     with pytest.raises(ConfigError, match=message):
         load_agent(name)
@@ -221,14 +220,14 @@ def test_there_are_some() -> None:
 def test_shipped(name: str) -> None:
     agent = load_agent(f"pretrained:{name}")
     folder = pretrained.FOLDER / name
-    config = read_config(folder)
+    config = make_pretrained.read_run(folder)
     assert config.method in METHODS
     assert agent.searches
     card = (folder / "README.md").read_text()
     assert f"# pretrained:{name}" in card
     data, _, split = str(config.data).partition("/")
     assert PRESETS[data].checksums[split] in card  # type: ignore[index]
-    assert "not been judged" not in card
+    assert "not been evaluated" not in card
     (file,) = (folder / "evaluations").iterdir()
     assert f"{json.loads(file.read_text())['collision_rate']:.1f}" in card
     for place, content in contents(folder).items():

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import pytest
+import tyro
 
 from symphony.cli import main
-from symphony.cli.profiles import Profile, expanded
-from symphony.cli.recipe import parse
-from symphony.config import Method, TrainConfig
+from symphony.cli.profiles import expanded
+from symphony.cli.recipe import Arguments
+from symphony.config import METHODS, PROFILES, TrainConfig
 from symphony.errors import ConfigError
 
 NEEDED = ["--data", "a", "--out", "b", "--test", "c"]
 
 
-def settings(method: Method, *args: str) -> TrainConfig:
-    return parse(method, None, [*NEEDED, *args]).training
+def settings(method: str, *args: str) -> TrainConfig:
+    return tyro.cli(Arguments, args=expanded([method, *NEEDED, *args])).training
 
 
-@pytest.mark.parametrize("method", get_args(Method))
-@pytest.mark.parametrize("profile", get_args(Profile))
-def test_every_profile_is_a_valid_configuration_of_every_method(method: Method, profile: str) -> None:
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_is_a_valid_configuration_of_every_method(method: str, profile: str) -> None:
     config = settings(method, "--profile", profile)
     assert config.method == method
     assert (config == settings(method)) == (profile == "default")
@@ -34,7 +35,8 @@ def test_the_paper_is_followed() -> None:
     assert (config.steps, config.segments, config.checkpoint_every) == (70_000, 16, 2_000)
     assert (search.branches, search.test_branches, search.prune_every, search.rule) == (4, 16, 10, "best")
     assert (config.agent.num_points, config.validation.segments) == (1_000, 200)
-    assert config.mgail.regression == 0
+    assert (config.mgail.regression, config.mgail.react, config.mgail.cost) == (0, True, "log_d")
+    assert config.discriminator.features == "paper"
 
 
 def test_the_settings_of_the_paper_s_tables_are_options_of_every_recipe() -> None:
@@ -52,9 +54,16 @@ def test_what_is_given_has_precedence(given: list[str], first: bool) -> None:
     assert config.states == 16
 
 
-def test_adversarial_methods_differ_only_where_they_say() -> None:
-    assert settings("mgail", "--profile", "smoke").mgail.regression == 2
-    assert settings("bc", "--profile", "smoke").mgail == settings("bc").mgail
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_is_the_same_for_every_method(profile: str) -> None:
+    found = [replace(settings(method, "--profile", profile), method="bc") for method in METHODS]
+    assert all(config == found[0] for config in found)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_the_flags_of_a_profile_make_what_its_function_returns(profile: str) -> None:
+    plain = settings("bc")
+    assert settings("bc", "--profile", profile) == PROFILES[profile](plain)  # type: ignore[index]
 
 
 def test_unknown_profiles_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import crossing, hide, segments, straight_road
+from symphony.data import resample as resampling
 from symphony.data.resample import resample, smooth
 from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.errors import ConfigError, DataError
@@ -219,3 +220,25 @@ def test_whatever_is_valid_stays_valid(log: RunSegment, sigma: float) -> None:
 def test_impossible_windows_are_refused(sigma: float) -> None:
     with pytest.raises(ConfigError, match="sigma"):
         smooth(straight_road(1), sigma)
+
+
+@pytest.mark.parametrize("block", [1, 100, 700])
+def test_smoothing_in_blocks_gives_the_same(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = hide(crossing(4, steps=91, dt=0.1), 2, slice(20, 31))
+    noise = np.random.default_rng(0).normal(0, 0.2, log.position.shape).astype(np.float32)
+    log = log.replace(position=np.where(log.valid[..., None], log.position + noise, 0).astype(np.float32))
+    whole = smooth(log, 0.5)
+    monkeypatch.setattr(resampling, "BLOCK", block)
+    for name in ("position", "heading", "velocity"):
+        np.testing.assert_allclose(getattr(smooth(log, 0.5), name), getattr(whole, name), atol=1e-4)
+
+
+def test_absurd_steps_are_refused_before_there_is_room_for_them() -> None:
+    log = straight_road(steps=91, dt=0.1)
+    for dt in (1e-9, 0.004, 6.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="dt must be"):
+            resample(log, dt)
+    with pytest.raises(ConfigError, match="sigma"):
+        smooth(log, 1e9)
+    with pytest.raises(DataError, match="steps"):
+        resample(straight_road(3, steps=900, dt=1.0), 0.03)

@@ -21,6 +21,7 @@ from helpers_roadgraph import (
     tree,
     turned,
 )
+from helpers_segments import make_road
 from symphony.roadgraph import (
     LaneGraph,
     feasible_routes,
@@ -29,6 +30,7 @@ from symphony.roadgraph import (
     route_polyline,
     routes,
 )
+from symphony.roadgraph.routes import MAX_LANES
 
 
 def named(name, *lanes):
@@ -207,3 +209,19 @@ def test_route_polyline_window():
     np.testing.assert_allclose(gone, [[2, 70], [2, 70]], atol=1e-5)
     with pytest.raises(ValueError, match="spacing"):
         route_polyline(graph, route, spacing=0)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-38])
+def test_lanes_of_next_to_no_length_in_a_circle(size):
+    road, name = crossing()
+    lines = [road.lanes[k][:, :2].copy() for k in range(len(road.lanes))]
+    tiny = np.array([[0, 0], [size, 0]], np.float32)
+    lines += [tiny, tiny[::-1]]
+    a, b = len(lines) - 2, len(lines) - 1
+    links = [*map(tuple, road.successors.tolist()), (name["in0"], a), (a, b), (b, a)]
+    graph = LaneGraph(make_road(lines, links))
+    found = routes(graph, [(name["in0"], 10.0)])
+    assert max(map(len, found)) == MAX_LANES
+    assert all(follows(graph, route) for route in found)
+    ordinary = [route for route in found if a not in route]
+    assert ordinary == routes(LaneGraph(road), [(name["in0"], 10.0)])

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import crossing, hide, random_segment, segments, straight_road
+from symphony.data.bounds import line_length, oddities
 from symphony.data.segment import Polylines, RunSegment, content_hash, validate
 from symphony.errors import DataError
 
@@ -283,3 +284,70 @@ def test_hidden_agents_are_zero() -> None:
     assert not segment.valid[1, 3:9].any()
     assert not segment.position[1, 3:9].any()
     assert segment.valid.sum() == 3 * 51 - 6
+
+
+ABSURD = {
+    "dt": lambda s: s.replace(dt=0.001),
+    "size": lambda s: s.replace(size=s.size * np.float32(1e-6)),
+    "velocity": lambda s: s.replace(velocity=s.velocity + np.float32(3e38)),
+    "heading": lambda s: s.replace(heading=s.heading + np.float32(2e3)),
+    "position": lambda s: s.replace(position=_moved(s.position, 5000)),
+    "origin": lambda s: s.replace(origin=s.origin + 1e30),
+    "valid": lambda s: s.replace(valid=np.ones((s.num_agents, 10_001), bool)),
+    "segment_id": lambda s: s.replace(segment_id="a\x1b[31m"),
+    "file": lambda s: s.replace(file="x" * 300),
+    "source": lambda s: s.replace(source="\udc80"),
+    "road.lanes": lambda s: _road(s, "lanes", 1e30),
+    "road.boundary": lambda s: _road(s, "boundary", 30_000),
+    "road.marks": lambda s: _road(s, "marks", 1e6),
+    "road": lambda s: _many(s.replace(segment_id="many")),
+    "road.speed_limit": lambda s: s.replace(
+        road=dataclasses.replace(s.road, speed_limit=s.road.speed_limit * np.float32(1e6))
+    ),
+}
+
+
+def _moved(position: NDArray[Any], metres: float) -> NDArray[Any]:
+    moved = position.copy()
+    moved[1, 3:, 0] += metres
+    return moved
+
+
+def _many(segment: RunSegment) -> RunSegment:
+    """The same mark, from one end of the map to the other, again and again."""
+    line = np.array([[-15_000, 0], [15_000, 0]])
+    marks = Polylines.of([line] * 170)
+    road = dataclasses.replace(segment.road, marks=marks, mark_type=np.ones(170, np.uint8))
+    return segment.replace(road=road)
+
+
+def _road(segment: RunSegment, name: str, metres: float) -> RunSegment:
+    lines = getattr(segment.road, name)
+    far = dataclasses.replace(lines, points=lines.points + np.float32(metres))
+    return segment.replace(road=dataclasses.replace(segment.road, **{name: far}))
+
+
+@pytest.mark.parametrize("field", ABSURD)
+def test_absurd_values_are_refused(field: str) -> None:
+    segment = validate(straight_road(3, steps=8))
+    with pytest.raises(DataError) as caught:
+        validate(ABSURD[field](segment))
+    assert caught.value.field == field
+
+
+def test_odd_values_are_named() -> None:
+    segment = straight_road(3, steps=8)
+    assert oddities(segment) == []
+    fast = segment.replace(velocity=segment.velocity + np.float32(80))
+    small = segment.replace(size=segment.size * np.float32(0.1))
+    jumping = segment.replace(position=_moved(segment.position, 100))
+    for odd, word in ((fast, "faster"), (small, "under 0.2 m"), (jumping, "jumps")):
+        (found,) = oddities(validate(odd))
+        assert word in found
+
+
+def test_gaps_between_lines_are_no_length() -> None:
+    segment = random_segment(seed=3, lanes=3, marks=3)
+    for lines in (segment.road.lanes, segment.road.boundary, segment.road.marks, Polylines.of([])):
+        expected = sum(np.hypot(*np.diff(line[:, :2].astype(float), axis=0).T).sum() for line in lines)
+        assert line_length(lines) == pytest.approx(expected)

@@ -24,7 +24,8 @@ from symphony.geometry import segments_of, signed_distance
 from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
 
 needs_sumo = pytest.mark.skipif(
-    importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony[sumo]')"
+    importlib.util.find_spec("sumo") is None,
+    reason="SUMO is not installed (pip install 'symphony-traffic[sumo]')",
 )
 SPLITS: tuple[Literal["train", "test"], ...] = ("train", "test")
 RULE = sumo.CropRule(focuses=3, per_focus=4)
@@ -43,7 +44,7 @@ def segments(request: pytest.FixtureRequest) -> list[RunSegment]:
     if request.param != "simulated":
         return list(SegmentStore(builtin_store(request.param)))
     if importlib.util.find_spec("sumo") is None:
-        pytest.skip("SUMO is not installed (pip install 'symphony[sumo]')")
+        pytest.skip("SUMO is not installed (pip install 'symphony-traffic[sumo]')")
     return [s for run in request.getfixturevalue("simulated").values() for s in run]
 
 
@@ -285,7 +286,7 @@ def test_failure_of_a_program_shows_its_message(tmp_path: Path) -> None:
 def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     process.sumo_home.cache_clear()
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(DataError, match=r"symphony\[sumo\]"):
+    with pytest.raises(DataError, match=r"symphony-traffic\[sumo\]"):
         sumo.generate("town", 0)
     process.sumo_home.cache_clear()
 

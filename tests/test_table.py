@@ -34,12 +34,12 @@ from symphony.evaluation.comparison import (
     family,
     method_name,
 )
-from symphony.evaluation.formats import FORMATS, as_json, as_latex, as_markdown, as_text, print_text
+from symphony.evaluation.formats import ABSENT, FORMATS, as_json, as_latex, as_markdown, as_text, print_text
 from symphony.evaluation.paper import METRICS, paper_figures
 from symphony.evaluation.records import evaluation_name, find_runs, keep_evaluation, kept_evaluations
 from symphony.metrics import jensen_shannon
+from symphony.recipes import train
 from symphony.render import plot_curvature
-from symphony.training import train
 
 METHODS = get_args(Method)
 NUMBERS = st.floats(0, 100)
@@ -60,13 +60,15 @@ def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[
     }
     counts = [0] * 100 + [3] + [0] * 100
     return {
-        "format": 1,
+        "format": 2,
         **numbers,
         "segments": 4,
         "run": {"updates": 0, "named": False, "checkpoint": 0},
         "data": {"name": "test", "checksum": "ab" * 32},
         "config": config | changes,
         "playback": {"collision_rate": 0.5, "offroad_time": 0.25},
+        "constant_velocity": dict.fromkeys(METRICS, 2.0),
+        "cost": {"simulation": 6.0},
         "curvature": {"policy": counts, "log": counts},
     }
 
@@ -81,7 +83,7 @@ def make_run(folder: Path, method: str, seed: int = 0, *records: dict[str, Any],
     settings = {"format": 2, "method": method, "seed": seed, "agent": {"interactive": 2}} | config
     (folder / "config.json").write_text(json.dumps(settings))
     for record in records:
-        keep_evaluation(folder, record)
+        keep_evaluation(str(folder), record)
     return folder
 
 
@@ -149,6 +151,7 @@ def test_rows_are_those_of_the_paper_and_missing_methods_are_missing() -> None:
     assert [row.method for row in compare(full_table(), "main").rows] == list(ROWS)
     assert [method_name(method) for method in ROWS] == [
         "Playback",
+        "Constant velocity",
         "BC",
         "BC+H",
         "BC+TS",
@@ -159,7 +162,7 @@ def test_rows_are_those_of_the_paper_and_missing_methods_are_missing() -> None:
         "MGAIL+TS+H",
     ]
     some = compare(full_table(2, ("mgail_ts", "bc_h")), "main", "proprietary")
-    assert [row.method for row in some.rows] == ["playback", "bc_h", "mgail_ts"]
+    assert [row.method for row in some.rows] == ["playback", "constant_velocity", "bc_h", "mgail_ts"]
     for write in FORMATS.values():
         assert "BC+TS+H" not in write(some).replace(" + ", "+").replace("MGAIL+TS+H", "")
 
@@ -178,7 +181,7 @@ def test_a_mean_over_something_unknown_is_unknown_and_never_the_best() -> None:
     assert math.isnan(cell.mean)
     assert not cell.best
     assert row_of(comparison, "bc_h").cells["ade"].best
-    assert json.loads(as_json(comparison))["rows"][1]["ade"]["mean"] is None
+    assert json.loads(as_json(comparison))["rows"][2]["ade"]["mean"] is None
 
 
 # --- the paper's own figures ---
@@ -199,7 +202,7 @@ BOLD = {
 def test_the_paper_s_bold_figures_are_what_we_call_best(setting: Any, dataset: Any) -> None:
     comparison = compare(full_table(1), setting, dataset)
     for number, key in enumerate(METRICS):
-        best = [row.method for row in comparison.rows if row.paper[key].best]
+        best = [row.method for row in comparison.rows if row.method in METHODS and row.paper[key].best]
         assert best == [part[number] for part in BOLD[setting, dataset]]
 
 
@@ -209,7 +212,7 @@ def test_the_paper_s_figures_are_in_our_units() -> None:
     assert figures["bc"]["curvature_jsd"] == pytest.approx((0.00132, 0.00028))
     assert figures["playback"]["collision_rate"][0] == 3.04
     assert math.isnan(figures["playback"]["ade"][0])
-    assert set(figures) == set(ROWS)
+    assert set(figures) == set(ROWS) - {"constant_velocity"}
     with pytest.raises(ConfigError, match="no figures for setting 'long' on womd"):
         compare(full_table(1), "long", "womd")
 
@@ -226,8 +229,9 @@ def expected(comparison: Comparison) -> dict[str, list[tuple[bool, tuple[float, 
     found: dict[str, list[tuple[bool, tuple[float, ...]]]] = {}
     for row in comparison.rows:
         found[row.name] = []
-        for column in COLUMNS:
-            for cell in (row.cells[column.key], row.paper.get(column.key)):
+        for column in comparison.columns:
+            theirs = [] if comparison.dataset is None else [row.paper.get(column.key, ABSENT)]
+            for cell in (row.cells[column.key], *theirs):
                 if cell is not None:
                     held = [float(column.shown(v)) for v in (cell.mean, cell.error) if not math.isnan(v)]
                     found[row.name].append((cell.best, tuple(held)))
@@ -242,11 +246,14 @@ def test_markdown_and_latex_read_back(seeds: int, dataset: Any) -> None:
     lines = [line.strip("| ").split(" | ") for line in as_markdown(comparison).splitlines() if "|" in line]
     assert len({len(line) for line in lines}) == 1
     assert {name: [("**" in c, numbers_of(c)) for c in cells] for name, _, *cells in lines[2:]} == wanted
-    assert [line[1].strip() for line in lines[3:]] == [str(seeds)] * 8
+    assert [line[1].strip() for line in lines[4:]] == [str(seeds)] * 8
     latex = as_latex(comparison)
     body = [line[:-3].split(" & ") for line in latex.splitlines() if line.endswith(r"\\")]
     rows = {line[0].replace(" ", ""): line[2:] for line in body[2 if dataset else 1 :]}
-    assert {name: [(r"\textbf" in c, numbers_of(c)) for c in cells] for name, cells in rows.items()} == wanted
+    latex_wanted = {name.replace(" ", ""): cells for name, cells in wanted.items()}
+    assert {
+        name: [(r"\textbf" in c, numbers_of(c)) for c in cells] for name, cells in rows.items()
+    } == latex_wanted
     (columns,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", latex)
     assert len(columns) == len(body[-1])
     assert latex.count("{") == latex.count("}")
@@ -266,7 +273,8 @@ def test_json_reads_back_whole() -> None:
             assert found[key]["best"] is cell.best
             if not math.isnan(cell.error):
                 assert (found[key]["mean"], found[key]["se"]) == (cell.mean, cell.error)
-                assert found["paper"][key]["mean"] == row.paper[key].mean
+                if row.paper:
+                    assert found["paper"][key]["mean"] == row.paper[key].mean
 
 
 def test_text_fits_a_terminal_and_shows_the_best_in_bold() -> None:
@@ -312,7 +320,7 @@ def test_settings_tell_runs_apart(tmp_path: Path) -> None:
 def test_runs_judged_in_another_setting_than_their_own_do_not_count(tmp_path: Path) -> None:
     run = make_run(tmp_path / "bc", "bc", 0, make_record(interactive=8), make_record(duration=20))
     assert collect([run], "main")[0] == []
-    keep_evaluation(run, make_record(duration=10))
+    keep_evaluation(str(run), make_record(duration=10))
     assert len(collect([run], "main")[0]) == 1
 
 
@@ -365,7 +373,7 @@ def test_rows_must_be_comparable() -> None:
         compare(entries, "main")
     entries = full_table(2)
     entries[-1].record["config"]["rollouts"] = 4
-    with pytest.raises(ConfigError, match=r"seeds of MGAIL\+TS\+H judged in different ways"):
+    with pytest.raises(ConfigError, match=r"seeds of MGAIL\+TS\+H evaluated in different ways"):
         compare(entries, "main")
     entries[-2].record["config"]["rollouts"] = 4
     assert any("4 rollouts: MGAIL+TS+H" in note for note in compare(entries, "main").notes)
@@ -384,8 +392,8 @@ def test_notes_say_what_differs_and_what_is_outdated(tmp_path: Path) -> None:
         (run / "checkpoints" / f"step-{steps:012d}").mkdir(parents=True)
     notes = "\n".join(compare(collect([tmp_path], "main")[0], "main").notes)
     assert "runs of BC differ in steps, search.rule\n" in notes
-    assert notes.count("was judged after") == 1
-    assert "bc-1 was judged after 5 updates and has 6 now" in notes
+    assert notes.count("was evaluated after") == 1
+    assert "bc-1 was evaluated after 5 updates and has 6 now" in notes
 
 
 @pytest.mark.parametrize(
@@ -424,6 +432,7 @@ CHANGES: dict[str, Any] = {
     "temperature": 0.6,
     "retries": 1,
     "retry_above": 2.0,
+    "metric": ["my.metrics:jerk"],
 }
 
 
@@ -458,7 +467,15 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         writer.append(straight_road(4, seed=1, steps=12))
         writer.append(crossing(4, seed=1, steps=12))
     small = AgentConfig(hidden=8, head=8, num_points=10)
-    config = TrainConfig("bc", folder / "test", folder / "bc", 2, agent=small, states=8, wandb="disabled")
+    config = TrainConfig(
+        method="bc",
+        data=folder / "test",
+        out=folder / "bc",
+        steps=2,
+        agent=small,
+        states=8,
+        wandb="disabled",
+    )
     return train(config), folder / "test"
 
 
@@ -474,7 +491,9 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
     for _ in range(2):
         assert main(command) == 0
     ((name, record),) = kept_evaluations(run).items()
-    assert record == json.loads(file.read_text())
+    other = json.loads(file.read_text())
+    assert record | {"cost": 0} == other | {"cost": 0}
+    assert other["cost"]["simulation"] > 0
     assert name == evaluation_name(record)
     found = evaluate(str(run), store, EvaluateConfig(rollouts=2))
     assert record["ade"] == found.numbers()["ade"]
@@ -490,7 +509,7 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
         main(["table", "--setting", "main", "--runs", str(tmp_path), "--format", "json", "--out", str(out)])
         == 0
     )
-    assert json.loads(out.read_text())["rows"][1]["ade"]["mean"] == record["ade"]
+    assert json.loads(out.read_text())["rows"][2]["ade"]["mean"] == record["ade"]
     capsys.readouterr()
     assert main(["table", "--setting", "main", "--runs", str(run), "--paper", "womd"]) == 0
     assert f"{record['ade']:.2f}" in capsys.readouterr().out

@@ -4,26 +4,38 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
 from symphony.cli import main
-from symphony.config import AgentConfig, EvaluateConfig, TrainConfig, from_dict, to_json
+from symphony.config import (
+    METHODS,
+    AgentConfig,
+    AgentSpec,
+    EvaluateConfig,
+    TrainConfig,
+    from_dict,
+    read_json,
+    to_json,
+)
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.metrics import collisions, offroad
+from symphony.recipes import train
 from symphony.simulation import simulate
-from symphony.simulation.demonstrations import SceneDataset, experts
-from symphony.training import train
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.experts import experts
 from symphony.training.logging import read_metrics
 
 TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
@@ -41,7 +53,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def config(store: Path, out: Path, **changes: object) -> TrainConfig:
     base = TrainConfig(
-        "bc",
+        method="bc",
         data=store,
         out=out,
         steps=6,
@@ -55,24 +67,15 @@ def config(store: Path, out: Path, **changes: object) -> TrainConfig:
     return replace(base, **changes)
 
 
-def weights(run: Path) -> list[torch.Tensor]:
-    policy = load_agent(str(run)).policy
-    assert policy is not None
-    return [p.detach().clone() for p in policy.parameters()]
-
-
-def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
 @pytest.fixture(scope="module")
 def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(config(store, tmp_path_factory.mktemp("runs") / "bc"))
 
 
 def test_a_run_leaves_its_config_metrics_and_last_checkpoints(run: Path, store: Path) -> None:
-    saved = from_dict(TrainConfig, json.loads((run / "config.json").read_text()))
-    assert saved == config(store, run)
+    assert read_json(TrainConfig, run / "config.json") == config(store, run)
+    spec = AgentSpec(action_space="bicycle", dt=0.2, agent=TINY)
+    assert read_json(AgentSpec, run / "agent.json") == spec == load_agent(str(run)).spec
     assert [r["step"] for r in read_metrics(run)] == [1, 2, 3, 4, 5, 6]
     assert [int(p.name[-12:]) for p in checkpoints(run / "checkpoints")] == [2, 4, 6]
 
@@ -80,8 +83,8 @@ def test_a_run_leaves_its_config_metrics_and_last_checkpoints(run: Path, store: 
 def test_the_same_seed_gives_the_same_weights(run: Path, store: Path, tmp_path: Path) -> None:
     again = train(config(store, tmp_path / "again"))
     other = train(config(store, tmp_path / "other", seed=1))
-    assert same(weights(run), weights(again))
-    assert not same(weights(run), weights(other))
+    assert same_weights(weights(run), weights(again))
+    assert not same_weights(weights(run), weights(other))
 
 
 @pytest.mark.parametrize("stop", [2, 4])
@@ -90,11 +93,9 @@ def test_a_resumed_run_ends_with_the_same_weights(run: Path, store: Path, tmp_pa
     train(whole)
     for done in checkpoints(out / "checkpoints"):
         if int(done.name[-12:]) > stop:
-            for file in done.iterdir():
-                file.unlink()
-            done.rmdir()
+            shutil.rmtree(done)
     train(replace(whole, resume=True))
-    assert same(weights(run), weights(out))
+    assert same_weights(weights(run), weights(out))
     assert [r["step"] for r in read_metrics(out)] == [1, 2, 3, 4, 5, 6]
 
 
@@ -109,7 +110,7 @@ def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
     out = train(
         config(store, tmp_path / "long", steps=100, states=128, learning_rate=3e-3, checkpoint_every=100)
     )
-    losses, rates = ([r[name] for r in read_metrics(out)] for name in ("loss_bc", "learning_rate"))
+    losses, rates = ([r[name] for r in read_metrics(out)] for name in ("loss_policy", "learning_rate"))
     assert rates[0] == 3e-3
     assert rates[-1] == pytest.approx(3e-4, rel=0.05)
     assert losses[0] == pytest.approx(math.log(147), rel=0.1)
@@ -238,6 +239,16 @@ def test_command_line_trains_and_evaluates(
     assert picture.stat().st_size > 10_000
 
 
+def test_a_store_that_teaches_nothing_is_found_before_training(tmp_path: Path) -> None:
+    with StoreWriter(tmp_path / "store"):
+        pass
+    for method in METHODS:
+        with pytest.raises(DataError, match="no run segments") as caught:
+            train(replace(config(tmp_path / "store", tmp_path / "run"), method=method))
+        assert caught.value.file == tmp_path / "store"
+        assert not (tmp_path / "run").exists()
+
+
 def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is no agent"):
         load_agent(str(tmp_path / "nowhere"))
@@ -251,11 +262,16 @@ def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
 
 
 def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> None:
-    saved = json.loads(to_json(config(store, tmp_path)))
+    saved, file = json.loads(to_json(config(store, tmp_path))), tmp_path / "config.json"
+    file.write_text(json.dumps({**saved, "format": 99}))
+    with pytest.raises(
+        ConfigError, match=r"config\.json: configuration of another version, expected format 3"
+    ):
+        read_json(TrainConfig, file)
+    assert saved.pop("format") == 3
+    assert from_dict(TrainConfig, saved) == config(store, tmp_path)
     with pytest.raises(ConfigError, match="did you mean 'learning_rate'"):
         from_dict(TrainConfig, {**saved, "learning_rat": 1})
-    with pytest.raises(ConfigError, match="unknown format"):
-        from_dict(TrainConfig, {**saved, "format": 99})
     with pytest.raises(ConfigError, match="missing"):
         from_dict(TrainConfig, {"out": "x", "method": "bc"})
     with pytest.raises(ConfigError, match="steps must be positive"):

@@ -32,13 +32,13 @@ def refuse(path: Path, scenario: womd_pb2.Scenario) -> DataError:
 
 
 def test_readers_are_found_by_name() -> None:
-    assert readers() == ("argoverse2", "commonroad", "womd")
+    assert readers() == ("argoverse2", "commonroad", "interaction", "scenarionet", "womd")
     for name in readers():
         if name != "argoverse2" or importlib.util.find_spec("pyarrow"):
             assert get_reader(name).name == name
     with pytest.raises(ConfigError, match="did you mean 'womd'"):
         get_reader("wmod")
-    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, womd"):
+    with pytest.raises(ConfigError, match="known: argoverse2, commonroad, interaction, scenarionet, womd"):
         get_reader("?")
     with pytest.raises(ConfigError, match="'egoes'"):
         get_reader("commonroad", egoes="all")
@@ -215,6 +215,12 @@ def test_precision_far_from_the_origin(path: Path) -> None:
         for line in (feature.lane.polyline, feature.road_edge.polyline, feature.road_line.polyline):
             for point in line:
                 point.x += 4e6
+        for point in feature.crosswalk.polygon:
+            point.x += 4e6
+        if feature.HasField("stop_sign"):
+            feature.stop_sign.position.x += 4e6
+    for now in scenario.dynamic_map_states:
+        now.lane_states[0].stop_point.x += 4e6
     far = convert(path, scenario)
     np.testing.assert_allclose(far.position, near.position, atol=1e-5)
     np.testing.assert_allclose(far.road.lanes.points, near.road.lanes.points, atol=1e-5)

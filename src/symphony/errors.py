@@ -7,6 +7,19 @@ class SymphonyError(Exception):
     """Base of every error this package raises on bad input; the command line prints it without a traceback."""
 
 
+def printable(text: str, keep: str = "") -> str:
+    """Text with everything escaped that a terminal would act on, or that can't be shown, but for what is to be kept.
+
+    What files hold may be meant to move the cursor, to clear the screen or to turn the direction of writing around.
+    """
+    return "".join(
+        letter
+        if letter.isprintable() or letter in keep
+        else letter.encode("unicode_escape", "surrogatepass").decode("ascii")
+        for letter in text
+    )
+
+
 class DataError(SymphonyError):
     """Bad or unusable data.
 
@@ -25,8 +38,9 @@ class DataError(SymphonyError):
 
     def __str__(self) -> str:
         places = (("file", self.file), ("segment", self.segment), ("field", self.field))
-        where = ", ".join(f"{name} {value}" for name, value in places if value is not None)
-        return f"{where}: {self.message}" if where else self.message
+        where = ", ".join(f"{name} {printable(str(value))}" for name, value in places if value is not None)
+        message = printable(self.message, keep="\n")
+        return f"{where}: {message}" if where else message
 
     def at(self, *, file: object = None, segment: str | None = None) -> DataError:
         """The same error (same class) with the places that were still unknown filled in."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,23 +14,66 @@ from typing import Any
 from symphony.errors import DataError
 
 
-def write_file(path: Path, text: str) -> None:
-    """Write a text file that appears complete or not at all. Raises DataError if the disk refuses."""
-    new = path.with_name(f".new-{os.getpid()}-{path.name}")
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to be written in the block, of the same suffix as ``path``, which it replaces in the end.
+
+    Makes its folder. If the block fails, what was at ``path`` stays as it was and nothing is left behind. Links are
+    followed, and what is no ordinary file (a terminal, a pipe) is written to as it is.
+
+    Raises:
+        DataError: the disk refuses.
+    """
+    place = Path(os.path.realpath(path))
     with naming(path):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if place.exists() and not place.is_file():
+            yield place
+            return
+        draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
+        _remove_left(place)
         try:
-            with new.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
+            yield draft
+            with draft.open("rb+") as file:
                 os.fsync(file.fileno())
-            new.replace(path)
+            draft.replace(place)
         finally:
-            new.unlink(missing_ok=True)
+            draft.unlink(missing_ok=True)
+
+
+def _remove_left(place: Path) -> None:
+    """Drafts of this file by processes that were killed."""
+    if os.name != "posix":  # elsewhere there is no asking whether a process lives
+        return
+    pattern = re.compile(rf"\.{re.escape(place.stem)}\.(\d+)\.new{re.escape(place.suffix)}")
+    for other in place.parent.iterdir():
+        match = pattern.fullmatch(other.name)
+        if match is not None and not _lives(int(match[1])):
+            other.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass  # somebody else's
+    return True
+
+
+def write_file(path: Path, text: str) -> None:
+    """Write a text file, which appears complete or not at all, and its folder.
+
+    Raises:
+        DataError: the disk refuses.
+    """
+    with replacing(path) as draft:
+        draft.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, result: Any) -> None:
     """Write a result as JSON, making its folder; numbers that are not finite become null."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, json_text(result))
 
 
@@ -45,6 +89,20 @@ def naming(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DataError(f"can't be written: {error.strerror or error}", file=path) from error
+
+
+@contextmanager
+def locating(path: str | Path) -> Iterator[None]:
+    """Errors of the disk as they are, but those that name no file, such as of a full disk, get this one's name.
+
+    For where a :class:`DataError` means a bad record.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 def _finite(value: Any) -> Any:

@@ -22,6 +22,8 @@ STATE: Key = ("agents", "state")
 """[..., N, 4] float: x, y, heading, speed."""
 GOAL: Key = ("agents", "goal")
 """[..., N] int64: the route the agent follows, a row of its scene's table; -1 for none."""
+GOAL_SET: Key = ("agents", "goal_set")
+"""[..., N, G] bool: the feasible routes among which an expert's log does not tell; where given, instead of GOAL."""
 ACTION: Key = ("agents", "action")
 """[..., N] int64 (bicycle) or [..., N, 2] float (displacement)."""
 REWARD: Key = ("agents", "reward")
@@ -31,7 +33,11 @@ OFFROAD: Key = ("agents", "offroad")
 """[..., N, 1] bool: box centre off the drivable area at this step."""
 NOISE: Key = ("agents", "noise")
 """[..., N] or [..., N, 2] float in (0, 1): the random numbers that decide an action."""
+NOISE_PLAN: Key = "noise_plan"
+"""[..., T, N] or [..., T, N, 2] float in (0, 1): those of all steps of a rollout."""
 LOGITS: Key = ("agents", "logits")
+LOG_PROB: Key = ("agents", "action_log_prob")
+"""[..., N] float: of the action, where it is asked for."""
 SCORE: Key = ("agents", "score")
 """[..., N] float: the discriminator's logit; high where a state looks simulated."""
 SIMULATED: Key = ("agents", "simulated")
@@ -51,6 +57,8 @@ POINTS: Key = ("agents", "observation", "points")
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
 ROUTE: Key = ("agents", "observation", "route")
 """[..., N, Fr] float: the agent's route as it sees it."""
+SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE)
+"""What an agent observes and could react to."""
 GAP: Key = ("agents", "observation", "gap")
 """[..., N, O] float: signed gap to the box of each object, metres."""
 GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")

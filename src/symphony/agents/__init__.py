@@ -2,6 +2,22 @@
 
 from __future__ import annotations
 
-from symphony.agents.agent import Agent, load_agent
+from symphony.agents.agent import Agent, build_agent, load_agent
+from symphony.agents.networks import (
+    discriminator_network,
+    dynamics_of,
+    goal_network,
+    observation_of,
+    policy_network,
+)
 
-__all__ = ["Agent", "load_agent"]
+__all__ = [
+    "Agent",
+    "build_agent",
+    "discriminator_network",
+    "dynamics_of",
+    "goal_network",
+    "load_agent",
+    "observation_of",
+    "policy_network",
+]

@@ -1,26 +1,34 @@
-"""Agents by name: baselines, and the folders of trained ones."""
+"""Agents: networks with what it takes to simulate them, by name and on disk."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from symphony.agents.checkpoint import load_checkpoint
 from symphony.agents.choice import choose, split_name
 from symphony.agents.included import PREFIX
-from symphony.agents.networks import Networks, build_networks, dynamics_of, observation_config
-from symphony.config import SearchConfig, TrainConfig, from_dict
+from symphony.agents.networks import (
+    discriminator_network,
+    dynamics_of,
+    goal_network,
+    observation_of,
+    policy_network,
+)
+from symphony.config import AgentSpec, SearchConfig, read_json
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
 
 PLAYBACK = "playback"
-"""Name of the logged trajectories themselves, judged like an agent."""
+"""Name of the logged trajectories themselves, evaluated like an agent."""
+FILE = "agent.json"
+"""Of a run's folder: the agent's specification."""
 
 
 @dataclass(frozen=True)
@@ -30,26 +38,77 @@ class Agent:
     Attributes:
         name: as given by the user.
         policy: writes actions; None for log playback.
-        dynamics: the action space it acts in.
-        observation: what it sees.
-        interactive: how many agents a segment it was trained with.
+        spec: what its networks are and how it is simulated; None for baselines.
         goals: draws routes from first states; None for agents that follow none.
         discriminator: scores states; None for agents trained without.
-        search: how branches are pruned, where there is a discriminator.
-        searches: whether it is meant to be simulated with the search.
-        duration: seconds of a segment it was trained with; 0 for all.
     """
 
     name: str
     policy: TensorDictModuleBase | None
-    dynamics: Bicycle | Displacement
-    observation: ObservationConfig
-    interactive: int = 2
+    spec: AgentSpec | None = None
     goals: TensorDictModuleBase | None = None
     discriminator: TensorDictModuleBase | None = None
-    search: SearchConfig = field(default_factory=SearchConfig)
-    searches: bool = True
-    duration: int = 0
+
+    @property
+    def dynamics(self) -> Bicycle | Displacement:
+        """The action space it acts in."""
+        return Bicycle() if self.spec is None else dynamics_of(self.spec)
+
+    @property
+    def observation(self) -> ObservationConfig:
+        """What it sees, what its discriminator sees included."""
+        return ObservationConfig.nothing() if self.spec is None else observation_of(self.spec)
+
+    @property
+    def interactive(self) -> int:
+        """How many agents a segment it was trained with (2 for baselines)."""
+        return 2 if self.spec is None else self.spec.agent.interactive
+
+    @property
+    def duration(self) -> int:
+        """Seconds of a segment it was trained with; 0 for all."""
+        return 0 if self.spec is None else self.spec.duration
+
+    @property
+    def search(self) -> SearchConfig:
+        """How branches are pruned, where there is a discriminator."""
+        return SearchConfig() if self.spec is None else self.spec.search
+
+    @property
+    def searches(self) -> bool:
+        """Whether it is meant to be simulated with the search."""
+        return self.spec is not None and self.spec.searches
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """Those of its networks that there are, by name."""
+        parts = {"policy": self.policy, "goals": self.goals, "discriminator": self.discriminator}
+        return {name: module for name, module in parts.items() if module is not None}
+
+    def to(self, device: torch.device) -> Agent:
+        """Move its networks to a device, in place."""
+        for module in self.modules.values():
+            module.to(device)
+        return self
+
+    def check_step(self, dt: float) -> None:
+        """Raise ConfigError if the agent learned another time step than ``dt`` seconds."""
+        if self.spec is not None and abs(self.spec.dt - dt) > 1e-6:
+            raise ConfigError(
+                f"{self.name} learned steps of {self.spec.dt:g} s and can't drive in steps of {dt:g} s; "
+                f"convert the logs with --rate {1 / self.spec.dt:g}"
+            )
+
+
+def build_agent(name: str, spec: AgentSpec) -> Agent:
+    """An agent with fresh networks; seed torch beforehand."""
+    return Agent(
+        name,
+        policy_network(spec),
+        spec,
+        goal_network(spec) if spec.goals else None,
+        None if spec.discriminator is None else discriminator_network(spec),
+    )
 
 
 def load_agent(name: str, device: str = "cpu") -> Agent:
@@ -66,45 +125,27 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
         CheckpointError: if its weights can't be read.
     """
     if name == PLAYBACK:
-        return Agent(name, None, Bicycle(), ObservationConfig(num_points=1))
+        return Agent(name, None)
     if name == "constant_velocity":
-        return Agent(name, ConstantVelocity(Bicycle()), Bicycle(), ObservationConfig(num_points=1))
+        return Agent(name, ConstantVelocity(Bicycle()))
     folder, which = split_name(name)
-    config = read_config(folder)
-    checkpoint = choose(folder, which)
-    networks = build_networks(config)
-    load_checkpoint(checkpoint, modules=networks.present(), partial=True, restore_rng=False)
-    for module in networks.present().values():
-        module.to(torch.device(device)).eval()
-    return assemble(name, config, networks)
+    agent = build_agent(name, read_spec(folder))
+    load_checkpoint(choose(folder, which), modules=agent.modules, partial=True, restore_rng=False)
+    for module in agent.modules.values():
+        module.eval()
+    return agent.to(torch.device(device))
 
 
-def assemble(name: str, config: TrainConfig, networks: Networks) -> Agent:
-    """The agent that the networks of a run make, to be simulated as it was trained."""
-    return Agent(
-        name,
-        networks.policy,
-        dynamics_of(config),
-        observation_config(config),
-        config.agent.interactive,
-        networks.goals,
-        networks.discriminator,
-        config.search,
-        config.searches,
-        config.duration,
-    )
+def read_spec(folder: Path) -> AgentSpec:
+    """The specification of the agent that a run trains.
 
-
-def read_config(folder: Path) -> TrainConfig:
-    """The configuration a run was started with."""
-    path = folder / "config.json"
+    Raises:
+        ConfigError: if the folder is no run, or the file is damaged.
+    """
+    path = folder / FILE
     if not path.is_file():
         raise ConfigError(
             f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', '{PREFIX}NAME' or the folder of a "
-            f"run (one with a config.json)"
+            f"run (one with an {FILE})"
         )
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise ConfigError(f"{path}: not valid JSON ({error})") from error
-    return from_dict(TrainConfig, values, file=path)
+    return read_json(AgentSpec, path)

@@ -24,22 +24,17 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load as decode_tensors
 from safetensors.torch import save as encode_tensors
 from torch import Tensor, nn
 
 from symphony.agents.codec import decode, encode
-from symphony.errors import DataError
+from symphony.agents.fitting import CheckpointError, check_random_states, match_module, match_optimizer
 
 FORMAT = 1
 MANIFEST = "checkpoint.json"
 _NAME = re.compile(r"step-(\d{12})")
 _PART = re.compile(r"[A-Za-z0-9_-]+")
-
-
-class CheckpointError(DataError):
-    """A checkpoint that can't be written, read, or fitted to what it is loaded into."""
 
 
 class Stateful(Protocol):
@@ -145,8 +140,8 @@ def load_checkpoint(
         restore_rng: also set the global random states of Python, numpy and torch.
 
     Raises:
-        CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, or names,
-            shapes or types differ; names the file and the field.
+        CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, names, shapes or
+            types differ, or a number is not finite; names the file and the field.
     """
     path = Path(path)
     manifest = _read_manifest(path)
@@ -157,6 +152,7 @@ def load_checkpoint(
     states = {part: _read_part(path, manifest, part) for part in ("rng", "extra", *asked)}
     rng = states["rng"]
     own = generators or {}
+    check_random_states(path / MANIFEST, rng, own)
     _match_names(path / MANIFEST, set(own), set(rng["generators"]), partial, what="generator")
     if restore_rng and len(rng["cuda"]) not in (0, torch.cuda.device_count()):
         raise CheckpointError(
@@ -168,14 +164,14 @@ def load_checkpoint(
     for part, item in asked.items():
         where = path / f"{part}.safetensors"
         if isinstance(item, nn.Module):
-            _match_module(where, item, states[part])
+            match_module(where, item, states[part])
         elif isinstance(item, torch.optim.Optimizer):
-            _match_optimizer(where, item, states[part])
+            match_optimizer(where, item, states[part])
     for part, item in asked.items():
         try:
             item.load_state_dict(states[part])
-        except (RuntimeError, ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(str(error), file=path, field=part) from error
+        except Exception as error:  # whatever a schedule, say, makes of values it did not write
+            raise CheckpointError(f"does not fit: {error!r}", file=path / MANIFEST, field=part) from error
     for name, generator in own.items():
         generator.set_state(rng["generators"][name])
     if restore_rng:
@@ -278,22 +274,44 @@ def _flush_folder(folder: Path) -> None:
 def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / MANIFEST
     try:
-        manifest = json.loads(file.read_text())
+        manifest = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
     except OSError as error:
         raise CheckpointError(f"no checkpoint here: {error.strerror}", file=file) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"not JSON: {error}", file=file) from error
     version = manifest.get("format") if isinstance(manifest, dict) else None
-    if version != FORMAT:
+    if type(version) is not int or version != FORMAT:
         raise CheckpointError(f"format {version!r}, this version reads {FORMAT}", file=file, field="format")
-    parts = manifest.get("parts")
-    if (
-        not isinstance(manifest.get("step"), int)
-        or not isinstance(parts, dict)
-        or not {"rng", "extra"} <= set(parts)
-    ):
-        raise CheckpointError("step or parts missing", file=file, field="parts")
+    step, parts = manifest.get("step"), manifest.get("parts")
+    if type(step) is not int or not 0 <= step < 10**12:
+        raise CheckpointError(f"no number of updates: {str(step)[:40]!r}", file=file, field="step")
+    named = _NAME.fullmatch(path.name.removeprefix(".old-"))
+    if named and int(named[1]) != step:
+        raise CheckpointError(f"is {step} in the folder {path.name}", file=file, field="step")
+    if not isinstance(parts, dict) or not {"rng", "extra"} <= set(parts):
+        raise CheckpointError(
+            "parts missing: at least rng and extra are in every checkpoint", file=file, field="parts"
+        )
+    for part, entry in parts.items():
+        if not _is_entry(part, entry):
+            raise CheckpointError("no part of a checkpoint", file=file, field=f"parts.{part[:80]}")
     return manifest
+
+
+def _refuse(text: str) -> None:
+    raise ValueError(f"{text} is no JSON")
+
+
+def _is_entry(part: str, entry: Any) -> bool:
+    """Whether this is how :func:`save_checkpoint` describes a part."""
+    kind, _, name = part.partition(".")
+    known = part in ("rng", "extra") or (kind in ("module", "optimizer") and _PART.fullmatch(name))
+    if not known or not isinstance(entry, dict) or "state" not in entry:
+        return False
+    if "file" not in entry:
+        return set(entry) == {"state"}
+    checksum = entry.get("sha256")
+    return entry["file"] == f"{part}.safetensors" and isinstance(checksum, str) and len(checksum) == 64
 
 
 def _read_part(path: Path, manifest: dict[str, Any], part: str) -> Any:
@@ -303,14 +321,21 @@ def _read_part(path: Path, manifest: dict[str, Any], part: str) -> Any:
     try:
         if "file" in entry:
             content = file.read_bytes()
-            if hashlib.sha256(content).hexdigest() != entry.get("sha256"):
+            if hashlib.sha256(content).hexdigest() != entry["sha256"]:
                 raise CheckpointError("damaged: its checksum differs from the recorded one", file=file)
             tensors = decode_tensors(content)
-        return decode(entry["state"], tensors)
+        state = decode(entry["state"], tensors)
     except OSError as error:
         raise CheckpointError(f"can't be read: {error.strerror}", file=file, field=part) from error
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"can't be decoded: {error!r}", file=file, field=part) from error
+    except CheckpointError:
+        raise
+    except Exception as error:  # torch and the decoder raise much on what they did not write
+        raise CheckpointError(
+            f"can't be decoded: {error!r}"[:300], file=path / MANIFEST, field=part
+        ) from error
+    if not isinstance(state, dict):
+        raise CheckpointError("no table of values", file=path / MANIFEST, field=part)
+    return state
 
 
 def _match_names(file: Path, asked: set[str], held: set[str], partial: bool, *, what: str) -> None:
@@ -321,49 +346,6 @@ def _match_names(file: Path, asked: set[str], held: set[str], partial: bool, *, 
         )
     if surplus and not partial:
         raise CheckpointError("in the checkpoint but not asked for", file=file, field=f"{what} {surplus[0]}")
-
-
-def _match_tensor(file: Path, name: str, own: Any, saved: Any) -> None:
-    if isinstance(own, Tensor) != isinstance(saved, Tensor):
-        raise CheckpointError("a tensor on one side only", file=file, field=name)
-    if isinstance(own, Tensor) and (own.shape != saved.shape or own.dtype != saved.dtype):
-        raise CheckpointError(
-            f"saved as {saved.dtype} {tuple(saved.shape)}, expected {own.dtype} {tuple(own.shape)}",
-            file=file,
-            field=name,
-        )
-
-
-def _match_module(file: Path, module: nn.Module, saved: dict[str, Any]) -> None:
-    own = module.state_dict()
-    for name in [*own, *saved]:
-        if name not in saved or name not in own:
-            where = "the module" if name in own else "the checkpoint"
-            raise CheckpointError(f"only {where} has it", file=file, field=name)
-        _match_tensor(file, name, own[name], saved[name])
-
-
-def _match_optimizer(file: Path, optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
-    groups = saved.get("param_groups", [])
-    sizes, own_sizes = [len(g["params"]) for g in groups], [len(g["params"]) for g in optimizer.param_groups]
-    if sizes != own_sizes:
-        raise CheckpointError(
-            f"saved for groups of {sizes} parameters, expected {own_sizes}", file=file, field="param_groups"
-        )
-    for group, own in zip(groups, optimizer.param_groups, strict=True):
-        if set(group) - {"initial_lr"} != set(own) - {"initial_lr"}:
-            names = sorted(set(group) ^ set(own))
-            raise CheckpointError(
-                f"another kind of optimizer: {names} differ", file=file, field="param_groups"
-            )
-        for index, parameter in zip(group["params"], own["params"], strict=True):
-            for name, value in saved["state"].get(index, {}).items():
-                if isinstance(value, Tensor) and value.ndim and value.shape != parameter.shape:
-                    raise CheckpointError(
-                        f"saved with shape {tuple(value.shape)}, expected {tuple(parameter.shape)}",
-                        file=file,
-                        field=f"state.{index}.{name}",
-                    )
 
 
 def _rng_state(generators: Mapping[str, torch.Generator]) -> dict[str, Any]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from symphony.agents.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint
 from symphony.agents.included import is_pretrained, pretrained_folder
 from symphony.errors import ConfigError
 
@@ -27,15 +27,20 @@ class Best:
     step: int
     infractions: float
 
-    def plain(self) -> dict[str, Any]:
-        """As checkpoints keep it."""
-        return asdict(self)
-
     @classmethod
     def of(cls, extra: Mapping[str, Any]) -> Best | None:
-        """What the extra values of a checkpoint tell; None if nothing was validated up to then."""
+        """What the extra values of a checkpoint tell; None if nothing was validated up to then.
+
+        Raises:
+            CheckpointError: they tell something else.
+        """
         found = extra.get("best")
-        return None if found is None else cls(found["step"], found["infractions"])
+        if found is None:
+            return None
+        values: Any = [found.get(name) for name in ("step", "infractions")] if isinstance(found, dict) else []
+        if [type(value) for value in values] != [int, float] or not min(values) >= 0:
+            raise CheckpointError("no step with its infractions", field="extra.best")
+        return cls(*values)
 
 
 def split_name(name: str) -> tuple[Path, str]:
@@ -80,7 +85,10 @@ def choose(folder: Path, which: str = "") -> Path:
         raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
     if which == "last":
         return found[-1]
-    best = Best.of(load_checkpoint(found[-1], partial=True, restore_rng=False).extra)
+    try:
+        best = Best.of(load_checkpoint(found[-1], partial=True, restore_rng=False).extra)
+    except CheckpointError as error:
+        raise error.at(file=found[-1] / MANIFEST) from error
     if best is None:
         if which == "best":
             raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")

@@ -19,7 +19,7 @@ def is_pretrained(name: str) -> bool:
 
 def pretrained_names() -> list[str]:
     """All there are, without prefix."""
-    return sorted(path.parent.name for path in FOLDER.glob("*/config.json"))
+    return sorted(path.parent.name for path in FOLDER.glob("*/agent.json"))
 
 
 def pretrained_folder(name: str) -> Path:

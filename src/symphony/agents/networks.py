@@ -1,99 +1,109 @@
-"""The networks of an agent, built from its configuration."""
+"""The networks of an agent, from what its specification says."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import nn
 
 from symphony import keys
-from symphony.config import TrainConfig
+from symphony.config import AgentSpec
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
+from symphony.imports import build_object, load_object
 from symphony.modules import (
     FORESIGHT,
     ElementGroup,
+    SceneEncoder,
     discrete_policy,
     discriminator,
     displacement_policy,
     goal_policy,
 )
 
+GROUPS = (
+    ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
+    ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
+)
+"""What every network sees around an agent."""
+DYNAMICS: dict[str, Bicycle | Displacement] = {"bicycle": Bicycle(), "displacement": Displacement()}
 
-@dataclass
-class Networks:
-    """What is learned.
 
-    Attributes:
-        policy: actions from observations, and from a route with H.
-        goals: routes from first states; None without H.
-        discriminator: how simulated a state looks; None for behavioural cloning without TS.
+def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
+    """The action space: MGAIL needs one that its gradient can pass (paper, section V-A)."""
+    return DYNAMICS[spec.action_space]
+
+
+def observation_of(spec: AgentSpec, *, judged: bool = True) -> ObservationConfig:
+    """What the networks see.
+
+    Args:
+        spec: of the agent.
+        judged: whether the discriminator looks too; clearances are costly, and only it reads them.
     """
-
-    policy: ProbabilisticTensorDictSequential
-    goals: ProbabilisticTensorDictSequential | None = None
-    discriminator: TensorDictModule | None = None
-
-    def present(self) -> dict[str, nn.Module]:
-        """Those that there are, by name."""
-        found = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: module for name, module in found.items() if module is not None}
-
-
-def observation_config(config: TrainConfig) -> ObservationConfig:
-    """What the networks need to see."""
-    features = config.discriminator.features if config.judged else "paper"
+    features = spec.discriminator.features if judged and spec.discriminator is not None else "paper"
     return ObservationConfig(
-        num_objects=config.agent.num_objects,
-        num_points=config.agent.num_points,
-        route=config.hierarchical,
+        num_objects=spec.agent.num_objects,
+        num_points=spec.agent.num_points,
+        route=spec.goals,
         clearance=features != "paper",
         foresight=FORESIGHT if features == "foresight" else (),
     )
 
 
-def dynamics_of(config: TrainConfig) -> Bicycle | Displacement:
-    """The action space: MGAIL needs one that its gradient can pass (paper, section V-A)."""
-    return Displacement() if config.adversarial else Bicycle()
-
-
-def build_networks(config: TrainConfig) -> Networks:
-    """Freshly initialised networks; seed torch beforehand."""
-    groups = (
-        ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
-        ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
-    )
-    own_keys = (keys.OWN, keys.ROUTE) if config.hierarchical else (keys.OWN,)
-    own = SELF_FEATURES + (ROUTE_FEATURES if config.hierarchical else 0)
-    agent, judge = config.agent, config.discriminator
-    head, sees, dynamics = (agent.head, agent.head), observation_config(config), dynamics_of(config)
+def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
+    """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
+    bicycle, or a Gaussian over displacements. Seed torch beforehand.
+    """
+    if spec.agent.policy != "paper":
+        return build_object(spec.agent.policy, spec)
+    sizes: dict[str, Any] = {
+        "hidden": spec.agent.hidden,
+        "head": (spec.agent.head, spec.agent.head),
+        "own_keys": _own_keys(spec),
+        "encoder": _encoder(spec),
+    }
+    dynamics = dynamics_of(spec)
     if isinstance(dynamics, Bicycle):
-        policy = discrete_policy(
-            own,
-            groups,
-            actions=dynamics.num_actions,
-            hidden=agent.hidden,
-            head=head,
-            own_keys=own_keys,
-        )
-    else:
-        policy = displacement_policy(
-            own, groups, hidden=agent.hidden, head=head, size_scale=sees.size_scale, own_keys=own_keys
-        )
-    networks = Networks(policy)
-    if config.hierarchical:
-        networks.goals = goal_policy(SELF_FEATURES, groups, CHOICE_FEATURES, hidden=agent.hidden)
-    if config.judged:
-        networks.discriminator = discriminator(
-            own,
-            OBJECT_FEATURES,
-            POINT_FEATURES,
-            own_keys=own_keys,
-            radius=judge.radius / sees.distance_scale,
-            hidden=judge.hidden,
-            head=(judge.head,),
-            features=judge.features,
-        )
-    return networks
+        return discrete_policy(_own_features(spec), GROUPS, actions=dynamics.num_actions, **sizes)
+    scale = observation_of(spec).size_scale
+    return displacement_policy(_own_features(spec), GROUPS, dt=spec.dt, size_scale=scale, **sizes)
+
+
+def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
+    """Routes from first states, by an encoder of its own (paper, section III-B)."""
+    return goal_policy(
+        SELF_FEATURES, GROUPS, CHOICE_FEATURES, hidden=spec.agent.hidden, encoder=_encoder(spec)
+    )
+
+
+def discriminator_network(spec: AgentSpec) -> TensorDictModule:
+    """How simulated a state looks, given the goal."""
+    config = spec.discriminator
+    if config is None:
+        raise ValueError("the specification has no discriminator")
+    if config.network != "paper":
+        return build_object(config.network, spec)
+    return discriminator(
+        _own_features(spec),
+        OBJECT_FEATURES,
+        POINT_FEATURES,
+        own_keys=_own_keys(spec),
+        radius=config.radius / observation_of(spec).distance_scale,
+        hidden=config.hidden,
+        head=(config.head,),
+        features=config.features,
+    )
+
+
+def _own_keys(spec: AgentSpec) -> tuple[keys.Key, ...]:
+    return (keys.OWN, keys.ROUTE) if spec.goals else (keys.OWN,)
+
+
+def _own_features(spec: AgentSpec) -> int:
+    return SELF_FEATURES + (ROUTE_FEATURES if spec.goals else 0)
+
+
+def _encoder(spec: AgentSpec) -> Any:
+    return SceneEncoder if spec.agent.encoder == "paper" else load_object(spec.agent.encoder)

@@ -6,19 +6,36 @@ imports what it needs when it runs.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 
 import tyro
 
+from symphony import allocator
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, export, figure, plot, profiles, report, table, train, view
-from symphony.errors import ConfigError, SymphonyError
+from symphony.cli import (
+    data,
+    demo,
+    evaluate,
+    export,
+    figure,
+    plot,
+    profiles,
+    report,
+    table,
+    train,
+    view,
+    wosac,
+)
+from symphony.errors import ConfigError, SymphonyError, printable
 
 __all__ = ["main"]
 
-FAILED, USAGE, INTERRUPTED = 1, 2, 130
+FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
@@ -36,6 +53,7 @@ app.command(plot.app, name="plot", help=plot.__doc__)
 app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
+app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="demo")(demo.Demo)
 
 
@@ -46,9 +64,12 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the arguments, by default those of the process.
 
     Returns:
-        Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
+        Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 143 terminated.
     """
-    args = sys.argv[1:] if args is None else list(args)
+    if args is None:
+        allocator.tune()  # only where the process is ours
+        args = sys.argv[1:]
+    args = list(args)
     if args == ["--version"]:
         return _guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
@@ -67,15 +88,40 @@ def main(args: Sequence[str] | None = None) -> int:
     return _guarded(command.run)
 
 
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end (SIGTERM); whatever tidies up after an interrupt does so after this."""
+
+
+@contextlib.contextmanager
+def _ended_politely() -> Iterator[None]:
+    """Inside, SIGTERM ends the work as an interrupt does, where there are signals to be had."""
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: tidying up must not be cut short
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def _guarded(action: Callable[[], object]) -> int:
     """Run something; errors that a user can meet become one line and an exit status."""
     try:
-        action()
-        sys.stdout.flush()
+        with _ended_politely():
+            action()
+            sys.stdout.flush()
     except BrokenPipeError:
         # The reader of our output has gone, say `head`; Python would complain once more as it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+    except Terminated:
+        return _complain("terminated", TERMINATED)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except (SymphonyError, OSError) as error:
@@ -89,5 +135,6 @@ def _complain(error: object, status: int) -> int:
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename is not None else ""
         error = f"{where}{error.strerror}"
-    sys.stderr.write(f"symphony: error: {error}\n")
+    text = printable(str(error), keep="\n")
+    sys.stderr.write(f"symphony: error: {text}\n")
     return status

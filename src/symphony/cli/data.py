@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json as jsonlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from symphony.cli.generate import Generate, Quality
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, printable
+
+_WINDOWS = ("window", "stride", "motion")
+"""Options of the INTERACTION reader alone."""
 
 app = tyro.extras.SubcommandApp()
 app.command(name="generate")(Generate)
@@ -27,9 +30,9 @@ class Convert:
     stopped when the same command is given again.
     """
 
-    format: tyro.conf.Positional[Literal["womd", "commonroad", "argoverse2"]]
+    format: tyro.conf.Positional[Literal["womd", "commonroad", "argoverse2", "interaction", "scenarionet"]]
     """Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion forecasting
-    (Parquet, each with its map beside it)."""
+    (Parquet, each with its map beside it), INTERACTION (CSV with Lanelet2 maps), ScenarioNet (pickle)."""
     files: Annotated[
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="FILE ...", help_behavior_hint="(required)"),
@@ -44,8 +47,20 @@ class Convert:
     smooth: float = 0.0
     """Smoothing of the tracks before they are resampled: sigma in seconds, 0 for none."""
     egos: Literal["one", "all"] = "one"
-    """CommonRoad, which names no ego vehicle: make one segment of each scenario, with the ego that has the most
-    moving vehicles around it, or one for every moving vehicle seen throughout."""
+    """CommonRoad and INTERACTION, which name no ego vehicle: make one segment of each scenario or window, with the
+    ego that has the most moving vehicles around it, or one for every moving vehicle seen throughout."""
+    window: float = 10.0
+    """INTERACTION: seconds of the segments that recordings are cut into."""
+    stride: float | None = None
+    """INTERACTION: seconds between the starts of two such segments; without it, one begins where another ends."""
+    motion: Literal["logged", "positions"] = "logged"
+    """INTERACTION: take velocities and headings as logged, or compute them from the positions (for files that are
+    refused because theirs don't fit)."""
+    radius: float | None = None
+    """Keep what comes within so many metres of the ego's path, of map and agents: for sources that give whole
+    districts, whose maps would exceed the paper's limit (ScenarioNet)."""
+    exclude_overlaps: bool = False
+    """Leave out segments in whose log a moving vehicle's box overlaps another box."""
     append: bool = False
     """Add to a store that exists; what it holds already is left as it is."""
     workers: int = 1
@@ -59,14 +74,28 @@ class Convert:
             raise ConfigError("no files given")
         if not self.rate > 0:
             raise ConfigError(f"--rate must be positive, is {self.rate}")
+        if not 0.2 <= self.rate <= 200:
+            raise ConfigError(f"--rate must be between 0.2 and 200 steps per second, is {self.rate:g}")
         if self.interactive < 1:
             raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
         if not self.smooth >= 0:
             raise ConfigError(f"--smooth must not be negative, is {self.smooth}")
         if self.workers < 1:
             raise ConfigError(f"--workers must be at least 1, is {self.workers}")
-        if self.egos == "all" and self.format != "commonroad":
-            raise ConfigError(f"--egos all is for commonroad; {self.format} names its ego vehicle")
+        if self.radius is not None and not self.radius > 0:
+            raise ConfigError(f"--radius must be positive, is {self.radius}")
+        if self.egos == "all" and self.format not in {"commonroad", "interaction"}:
+            raise ConfigError(
+                f"--egos all is for commonroad and interaction; {self.format} names its ego vehicle"
+            )
+        given = [f.name for f in fields(self) if f.name in _WINDOWS and getattr(self, f.name) != f.default]
+        if given and self.format != "interaction":
+            raise ConfigError(f"--{given[0]} is for interaction")
+
+    def _options(self) -> dict[str, Any] | None:
+        """Arguments of the reader."""
+        names = {"commonroad": ("egos",), "interaction": ("egos", *_WINDOWS)}.get(self.format)
+        return None if names is None else {name: getattr(self, name) for name in names}
 
     def run(self) -> None:
         """Convert, showing how far it is, and report."""
@@ -95,7 +124,9 @@ class Convert:
                     append=self.append,
                     workers=self.workers,
                     engine=self.engine,
-                    reader_options={"egos": self.egos} if self.format == "commonroad" else None,
+                    exclude_overlaps=self.exclude_overlaps,
+                    radius=self.radius,
+                    reader_options=self._options(),
                     progress=show,
                 )
             except KeyboardInterrupt:
@@ -142,6 +173,43 @@ class Info:
             _print_info(found)
 
 
+@app.command(name="verify")
+@dataclass(frozen=True)
+class Verify:
+    """Read a whole store and compare every segment with the hash that was written with it, and with the schema.
+
+    Training and evaluation do so for each segment when they first read it.
+    """
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of the store."""
+    json: bool = False
+    """Print the result as JSON."""
+
+    def run(self) -> None:
+        """Verify, showing how far it is, and print."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from symphony.data.store import SegmentStore
+
+        store = SegmentStore(self.store)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("segments"),
+        )
+        with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+            task = bar.add_task("Verifying", total=len(store))
+            store.verify(lambda done, total: bar.update(task, completed=done, total=total))
+        found = {"path": str(store.path), "segments": len(store), "checksum": store.checksum()}
+        if self.json:
+            _write(jsonlib.dumps(found, indent=2))
+        else:
+            _write(f"{len(store)} segments are what was written; checksum {found['checksum']}")
+
+
 @app.command(name="plot")
 @dataclass(frozen=True)
 class Plot:
@@ -164,7 +232,9 @@ class Plot:
         from symphony.data.selection import interactive_choice
         from symphony.data.store import SegmentStore
         from symphony.render import plot_segment
+        from symphony.render.style import picture_path
 
+        picture_path(self.out)
         store = SegmentStore(self.store)
         segment = store[segment_index(store, self.segment)]
         if not 0 <= self.step < segment.num_steps:
@@ -182,12 +252,18 @@ def _write(text: str) -> None:
     print(text)  # noqa: T201
 
 
+def _shown(text: str) -> str:
+    """Text from files for a table: neither markup nor what a terminal acts on."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
 def _print_report(report: Any, out: Path) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
-    table = Table("", "segments", title=escape(str(out)), title_justify="left", title_style="bold")
+    table = Table("", "segments", title=_shown(str(out)), title_justify="left", title_style="bold")
     table.columns[1].justify = "right"
     table.add_row("converted", str(report.converted))
     if report.present:
@@ -195,8 +271,14 @@ def _print_report(report: Any, out: Path) -> None:
     for reason, count in _exclusions(report.exclusions):
         table.add_row(f"excluded: {reason}", str(count))
     for reason, count in report.problems.items():
-        table.add_row(f"skipped: {escape(reason)}", str(count))
+        table.add_row(f"skipped: {_shown(reason)}", str(count))
+    for reason, count in report.odd.items():
+        table.add_row(f"odd: {_shown(reason)}", str(count))
+    if report.overlaps:
+        table.add_row("converted with boxes that overlap in the log", str(report.overlaps))
     Console().print(table)
+    if report.warning:
+        Console(stderr=True).print(f"[yellow]warning:[/] {_shown(report.warning)}", soft_wrap=True)
 
 
 def _exclusions(found: dict[str, int]) -> list[tuple[str, int]]:
@@ -214,7 +296,6 @@ def _unfinished_row(found: dict[str, int] | None) -> list[tuple[str, str]]:
 
 def _print_info(found: dict[str, Any]) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     def span(name: str, unit: str = "") -> str:
@@ -228,6 +309,7 @@ def _print_info(found: dict[str, Any]) -> None:
     sources = ", ".join(f"{count} from {source}" for source, count in found["sources"].items())
     rows = [
         ("segments", f"{found['segments']}" + (f" ({sources})" if sources else "")),
+        ("recordings", f"{found['groups']}"),
         ("agents", f"{found['agents']}"),
         ("traffic lights", f"{found['signals']}"),
         ("steps", span("steps")),
@@ -243,14 +325,16 @@ def _print_info(found: dict[str, Any]) -> None:
         *((f"  {reason}", str(count)) for reason, count in _exclusions(found["exclusions"])),
         ("skipped", f"{sum(found['problems'].values())}"),
         *((f"  {reason}", str(count)) for reason, count in found["problems"].items()),
+        *(("odd: " + what, str(count)) for what, count in found["odd"].items()),
+        *([("boxes overlap in the log of", str(found["overlaps"]))] if found["overlaps"] else []),
         *_unfinished_row(found["unfinished"]),
     ]
     table = Table(
-        show_header=False, box=None, pad_edge=False, title=escape(found["path"]), title_style="bold"
+        show_header=False, box=None, pad_edge=False, title=_shown(found["path"]), title_style="bold"
     )
     table.title_justify = "left"
     for name, value in rows:
-        table.add_row(escape(name), escape(value))
+        table.add_row(_shown(name), _shown(value))
     Console().print(table)
 
 

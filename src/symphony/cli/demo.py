@@ -16,7 +16,7 @@ from symphony.files import write_json
 class Demo:
     """Learn from the built-in data, evaluate, and draw what came out: some minutes on a laptop.
 
-    An agent that comes with the package is judged beside it.
+    An agent that comes with the package is evaluated beside it.
     """
 
     out: Path = Path("out/demo")
@@ -34,29 +34,41 @@ class Demo:
 
         from rich.console import Console
 
-        from symphony.agents import load_agent
-        from symphony.cli.pictures import draw_compared
         from symphony.data.builtin import builtin_store
-        from symphony.training import train
+        from symphony.data.store import SegmentStore
+        from symphony.evaluation.pictures import ClipKeeper, draw_clips
+        from symphony.recipes import train
+        from symphony.simulation.demonstrations import evenly_spaced
 
         console = Console()
         began = time.perf_counter()
         run, picture, numbers = self.out / "bc", self.out / "rollouts.png", self.out / "metrics.json"
         if (run / "config.json").is_file():
             shutil.rmtree(run)
-        learn, judge = builtin_store("train"), builtin_store("test")
+        learn, test = builtin_store("train"), builtin_store("test")
         console.print(f"Learning to drive from {learn} (behavioural cloning, {self.steps} updates)")
         # Half the states and fewer points than by default: more, cheaper updates suit so few segments.
         small = AgentConfig(num_points=128)
         train(
             TrainConfig(
-                "bc", learn, run, steps=self.steps, seed=self.seed, agent=small, states=512, wandb="disabled"
+                method="bc",
+                data=learn,
+                out=run,
+                steps=self.steps,
+                seed=self.seed,
+                agent=small,
+                states=512,
+                wandb="disabled",
             )
         )
-        console.print(f"Simulating {judge}, which it has not seen")
+        console.print(f"Simulating {test}, which it has not seen")
         config = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
         agents = ["playback", "constant_velocity", str(run), PRETRAINED]
-        results = [evaluate_with_bar(name, judge, config) for name in agents]
+        items = evenly_spaced(len(SegmentStore(test)), PANELS)
+        drawn = {
+            name: ClipKeeper(items, title=f"{title}: ") for name, title in zip(agents, NAMES, strict=True)
+        }
+        results = [evaluate_with_bar(name, test, config, observe=drawn[name]) for name in agents]
         rows = [{**result.numbers(), "agent": name} for result, name in zip(results, NAMES, strict=True)]
         print_metrics(rows, title="Built-in test segments")
         console.print(
@@ -66,12 +78,13 @@ class Demo:
         )
         seconds = time.perf_counter() - began
         write_json(numbers, {"rows": rows, "steps": self.steps, "seconds": round(seconds, 1)})
-        drawn = {NAMES[i]: load_agent(agents[i]) for i in (2, 3)}
-        draw_compared(drawn, judge, picture, results[-1].interactive, seed=self.seed)
+        draw_clips([clip for name in agents[2:] for clip in drawn[name].clips], picture, columns=len(items))
         console.print(f"Done in {seconds:.0f} s.")
         for what, where in (("picture of rollouts", picture), ("numbers", numbers), ("trained agent", run)):
             console.print(f"{what + ':':21}{where}", soft_wrap=True)
 
 
+PANELS = 3
+"""Run segments in the picture."""
 PRETRAINED = "pretrained:bc_ts_h"
 NAMES = ("log playback", "constant velocity", "BC", "included BC+TS+H")

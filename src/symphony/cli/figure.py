@@ -19,7 +19,7 @@ app = tyro.extras.SubcommandApp()
 class Curvature:
     """Draw how often the policy, and the log, visit branching regions of each average curvature.
 
-    A panel for each run; left turns are positive (in the paper, right turns). With --data the runs are judged as
+    A panel for each run; left turns are positive (in the paper, right turns). With --data the runs are evaluated as
     `symphony evaluate` does, and keep it; without, what they keep already is drawn.
     """
 
@@ -82,8 +82,12 @@ class Curvature:
 
         if self.data is None:
             return choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]
-        from symphony.cli.evaluate import judge
+        from symphony.agents import load_agent
+        from symphony.cli.evaluate import evaluate_with_bar
+        from symphony.data.store import SegmentStore
+        from symphony.evaluation.records import evaluation_record, keep_evaluation
 
-        judged = judge(str(run), self.data, self.config)
-        judged.keep()
-        return judged.record
+        agent, store = load_agent(str(run), self.config.device), SegmentStore(self.data)
+        record = evaluation_record(agent, evaluate_with_bar(agent, store, self.config, baselines=True), store)
+        keep_evaluation(agent.name, record)
+        return record

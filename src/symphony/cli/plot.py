@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from symphony.agents import Agent
     from symphony.data.store import SegmentStore
-    from symphony.render import SearchTree
-    from symphony.simulation.demonstrations import SceneDataset
 
 app = tyro.extras.SubcommandApp()
 
@@ -34,106 +32,38 @@ class Tree:
     """The segment's id, or its number in the store."""
     out: Path
     """Picture to write (.png, .pdf or .svg)."""
-    branches: int = 16
-    """Branches of the tree."""
-    prune_every: int = 0
-    """Steps between prunings; 0 takes those of the run."""
-    logged_goals: bool = False
-    """Give agents the routes of the log instead of sampled ones."""
-    seed: int = 0
-    """Of everything drawn at random: with the seed of an evaluation it is a tree that was judged there."""
-    device: str = "cpu"
-    """`cpu`, `cuda` or `cuda:N`."""
-
-    def __post_init__(self) -> None:
-        if self.branches < 1:
-            raise ConfigError(f"--branches must be at least 1, is {self.branches}")
-        if self.prune_every < 0:
-            raise ConfigError(f"--prune-every must not be negative, is {self.prune_every}")
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> None:
         """Search and draw."""
         from symphony.agents import load_agent
         from symphony.data.store import SegmentStore
+        from symphony.evaluation.pictures import search_tree
         from symphony.render import plot_search
         from symphony.render.style import picture_path
         from symphony.simulation.demonstrations import SceneDataset
 
         picture_path(self.out)
-        agent = load_agent(self.agent, self.device)
-        if agent.discriminator is None:
-            raise ConfigError(
-                f"{agent.name} has no discriminator to search by: it was not trained with tree search "
-                f"(methods bc_ts and bc_ts_h)"
-            )
+        agent, config = load_agent(self.agent, self.config.device), self.config
         store = SegmentStore(self.data)
-        chosen = [segment_index(store, self.segment)]
-        routes = agent.goals is not None
-        dataset = SceneDataset(store, agent.interactive, agent.dynamics, chosen, routes=routes)
-        plot_search(dataset.segment(0), self._tree(agent, dataset), self.out)
-
-    def _tree(self, agent: Agent, dataset: SceneDataset) -> SearchTree:
-        """Search as the evaluator does in its first tree of a segment."""
-        import torch
-
-        from symphony import keys
-        from symphony.envs.driving import DrivingEnv
-        from symphony.render import SearchTree
-        from symphony.simulation.rollouts import plant, pruning_rule, search
-
-        scene = dataset.scene(0).to(torch.device(self.device))
-        env = DrivingEnv(scene, agent.dynamics, agent.observation)
-        start = plant(
-            env,
-            agent.goals,
-            trees=1,
-            branches=self.branches,
-            seed=self.seed,
-            logged_goals=self.logged_goals,
-        )[:, 0]
-        routes = []
-        if agent.goals is not None:
-            routes = [
-                scene.route[0, n, route, : scene.route_count[0, n, route]].cpu().numpy()
-                if route >= 0
-                else None
-                for n, route in enumerate(start.get(keys.GOAL)[0, 0].tolist())
-            ]
-        every = self.prune_every or agent.search.prune_every
-        with torch.no_grad():
-            result = search(
-                env,
-                agent.policy,
-                agent.discriminator,
-                start,
-                seed=self.seed,
-                rule=pruning_rule(agent.search),
-                prune_every=every,
-                keep_tree=True,
-            )
-        assert result.tree is not None  # noqa: S101 - asked for just above
-        state, collision, offroad = (
-            result.tree.get(("next", *key))[0].cpu().numpy()
-            for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)
+        dataset = SceneDataset(
+            store,
+            config.interactive or agent.interactive,
+            agent.dynamics,
+            [segment_index(store, self.segment)],
+            routes=agent.goals is not None,
+            duration=config.duration or agent.duration,
         )
-        agents = torch.where(scene.interactive_valid, scene.interactive, -1)[0]
-        return SearchTree(
-            position=state[..., :2],
-            score=result.simulated_scores[0].cpu().numpy(),
-            parents=result.parents[0].cpu().numpy(),
-            reaches_leaf=result.reaches_leaf[0].cpu().numpy(),
-            prune_every=every,
-            agents=agents.cpu().numpy(),
-            collision=collision[..., 0],
-            offroad=offroad[..., 0],
-            routes=routes,
-        )
+        plot_search(dataset.segment(0), search_tree(agent, dataset, 0, config), self.out)
 
 
 @app.command(name="rollouts")
 @dataclass(frozen=True)
 class Rollouts:
-    """Draw what an agent does beside the log, or animate it."""
+    """Draw what an agent does beside the log, or animate it.
+
+    The rollouts are those that `symphony evaluate` counts with the same settings.
+    """
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
     """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback` or `constant_velocity`."""
@@ -145,42 +75,45 @@ class Rollouts:
     """Their ids, or their numbers in the store; by default some, spread evenly over the store."""
     panels: int = 3
     """How many, if none are named."""
-    rollouts: int = 1
-    """Of each segment."""
-    interactive: int = 0
-    """Interactive agents per run segment; 0 takes what the agent was trained with (2 for the baselines)."""
-    seed: int = 0
-    """Of everything drawn at random."""
-    device: str = "cpu"
-    """`cpu`, `cuda` or `cuda:N`."""
+    drawn: int = 8
+    """Rollouts drawn of each segment, at most."""
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
-        for name in ("panels", "rollouts"):
+        for name in ("panels", "drawn"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"--{name} must be at least 1, is {getattr(self, name)}")
-        if self.interactive < 0:
-            raise ConfigError(f"--interactive must not be negative, is {self.interactive}")
 
     def run(self) -> None:
         """Simulate and draw."""
         from symphony.agents import load_agent
-        from symphony.cli.pictures import draw_rollouts
+        from symphony.cli.evaluate import segments_bar
         from symphony.data.store import SegmentStore
+        from symphony.evaluation.evaluator import evaluate_dataset
+        from symphony.evaluation.pictures import ClipKeeper, check_picture, draw_clips
+        from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
 
-        agent, store = load_agent(self.agent, self.device), SegmentStore(self.data)
+        check_picture(self.out)
+        agent, store, config = (
+            load_agent(self.agent, self.config.device),
+            SegmentStore(self.data),
+            self.config,
+        )
         if len(store) == 0:
             raise DataError("the store holds no run segments", file=store.path)
-        draw_rollouts(
-            agent,
-            self.data,
-            self.out,
-            self.interactive or agent.interactive,
-            seed=self.seed,
-            panels=self.panels,
-            segments=[segment_index(store, name) for name in self.segments],
-            rollouts=self.rollouts,
-            device=self.device,
+        chosen = [segment_index(store, name) for name in self.segments]
+        dataset = SceneDataset(
+            store,
+            config.interactive or agent.interactive,
+            agent.dynamics,
+            chosen or evenly_spaced(len(store), self.panels),
+            routes=agent.goals is not None,
+            duration=config.duration or agent.duration,
         )
+        clips = ClipKeeper(range(len(dataset)), self.drawn)
+        with segments_bar(f"simulating {agent.name}") as advance:
+            evaluate_dataset(agent, dataset, config, advance, observe=clips)
+        draw_clips(clips.clips, self.out)
 
 
 @app.command(name="curves")

@@ -1,4 +1,4 @@
-"""What the recipes share: train one method, judge it beside log playback, keep the numbers."""
+"""What the scripts of the recipes share: train, evaluate beside the baselines, keep the numbers."""
 
 from __future__ import annotations
 
@@ -10,36 +10,38 @@ from typing import Annotated
 
 import tyro
 
-from symphony.cli.evaluate import judge as judge_agent
-from symphony.cli.profiles import WORDS, Profile, expanded
-from symphony.cli.tables import print_metrics
-from symphony.config import EvaluateConfig, Method, TrainConfig
+from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
+from symphony.cli.profiles import WORDS, expanded
+from symphony.config import EvaluateConfig, Method, Profile, TrainConfig
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """Train on one store, judge on another beside log playback."""
+class Arguments:
+    """Train on one store, evaluate on another beside log playback and constant velocity."""
 
     training: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """The training run."""
     test: Path
-    """Store of run segments to judge it on."""
+    """Store of run segments to evaluate it on."""
     rollouts: int = 16
     """Simulations per run segment."""
     profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
 
 
-def parse(method: Method, description: str | None, args: Sequence[str] | None = None) -> Recipe:
-    """The recipe of one method from command-line arguments (those of the process by default)."""
+def run(method: Method, description: str | None, args: Sequence[str] | None = None) -> None:
+    """Run the recipe of a method with command-line arguments, by default those of the process."""
+    from symphony.agents import load_agent
+    from symphony.data.store import SegmentStore
+    from symphony.evaluation.records import evaluation_record, keep_evaluation
+    from symphony.recipes import train
+
     given = list(sys.argv[1:] if args is None else args)
-    return tyro.cli(Recipe, description=description, args=expanded([method, *given]))
-
-
-def judge(recipe: Recipe, run: Path) -> None:
-    """Evaluate a trained run, print its row and keep it where `symphony table` looks for it."""
+    settings = tyro.cli(Arguments, description=description, args=expanded([method, *given]))
+    folder, store = train(settings.training), SegmentStore(settings.test)
     config = EvaluateConfig(
-        rollouts=recipe.rollouts, seed=recipe.training.seed, device=recipe.training.device
+        rollouts=settings.rollouts, seed=settings.training.seed, device=settings.training.device
     )
-    found = judge_agent(str(run), recipe.test, config)
-    print_metrics(found.rows, title=str(recipe.test))
-    found.keep()
+    agent = load_agent(str(folder), config.device)
+    found = evaluate_with_bar(agent, store, config, baselines=True)
+    print_evaluation(found, settings.test)
+    keep_evaluation(agent.name, evaluation_record(agent, found, store))

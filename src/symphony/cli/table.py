@@ -9,8 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from symphony.config import PaperData, Setting, TableFormat
+from symphony.config import Method, PaperData, Setting, TableFormat
 from symphony.errors import ConfigError
+from symphony.files import write_file
 
 NAMED = 5
 """Runs left out for the same reason that are named."""
@@ -33,6 +34,8 @@ class Table:
     anything. Of several names, the first that fits one decides."""
     paper: PaperData | None = None
     """Show the paper's own figures on this data set beside ours."""
+    paired: Annotated[Method | None, tyro.conf.arg(metavar="METHOD")] = None
+    """Also print every method less this one, paired over run segments."""
     format: TableFormat = "text"
     """How it is written."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -48,15 +51,18 @@ class Table:
 
         from symphony.evaluation.comparison import collect, compare
         from symphony.evaluation.formats import FORMATS, print_text
+        from symphony.evaluation.paired import differences
 
         entries, left_out = collect(self.runs, self.setting, self.evaluation)
         for reason, folders in left_out.items():
             more = f" and {len(folders) - NAMED} more" if len(folders) > NAMED else ""
             sys.stderr.write(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}\n")
         comparison = compare(entries, self.setting, self.paper)
+        if self.paired is not None:
+            for difference in differences(entries, self.paired):
+                sys.stderr.write(f"{difference.text()}\n")
         if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(FORMATS[self.format](comparison), encoding="utf-8")
+            write_file(self.out, FORMATS[self.format](comparison))
         elif self.format == "text" and (console := Console()).is_terminal:
             print_text(comparison, console)
         else:

@@ -20,6 +20,8 @@ KINDS = (
     ("crossing", "crossing"),
     ("oncoming", "oncoming"),
     ("sideswipe", "sideswipe"),
+    ("pedestrian", "into a pedestrian"),
+    ("cyclist", "into a cyclist"),
     ("other", "other"),
 )
 """Kinds of first collision (see :class:`symphony.metrics.CollisionKind`) and their words."""
@@ -33,27 +35,45 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     from rich.table import Table
 
     # Narrow enough for 80 columns, so the divergence goes without its error.
-    table = Table(title=escape(title) or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("agent", overflow="fold")
+    table = Table(
+        title=escape(title) or None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("agent", no_wrap=True)
     for _, heading, _ in COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         errors = {name: row.get(f"{name}_se") for name, _, _ in COLUMNS if name != "curvature_jsd"}
         cells = [_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
-        table.add_row(escape(str(row["agent"])), *cells)
+        table.add_row(escape(short_name(str(row["agent"]))), *cells)
     console = Console()
     console.print(table)
     first = rows[0]
     for row in rows:
         if row["collision_rate"] > 0 and "collision_into_leader" in row:
-            parts = ", ".join(f"{row[f'collision_{kind}']:.1f} {text}" for kind, text in KINDS)
-            console.print(f"{escape(str(row['agent']))}: collisions, % of rollouts: {parts}", style="dim")
+            parts = ", ".join(f"{row[name]:.1f} {text}" for name, text in _kinds_of(row))
+            console.print(
+                f"{escape(short_name(str(row['agent'])))}: collisions, % of rollouts: {parts}", style="dim"
+            )
     most = max(row["rollouts"] for row in rows)
     console.print(
         f"{first['segments']} run segments, {first['interactive']} interactive agents each, up to {most} "
         f"rollouts; ± standard error over segments; seed {first['seed']}",
         style="dim",
     )
+
+
+def short_name(agent: str) -> str:
+    """An agent's name as tables show it: that of its folder."""
+    return agent.rpartition("/")[2] or agent
+
+
+def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
+    """Names and words of the kinds a row has; older results know no pedestrians and cyclists."""
+    return [(f"collision_{kind}", text) for kind, text in KINDS if f"collision_{kind}" in row]
 
 
 def _cell(value: float, error: float | None, digits: int) -> str:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from symphony.cli.profiles import WORDS, Profile
-from symphony.config import TrainConfig
+from symphony.cli.profiles import WORDS
+from symphony.config import Profile, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,12 @@ class Train:
         """Train them."""
         from rich.console import Console
 
-        from symphony.training import train
+        from symphony.recipes import train
 
         folder = train(self.config)
         # Of the processes that torchrun starts, one speaks.
         if os.environ.get("RANK", "0") == "0":
             Console().print(
-                f"Trained agent in {folder}; judge it: symphony evaluate {folder} --data DIR", soft_wrap=True
+                f"Trained agent in {folder}; evaluate it: symphony evaluate {folder} --data DIR",
+                soft_wrap=True,
             )

@@ -1,24 +1,32 @@
-"""Beam search over simulated futures, as a function and as a TorchRL collector. Works with any environment."""
+"""Beam search over simulated futures, as a function and as a TorchRL collector.
+
+Works with environments that keep all of their state in the TensorDict, whatever they simulate; not with those that
+wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (ParallelEnv).
+"""
 
 from __future__ import annotations
 
-from symphony.collectors.beam_search import beam_search, branch
-from symphony.collectors.collector import BeamSearchCollector, with_rows
+from symphony.collectors.beam_search import beam_search
+from symphony.collectors.branching import branch, check_branching, with_rows
+from symphony.collectors.collector import BeamSearchCollector
 from symphony.collectors.result import BeamSearchResult, lineage
-from symphony.collectors.rules import KeepAll, KeepBest, PruningRule, Systematic
+from symphony.collectors.rules import GroupRule, KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
 from symphony.collectors.scores import Aggregate, KeyScore, max_then_sum, mean_then_sum
 
 __all__ = [
     "Aggregate",
     "BeamSearchCollector",
     "BeamSearchResult",
+    "GroupRule",
     "KeepAll",
     "KeepBest",
     "KeyScore",
     "PruningRule",
+    "ReplaceBad",
     "Systematic",
     "beam_search",
     "branch",
+    "check_branching",
     "lineage",
     "max_then_sum",
     "mean_then_sum",

@@ -1,9 +1,9 @@
-"""Beam search over simulated futures (paper, section on beam search).
+"""Beam search over simulated futures of environments that keep their state in the TensorDict (paper, section IV-A).
 
 S branches of each row are simulated side by side. After every T_p steps each gets a total, aggregated from the
 scores of its steps and agents; the branches with *high* totals are dropped and the others copied into the free
 slots. Nothing here knows what is simulated: rows, branches and agents are batch dimensions of any TorchRL
-environment that keeps its state in the TensorDict.
+environment that can be branched, see :func:`symphony.collectors.branching.check_branching`.
 """
 
 from __future__ import annotations
@@ -18,19 +18,15 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from symphony.collectors.branching import check_branching
 from symphony.collectors.result import BeamSearchResult, lineage, ranking
-from symphony.collectors.rules import KeepBest, PruningRule, group_members, prune
+from symphony.collectors.rules import GroupRule, KeepBest, PruningRule, group_members, prune, takes_groups
 from symphony.collectors.scores import max_then_sum
 from symphony.errors import ConfigError
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Score = Callable[[TensorDictBase], Tensor]
 Aggregation = Callable[[Tensor], Tensor]
-
-
-def branch(tensordict: TensorDictBase, branches: int) -> TensorDictBase:
-    """[*b] to [*b, S]: S views of each row, to start a search from."""
-    return tensordict.unsqueeze(-1).expand(*tensordict.batch_size, branches)
 
 
 def beam_search(
@@ -41,7 +37,7 @@ def beam_search(
     *,
     steps: int,
     prune_every: int = 10,
-    rule: PruningRule = KeepBest(0.5),  # noqa: B008  (frozen)
+    rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
     aggregate: Aggregation = max_then_sum,
     prune_last: bool = True,
     noise: Float[Tensor, "*b P"] | None = None,
@@ -55,15 +51,17 @@ def beam_search(
     reseed: Callable[[TensorDictBase, int], TensorDictBase] | None = None,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
-    """Simulate S branches per row, and let those with high scores make room for copies of the others.
+    """Search an environment whose whole state is in the TensorDict (no GymEnv, VmasEnv, SerialEnv or ParallelEnv).
+
+    S branches are simulated per row, and those with high scores make room for copies of the others.
 
     Gradients flow through environment, policy and scores unless the caller turns them off, along the history of
     each leaf; no tensor is changed in place. The end of an episode changes nothing: every branch runs for
     `steps` steps, and a score that should not judge what follows the end must be 0 there.
 
     Args:
-        env: keeps its state in the TensorDict and accepts any batch shape (``batch_size=[]``,
-            ``batch_locked=False``).
+        env: accepts any batch shape (``batch_size=[]``, ``batch_locked=False``); random numbers of its own are
+            allowed, memory is not.
         policy: writes the action into the TensorDict it is given.
         score: of the state after a step, [*b, S, N] or [*b, S]; high is bad, padded agents 0. It gets the next
             state with reward and action, and must not write into it.
@@ -71,12 +69,14 @@ def beam_search(
         steps: T, decisions per branch.
         prune_every: T_p, steps per period.
         rule: which branches go on, see :mod:`symphony.collectors.rules`.
-        aggregate: scores of a period [*b, S, T_p, N] to totals [*b, S].
+        aggregate: any function of the scores of a period [*b, S, T_p, N] that gives totals [*b, S], e.g.
+            ``lambda scores: scores.amax((-1, -2))``; see :class:`symphony.collectors.Aggregate`.
         prune_last: prune after the last period too.
         noise: numbers in [0, 1) for rules that draw, one per row and period.
         slot_keys: entries that stay in their slot when a branch is copied, such as the identity of a stream of
             random numbers: otherwise copies of one branch that draw from it would all do the same.
-        group_key: integers [*b, S] or [*b, S, 1] in `start`; branches compete only with those of the same number.
+        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree; branches compete only with those
+            of the same group. A :class:`GroupRule` may mix groups; a copy is then of its parent's group.
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
         leaves: return only so many, the best of the last period first; default all, in the order of their slots.
@@ -89,11 +89,14 @@ def beam_search(
         exploration_type: under which the policy runs.
 
     Raises:
-        ConfigError: for arguments that contradict each other or shapes that do not fit.
+        ConfigError: for an environment that can't be branched, arguments that contradict each other or shapes that
+            do not fit.
     """
     _check(start, steps, prune_every, leaves, retries, retry_above)
+    check_branching(env, start)
     threshold = torch.inf if retry_above is None else retry_above
-    members = None if group_key is None else group_members(_per_branch(start, group_key))
+    groups = None if group_key is None else _groups(start, group_key)
+    members = None if groups is None or takes_groups(rule) else group_members(groups)
     periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
     noises = _noises(noise, start, len(periods))
 
@@ -120,7 +123,8 @@ def beam_search(
             if last and not prune_last:
                 parents.append(torch.arange(start.shape[-1], device=run.totals.device).expand(start.shape))
                 break
-            parents.append(prune(rule, run.totals.detach(), noises[period], members))
+            parents.append(prune(rule, run.totals.detach(), noises[period], members, groups))
+            groups = None if groups is None else groups.gather(-1, parents[-1])
             if not last:
                 now = _fork(run.after, parents[-1], slot_keys)
 
@@ -255,14 +259,16 @@ def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) 
     return (row * branches + slot) * steps + torch.arange(steps, device=device)
 
 
-def _per_branch(start: TensorDictBase, key: NestedKey) -> Tensor:
+def _groups(start: TensorDictBase, key: NestedKey) -> Int[Tensor, "*b S"]:
+    """The group of each branch: its number, or the first branch that agrees with it in all of its numbers."""
     value = start.get(key)
     if value is None:
         raise ConfigError(f"the start state has no entry {key!r}")
-    value = value.squeeze(-1) if value.ndim == start.batch_dims + 1 and value.shape[-1] == 1 else value
-    if value.shape != start.shape:
-        raise ConfigError(f"{key!r} must hold one number per branch, is {list(value.shape)}")
-    return value
+    if value.is_floating_point() or value.shape[: start.ndim] != start.shape or value.ndim > start.ndim + 1:
+        raise ConfigError(f"{key!r} must hold integers, one or some per branch, is {list(value.shape)}")
+    if value.ndim == start.ndim:
+        return value
+    return (value[..., :, None, :] == value[..., None, :, :]).all(-1).int().argmax(-1)
 
 
 def _noises(noise: Tensor | None, start: TensorDictBase, periods: int) -> Sequence[Tensor | None]:

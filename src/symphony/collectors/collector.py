@@ -8,26 +8,29 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import BatchSizeTransform, Compose, EnvBase, TransformedEnv
-from torchrl.envs.utils import RandomPolicy, _aggregate_end_of_traj
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import RandomPolicy
 
-from symphony.collectors.beam_search import Aggregation, Score, beam_search, branch, score_state
+from symphony.collectors._torchrl import bind, new_trajectories, policy_of, seed_worker
+from symphony.collectors.beam_search import Aggregation, Policy, Score, beam_search, score_state
+from symphony.collectors.branching import branch, branched_env
 from symphony.collectors.result import BeamSearchResult
-from symphony.collectors.rules import KeepBest, PruningRule
+from symphony.collectors.rules import GroupRule, KeepBest, PruningRule
 from symphony.collectors.scores import max_then_sum
 from symphony.errors import ConfigError
 
 
 class BeamSearchCollector(Collector):
-    """A TorchRL collector whose batches are the leaves of a beam search: see :func:`beam_search`.
+    """Collects beam searches of an environment that keeps its whole state in the TensorDict: see :func:`beam_search`.
 
     Every batch starts from a reset. Each of the environment's rows is simulated in S branches, and what is
     returned has the layout of any collector's batch: [*env.batch_size, T] with the best leaf of each row, or
     [*env.batch_size, L, T] with the L best. Everything else is :class:`torchrl.collectors.Collector`: replay
-    buffers, weight updates, hooks, state, and being run by ``MultiSyncCollector`` or ``RayCollector``.
+    buffers, weight updates, hooks, state, and being run by ``MultiSyncCollector`` or ``RayCollector``: these take
+    ``collector_class=BeamSearchCollector.bind(score=..., branches=...)``.
 
     Besides the usual entries a batch holds
 
@@ -44,8 +47,8 @@ class BeamSearchCollector(Collector):
     many.
 
     Args:
-        create_env_fn: environment that keeps its state in the TensorDict and accepts any batch shape; for more
-            than one row ``with_rows(env, [B])``. Other transforms are applied to the branches as well.
+        create_env_fn: environment that can be branched, see :func:`check_branching`; for more than one row
+            ``with_rows(env, [B])``. Other transforms are applied to the branches as well.
         policy: as for :class:`Collector`; random actions by default.
         score: of the state after a step, see :func:`beam_search`.
         branches: S.
@@ -73,7 +76,7 @@ class BeamSearchCollector(Collector):
         branches: int,
         leaves: int | None = None,
         prune_every: int = 10,
-        rule: PruningRule = KeepBest(0.5),  # noqa: B008  (frozen)
+        rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
         aggregate: Aggregation = max_then_sum,
         prune_last: bool = True,
         prepare: Callable[[TensorDictBase], TensorDictBase] | None = None,
@@ -95,11 +98,12 @@ class BeamSearchCollector(Collector):
             raise ConfigError("split_trajs: the trajectories of a search all have one length")
         if not kwargs.get("extend_buffer", True):
             raise ConfigError("extend_buffer=False: a search has no single steps to write before it ends")
-        # Multi-process collectors pass their own choice; here the batch is made anew each time.
-        kwargs["use_buffers"] = False
+        # Multi-process collectors pass their own choice; here each batch is made anew, from a reset.
+        kwargs["use_buffers"], kwargs["reset_at_each_iter"] = False, True
         if kwargs.get("auto_register_policy_transforms") is None:
             # What TorchRL 0.14 does when left unset, minus its warning about any policy that is a module.
             kwargs["auto_register_policy_transforms"] = False
+        seed_worker(kwargs.get("worker_idx"))
         super().__init__(create_env_fn, policy, **kwargs)
         self.branches = branches
         self.leaves = leaves
@@ -126,11 +130,21 @@ class BeamSearchCollector(Collector):
         self._rule_noise = rule_noise
         self._rng = torch.Generator().manual_seed(torch.initial_seed() % (1 << 63))
         self._branched_env = branched_env(self.env)
-        done = [("next", key) if isinstance(key, str) else ("next", *key) for key in self.env.done_keys]
-        self._keep = None if keep is None else list(dict.fromkeys([*keep, *done]))
+        self._done = [_next(key) for key in self.env.done_keys]
+        self._keep = None if keep is None else list(dict.fromkeys([*keep, *self._done]))
         rows = self.n_env * (leaves or 1)
         self.frames_per_batch = -(-kwargs["frames_per_batch"] // rows)
         self.requested_frames_per_batch = self.frames_per_batch * rows
+
+    @classmethod
+    def bind(cls, **settings: Any) -> type[Collector]:
+        """A subclass with arguments given, for collectors that make collectors in other processes.
+
+        ``MultiSyncCollector(..., collector_class=BeamSearchCollector.bind(score=score, branches=16))``; without a
+        replay buffer also ``use_buffers=False, cat_results="stack"``. The arguments must be picklable. A network on
+        the CPU that is part of them is shared with the processes of this machine, any other is copied.
+        """
+        return bind(cls, settings)
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
@@ -142,7 +156,7 @@ class BeamSearchCollector(Collector):
             start = self.prepare(start.copy())
         found = self._search(
             self._branched_env,
-            self._act,
+            self._acting(),
             self._score,
             start,
             steps=self.frames_per_batch,
@@ -156,8 +170,8 @@ class BeamSearchCollector(Collector):
     def _finish(self, found: BeamSearchResult) -> TensorDictBase:
         leaves, totals = found.trajectories, found.leaf_totals
         period = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
-        if self._compact_next_keys:
-            leaves = leaves.exclude(*self._compact_next_keys)
+        if self.compact_obs:
+            leaves = leaves.exclude(*self._next_states())
         leaves.set(("collector", "beam_score"), found.scores)
         leaves.set(("collector", "beam_total"), totals.transpose(-1, -2)[..., period])
         leaves.set(("collector", "beam_slot"), found.slots.transpose(-1, -2)[..., period])
@@ -167,12 +181,11 @@ class BeamSearchCollector(Collector):
             leaves.set(("collector", "beam_rank"), rank[..., None].expand(leaves.shape).clone())
             found.tree.set(("collector", "beam_score"), found.simulated_scores)
             leaves.set("tree", found.tree)
-        ended = _aggregate_end_of_traj(leaves.get("next"), done_keys=self.env.done_keys)
+        ended = torch.stack([_per_entry(leaves.get(key), leaves.ndim) for key in self._done]).any(0)
         mask = ended.cumsum(-1) - ended.long() == 0
         leaves.set(("collector", "mask"), mask)
         if self.track_traj_ids:
-            number = leaves.shape[:-1].numel()
-            ids = self._traj_pool.get_traj_and_increment(number, device=mask.device)
+            ids = new_trajectories(self, leaves.shape[:-1].numel(), mask.device)
             leaves.set(
                 ("collector", "traj_ids"), ids.reshape(*leaves.shape[:-1], 1).expand(leaves.shape).clone()
             )
@@ -181,7 +194,7 @@ class BeamSearchCollector(Collector):
         leaves.refine_names(..., "time")
         if self.storing_device is not None:
             leaves = leaves.to(self.storing_device)
-        leaves = self._maybe_set_truncated(leaves)
+        leaves = self._truncate(leaves)
         return leaves if self.trajs_per_batch is None else self._cut(leaves)
 
     def _cut(self, leaves: TensorDictBase) -> TensorDictBase:
@@ -189,21 +202,45 @@ class BeamSearchCollector(Collector):
         after = ~leaves.get(("collector", "mask"))
         ids = leaves.get(("collector", "traj_ids"))
         leaves.set(("collector", "traj_ids"), ids.masked_fill(after, -1))
-        for key in self.env.done_keys:
-            nested = ("next", key) if isinstance(key, str) else ("next", *key)
-            done = leaves.get(nested)
-            leaves.set(nested, done & ~after.reshape(after.shape + (1,) * (done.ndim - after.ndim)))
+        for key in self._done:
+            done = leaves.get(key)
+            leaves.set(key, done & ~after.reshape(after.shape + (1,) * (done.ndim - after.ndim)))
         return leaves
 
-    def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._should_use_random_frames() or isinstance(self._wrapped_policy, RandomPolicy):
+    def _truncate(self, leaves: TensorDictBase) -> TensorDictBase:
+        """Declare the last step truncated, if asked for."""
+        for key in self._done if self.set_truncated else ():
+            if _last(key) == "truncated":
+                last = torch.zeros_like(leaves.get(("collector", "mask")))
+                last[..., -1] = True
+                for name in (key, (*key[:-1], "done")):
+                    flag = leaves.get(name)
+                    leaves.set(name, flag | last.reshape(last.shape + (1,) * (flag.ndim - last.ndim)))
+        return leaves
+
+    def _next_states(self) -> list[NestedKey]:
+        return [_next(key) for key in (*self.env.observation_keys, *self.env.state_keys)]
+
+    def _acting(self) -> Policy:
+        """The policy of one search; until `init_random_frames` are collected, random actions."""
+        first = self.init_random_frames or 0
+        buffer = self.replay_buffer
+        seen = self.stats()["frames"] if buffer is None else buffer.write_count
+        if isinstance(self.policy, RandomPolicy) or seen < first:
             # The specs of a random policy have the rows of the collector's environment, but no branches.
-            return self._branched_env.rand_action(tensordict)
-        if not self._cast_to_policy_device or self.policy_device is None:
-            return self._wrapped_policy(tensordict)
-        output = self._wrapped_policy(tensordict.to(self.policy_device))
-        output = output.select(*self._policy_output_keys)
-        return tensordict.update(output if self.env_device is None else output.to(self.env_device))
+            return self._branched_env.rand_action
+        policy = policy_of(self)
+        if self.policy_device is None or self.policy_device == self.env_device:
+            return policy
+
+        def elsewhere(tensordict: TensorDictBase) -> TensorDictBase:
+            there = tensordict.to(self.policy_device)
+            output = policy(there.copy())
+            new = [key for key, value in output.items(True, True) if value is not there.get(key, None)]
+            output = output.select(*new)
+            return tensordict.update(output if self.env_device is None else output.to(self.env_device))
+
+        return elsewhere
 
     def rule_noise(self, start: TensorDictBase) -> Tensor:
         """Numbers [*env.batch_size, P] in [0, 1) for the pruning rule, from a branched start state."""
@@ -220,14 +257,20 @@ class BeamSearchCollector(Collector):
     @torch.no_grad()
     def fake_tensordict(self) -> TensorDictBase:
         """Zeros in the shape and with the entries of a batch."""
-        if getattr(self, "_final_rollout", None) is None:
-            self._maybe_make_final_rollout(make_rollout=True)
-        plain = self._final_rollout.clone().zero_()
-        first = branch(plain[..., 0].exclude("collector"), self.branches).clone()
-        start = branch(self._carrier.exclude("collector"), self.branches)
-        first.update(start if self.prepare is None else self.prepare(start.copy()))
-        score = score_state(self._branched_env, self._score, first, first.exclude("next"))
+        plain = self.env.fake_tensordict()
+        if self.compact_obs:
+            plain = plain.exclude(*self._next_states())
+        first = branch(plain, self.branches).clone()
+        state = first.exclude("next", *self.env.action_keys)
+        # The actor's own entries are found by letting it act.
+        acted = self._acting()(state if self.prepare is None else self.prepare(state.copy()))
+        score = score_state(self._branched_env, self._score, first.update(acted), first.exclude("next"))
         total = self._aggregate(score.unsqueeze(-2))
+        plain = first[..., 0].unsqueeze(-1).expand(*plain.shape, self.frames_per_batch).clone().zero_()
+        if self.track_traj_ids:
+            plain.set(
+                ("collector", "traj_ids"), torch.zeros(plain.shape, dtype=torch.int64, device=score.device)
+            )
         if self.leaves is not None:
             plain = plain.unsqueeze(-2).expand(*plain.shape[:-1], self.leaves, plain.shape[-1]).clone()
         if self._keep is not None:
@@ -245,7 +288,9 @@ class BeamSearchCollector(Collector):
                 "tree", tree.set(("collector", "beam_score"), plain.get(("collector", "beam_score")).clone())
             )
         plain.refine_names(..., "time")
-        return self._postproc(self._maybe_set_truncated(plain))
+        plain = self._truncate(plain)
+        plain = plain if self.postproc is None else self.postproc(plain)
+        return plain.exclude(*(key for key in plain.keys(True) if _last(key).startswith("_")))
 
     def state_dict(self) -> OrderedDict:
         """State of the collector (policy, environment, counters) and of the search."""
@@ -265,43 +310,15 @@ class BeamSearchCollector(Collector):
         """Progress in numbers; see :class:`Collector`."""
         return {**super().stats(), "simulated_frames": self.simulated_frames}
 
-    def _discards_in_flight_trajectories(self) -> bool:
-        return True
+
+def _next(key: NestedKey) -> tuple[str, ...]:
+    return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
-def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
-    """Give an environment that accepts any batch shape a fixed one, each row with a start of its own.
-
-    A bare ``BatchSizeTransform(batch_size=...)`` resets once and starts all rows from the same state.
-    """
-    transform = BatchSizeTransform(batch_size=torch.Size(batch_size), reset_func=_reset_rows, env_kwarg=True)
-    return TransformedEnv(env, transform)
+def _last(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[-1]
 
 
-def _reset_rows(
-    tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase, env: TransformedEnv
-) -> TensorDictBase:
-    if tensordict_reset.batch_size == env.batch_size:  # rows were named, or only some are reset
-        return tensordict_reset
-    return env.base_env.reset(TensorDict({}, env.batch_size, device=env.device))
-
-
-def branched_env(env: EnvBase) -> EnvBase:
-    """The environment without a fixed batch size, for any number of branches.
-
-    Raises:
-        ConfigError: if it can only be stepped with its own batch size.
-    """
-    found = env
-    if isinstance(env, TransformedEnv):
-        chain = env.transform if isinstance(env.transform, Compose) else [env.transform]
-        others = [transform.clone() for transform in chain if not isinstance(transform, BatchSizeTransform)]
-        found = branched_env(env.base_env)
-        found = TransformedEnv(found, Compose(*others)) if others else found
-    if found.batch_locked or found.batch_size:
-        raise ConfigError(
-            f"{type(found).__name__} has a batch size of its own ({list(found.batch_size)}) and can't be stepped "
-            "with branches; it needs batch_locked = False and an empty batch size, and gets its rows from "
-            "with_rows(env, [B])"
-        )
-    return found
+def _per_entry(flag: Tensor, batch_dims: int) -> Tensor:
+    """Whether any of the flags [*b, ...] of an entry [*b] is set."""
+    return flag.reshape(*flag.shape[:batch_dims], -1).any(-1)

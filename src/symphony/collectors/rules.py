@@ -1,15 +1,15 @@
 """Pruning rules: which branches go on, and in how many copies.
 
 A rule is any callable ``rule(totals, noise) -> parents``: totals [*b, S] float, where a *high* number is bad;
-noise [*b] in [0, 1) or None; parents [*b, S] int64, the branch that each slot is continued from. Rules know
-nothing of groups: :func:`prune` shows them one group at a time.
+noise [*b] in [0, 1) or None; parents [*b, S] int64, the branch that each slot is continued from. Most rules know
+nothing of groups, and :func:`prune` shows them one group at a time; a :class:`GroupRule` sees all at once.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol, TypeGuard
 
 import torch
 from jaxtyping import Float, Int
@@ -19,12 +19,45 @@ from symphony.errors import ConfigError
 
 
 class PruningRule(Protocol):
-    """What :func:`beam_search` calls at a pruning point; a plain function will do."""
+    """What :func:`beam_search` calls at a pruning point; a plain function will do.
+
+    Rows are independent, and nothing is drawn but by the given noise. To drop the worst branch for the best:
+
+    >>> import torch
+    >>> def drop_worst(totals, noise=None):
+    ...     slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
+    ...     best, worst = totals.argmin(-1, keepdim=True), totals.argmax(-1, keepdim=True)
+    ...     return slots.scatter(-1, worst, best)
+    >>> drop_worst(torch.tensor([[0.5, 3.0, 0.1, 1.0]])).tolist()
+    [[0, 2, 2, 3]]
+
+    It is passed as ``rule=drop_worst``. What goes to other processes must be defined in a module, not in a script's
+    ``main``; a frozen dataclass with a ``__call__`` also carries parameters.
+    """
 
     def __call__(
         self, totals: Float[Tensor, "*b S"], noise: Float[Tensor, "*b"] | None
     ) -> Int[Tensor, "*b S"]:
         """Parents of the S slots; see the module."""
+
+
+class GroupRule(Protocol):
+    """A rule that decides itself what groups mean; they may be of any size, and branches may change theirs."""
+
+    takes_groups: ClassVar[bool] = True
+
+    def __call__(
+        self,
+        totals: Float[Tensor, "*b S"],
+        noise: Float[Tensor, "*b"] | None,
+        groups: Int[Tensor, "*b S"] | None = None,
+    ) -> Int[Tensor, "*b S"]:
+        """Parents of the S slots; groups are given where the search has a ``group_key``."""
+
+
+def takes_groups(rule: PruningRule | GroupRule) -> TypeGuard[GroupRule]:
+    """Whether a rule wants to see the groups itself."""
+    return bool(getattr(rule, "takes_groups", False))
 
 
 @dataclass(frozen=True)
@@ -112,6 +145,55 @@ class Systematic:
         return ranked.gather(-1, drawn)
 
 
+@dataclass(frozen=True)
+class ReplaceBad:
+    """Replace the branches with a total above a threshold by copies of the others, which keep their slots.
+
+    Where nothing is bad nothing changes, so branches stay as diverse as they were drawn. The copies are made in turn
+    of the good branches, by slot, from one on that the noise decides. With groups, such as the goals of a branch, a
+    slot goes to the good branches of its own group, and to any where its group has none left. Where no branch is
+    good, all stay. NaN is above every threshold.
+
+    Args:
+        threshold: in the units of the totals.
+    """
+
+    threshold: float
+    takes_groups: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.threshold):
+            raise ConfigError("the threshold must be a number, is nan")
+
+    def __call__(
+        self,
+        totals: Float[Tensor, "*b S"],
+        noise: Float[Tensor, "*b"] | None = None,
+        groups: Int[Tensor, "*b S"] | None = None,
+    ) -> Int[Tensor, "*b S"]:
+        """Parents of the S slots by one uniform number per row.
+
+        Raises:
+            ConfigError: if noise is None.
+        """
+        if noise is None:
+            raise ConfigError("ReplaceBad needs noise: one number in [0, 1) per row and pruning point")
+        slots = torch.arange(totals.shape[-1], device=totals.device)
+        good = totals <= self.threshold
+        groups = torch.zeros_like(totals, dtype=torch.int64) if groups is None else groups
+        # [*b, S, S]: the slot to fill, then the branch that may fill it, or another slot that waits.
+        same = groups[..., :, None] == groups[..., None, :]
+        own = (good[..., None, :] & same).any(-1)
+        candidates = good[..., None, :] & (same | ~own[..., :, None])
+        waiting = ~good[..., None, :] & torch.where(own[..., :, None], same, ~own[..., None, :])
+        turn = (waiting & (slots < slots[:, None])).sum(-1)
+        number = candidates.sum(-1)
+        first = (noise.double()[..., None] * number).long()
+        place = (first + turn) % number.clamp_min(1)
+        chosen = candidates & (candidates.cumsum(-1) - 1 == place[..., None])
+        return torch.where(good | (number == 0), slots, chosen.int().argmax(-1))
+
+
 def group_members(groups: Int[Tensor, "*b S"]) -> Int[Tensor, "*b G M"]:
     """The slots of each of the G groups of M branches, groups by id, slots ascending.
 
@@ -135,10 +217,11 @@ def group_members(groups: Int[Tensor, "*b S"]) -> Int[Tensor, "*b G M"]:
 
 
 def prune(
-    rule: PruningRule,
+    rule: PruningRule | GroupRule,
     totals: Float[Tensor, "*b S"],
     noise: Float[Tensor, "*b"] | None = None,
     members: Int[Tensor, "*b G M"] | None = None,
+    groups: Int[Tensor, "*b S"] | None = None,
 ) -> Int[Tensor, "*b S"]:
     """Apply a rule, inside each group if groups are given, and check what it returns.
 
@@ -147,6 +230,7 @@ def prune(
         totals: of each branch; high is bad.
         noise: one number in [0, 1) per row, which all groups of the row share.
         members: from :func:`group_members`. Survivors stay in the slots of their group.
+        groups: for a :class:`GroupRule`, which gets them as they are.
 
     Returns:
         The branch each slot goes on from.
@@ -154,17 +238,18 @@ def prune(
     Raises:
         ConfigError: if the rule returns something else than int64 indices of branches.
     """
+    if takes_groups(rule):
+        return _checked(rule, rule(totals, noise, groups), totals)
     if members is None:
-        return _checked(rule, totals, noise)
+        return _checked(rule, rule(totals, noise), totals)
     inside = totals.gather(-1, members.flatten(-2)).unflatten(-1, members.shape[-2:])
     shared = None if noise is None else noise[..., None].expand(inside.shape[:-1])
-    chosen = _checked(rule, inside, shared)
+    chosen = _checked(rule, rule(inside, shared), inside)
     parents = members.gather(-1, chosen)
     return torch.empty_like(members.flatten(-2)).scatter(-1, members.flatten(-2), parents.flatten(-2))
 
 
-def _checked(rule: PruningRule, totals: Tensor, noise: Tensor | None) -> Tensor:
-    parents = rule(totals, noise)
+def _checked(rule: object, parents: Tensor, totals: Tensor) -> Tensor:
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
         raise ConfigError(
             f"a pruning rule must return int64 {tuple(totals.shape)}, "

@@ -16,7 +16,7 @@ import numpy as np
 
 from symphony.data.plausibility import implausible, measure
 from symphony.data.segment import RunSegment, content_hash, validate
-from symphony.data.sources.base import Item, Reader
+from symphony.data.sources.base import Item, Reader, UnexpectedError
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import DataError
 
@@ -162,7 +162,8 @@ def _store(segments: Sequence[RunSegment], report: Conformance) -> None:
             report.fail("store", str(error))
             return
         for segment, stored in zip(segments, back, strict=True):
-            if content_hash(segment) != content_hash(stored):
+            group = segment.group or segment.segment_id
+            if (content_hash(segment), group) != (content_hash(stored), stored.group):
                 report.fail("store", f"segment {segment.segment_id} comes back changed")
 
 
@@ -175,6 +176,8 @@ def _read(reader: Reader, path: Path, report: Conformance, check: str = "errors"
         report.fail(check, f"{path}: raises {type(error).__name__}: {error}")
     named = {str(path), *map(str, reader.companions(path))}
     for item in items:
+        if isinstance(item, UnexpectedError):
+            report.fail(check, f"{path}: raises {item.message}")
         if isinstance(item, DataError) and str(item.file) not in named:
             report.fail(check, f"{path}: the error names the file {item.file}: {item.message}")
         if isinstance(item, DataError) and not item.message:
@@ -185,8 +188,8 @@ def _read(reader: Reader, path: Path, report: Conformance, check: str = "errors"
 
 
 def _hashes(items: Iterable[Item]) -> list[str]:
-    """Content hash per segment, an empty text per error."""
-    return [content_hash(item) if isinstance(item, RunSegment) else "" for item in items]
+    """Content hash and group per segment, an empty text per error."""
+    return [f"{content_hash(item)} {item.group}" if isinstance(item, RunSegment) else "" for item in items]
 
 
 def _compare(before: list[Item], after: list[Item], what: str, report: Conformance) -> None:
@@ -202,6 +205,7 @@ class _Copies:
         self.reader = reader
         self.path = folder / path.name
         self.files: dict[Path, bytes] = {}
+        self.optional = {folder / part.name for part in reader.optional(path)}
         for part in (path, *reader.companions(path)):
             copy = folder / part.name
             shutil.copyfile(part, copy)
@@ -231,7 +235,9 @@ def _mistreat(
             for item in copies.read(part, changed, report, "damaged"):
                 _judge_valid(item, f"{part.name} with bytes changed", report)
         foreign: dict[str, bytes | None] = {"emptied": b"", "made noise": rng.bytes(max(len(data), 64))}
-        foreign |= {"made text": b"Not what you are looking for.\n" * 50, "removed": None}
+        foreign["made text"] = b"Not what you are looking for.\n" * 50
+        if part not in copies.optional:
+            foreign["removed"] = None
         for what, content in foreign.items():
             items = copies.read(part, content, report, "foreign")
             if any(isinstance(item, RunSegment) for item in items):

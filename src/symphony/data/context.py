@@ -42,6 +42,10 @@ KEPT = 1.0
 """Seconds for which a vehicle must be that close in the same lane."""
 
 
+TILE = 1_000_000
+"""Pairs of steps that are compared at a time."""
+
+
 class Context(StrEnum):
     """Why the partner of the ego was chosen; the later ones say what it is to the ego. Best first."""
 
@@ -90,64 +94,101 @@ def relations(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Relation
     rows = np.flatnonzero(_boxes_meet(segment, others))
     if len(rows):
         meeting = _Meeting.of(segment, others[rows])
-        shared, gap = meeting.shared, meeting.gap
         together = meeting.length_in_common() >= SHARED
-        before = np.where(shared & (gap < 0), -gap, np.inf).min((1, 2))
-        after = np.where(shared & (gap > 0), gap, np.inf).min((1, 2))
-        for on_path, field in ((before, leader), (after, follower)):
+        for on_path, field in ((meeting.before, leader), (meeting.after, follower)):
             field[rows] = np.minimum(np.where(together, on_path, np.inf), field[rows])
         # Two paths that become one, or stop being one, cross on the way: those relations have their own names.
-        apart = ~shared.any((1, 2))
-        crossing[rows[apart]] = np.where(meeting.crossing[apart], np.abs(gap), np.inf).min((1, 2))
-        for k in np.flatnonzero(together & (np.minimum(before, after) <= CONFLICT_GAP)):
-            merge[rows[k]] = _merge_gap(segment, int(others[rows[k]]), shared[k], meeting.along[k])
+        apart = ~meeting.shared.any(1)
+        crossing[rows[apart]] = meeting.crossing[apart]
+        for k in np.flatnonzero(together & (np.minimum(meeting.before, meeting.after) <= CONFLICT_GAP)):
+            merge[rows[k]] = _merge_gap(segment, int(others[rows[k]]), *meeting.first[k].tolist())
     limits = ((merge, CONFLICT_GAP), (crossing, CONFLICT_GAP), (leader, TIME_GAP), (follower, TIME_GAP))
     return Relations(*(np.where(gaps <= limit + 1e-6, gaps, np.inf) for gaps, limit in limits))
 
 
 @dataclass(frozen=True)
 class _Meeting:
-    """K vehicles and the ego, T steps of each with each.
+    """K vehicles and the ego, each of T steps with each: found a tile at a time, as T squared may be large.
 
     Attributes:
         spacing: [T] metres the ego drives in a step, half before and half after it.
-        along: [K, T, T] metres the ego, at the step of the first axis, is ahead of the other at the second.
-        shared: [K, T, T] both at the same place, going the same way.
-        crossing: [K, T, T] both at the same place, at an angle.
-        gap: [T, T] seconds from the ego's step to the other's; negative where the other is there first.
+        shared: [K, T] whether the other, at some step, is where the ego is at this one, going the same way.
+        first: [K, 2] the ego's first such step, and the other's step nearest along it; 0 where there is none.
+        before, after: [K] smallest time in seconds by which the other is there before or after the ego.
+        crossing: [K] smallest time in seconds between the two at a place where they pass at an angle.
     """
 
     spacing: Reals
-    along: Reals
     shared: Bools
-    crossing: Bools
-    gap: Reals
+    first: NDArray[np.int64]
+    before: Reals
+    after: Reals
+    crossing: Reals
 
     @classmethod
     def of(cls, segment: RunSegment, others: NDArray[np.integer[Any]]) -> _Meeting:
-        ego = segment.ego
-        position = segment.position[..., :2]
-        delta = position[ego, None, :, None] - position[others][:, None]
-        heading = segment.heading[others]
-        cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
-        along = np.abs(cos * delta[..., 0] + sin * delta[..., 1])
-        aside = np.abs(cos * delta[..., 1] - sin * delta[..., 0])
-        turn = segment.heading[ego, None, :, None] - heading[:, None]
-        turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
-        mine = _spacing(position[ego], segment.valid[ego])
-        theirs = _spacing(position[others], segment.valid[others])[:, None]
-        both = segment.valid[ego, None, :, None] & segment.valid[others][:, None]
-        # A place lies between two logged steps as a rule: half the way to the next one is added.
-        both &= along <= theirs / 2 + 0.5
-        shared = both & (turn < SAME_WAY) & (aside <= HALF_LANE)
-        crosses = (turn >= SAME_WAY) & (turn <= np.pi - SAME_WAY)
-        crossing = both & crosses & (aside <= mine[:, None] / 2 + 0.5)
+        agents, steps = len(others), segment.num_steps
+        spacing = _spacing(segment.position[segment.ego, :, :2], segment.valid[segment.ego])
+        found = cls(
+            spacing,
+            np.zeros((agents, steps), bool),
+            np.zeros((agents, 2), np.int64),
+            *(np.full(agents, np.inf) for _ in range(3)),
+        )
+        rows = max(TILE // steps, 1)
+        group = max(rows // steps, 1)
+        for a in range(0, agents, group):
+            for t in range(0, steps, rows):
+                found._add(segment, others, slice(a, a + group), slice(t, t + rows))
+        return found
+
+    def _add(self, segment: RunSegment, others: NDArray[np.integer[Any]], group: slice, steps: slice) -> None:
+        """Look at some of the others [k] and some of the ego's steps [t]."""
+        along, shared, crossing = _places(segment, others[group], steps, self.spacing[steps])
         time = np.arange(segment.num_steps) * segment.dt
-        return cls(mine, along, shared, crossing, time - time[:, None])
+        # From the ego's step to the other's; negative where that is there first.
+        gap = time - time[steps, None]
+        for field, where, value in (
+            (self.before, shared & (gap < 0), -gap),
+            (self.after, shared & (gap > 0), gap),
+            (self.crossing, crossing, np.abs(gap)),
+        ):
+            field[group] = np.minimum(field[group], np.where(where, value, np.inf).min((1, 2)))
+        there = np.asarray(shared.any(axis=2))
+        new = np.flatnonzero(there.any(axis=1) & ~self.shared[group].any(axis=1))
+        mine = there[new].argmax(1)
+        theirs = np.where(shared[new, mine], along[new, mine], np.inf).argmin(1)
+        self.first[group][new] = np.stack([steps.start + mine, theirs], -1)
+        self.shared[group, steps] = there
 
     def length_in_common(self) -> Reals:
         """[K] metres of the ego's path that are the other's, too."""
-        return self.shared.any(2) @ self.spacing
+        return self.shared @ self.spacing
+
+
+def _places(
+    segment: RunSegment, others: NDArray[np.integer[Any]], steps: slice, spacing: Reals
+) -> tuple[Reals, Bools, Bools]:
+    """Each of the ego's steps [t] with each of the others' [k, t, T].
+
+    Returns:
+        Metres the ego is ahead of the other; both at the same place, going the same way; both there at an angle.
+    """
+    ego, position = segment.ego, segment.position[..., :2]
+    delta = position[ego, None, steps, None] - position[others][:, None]
+    heading = segment.heading[others]
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    along = np.abs(cos * delta[..., 0] + sin * delta[..., 1])
+    aside = np.abs(cos * delta[..., 1] - sin * delta[..., 0])
+    turn = segment.heading[ego, None, steps, None] - heading[:, None]
+    turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    theirs = _spacing(position[others], segment.valid[others])[:, None]
+    both = segment.valid[ego, None, steps, None] & segment.valid[others][:, None]
+    # A place lies between two logged steps as a rule: half the way to the next one is added.
+    both &= along <= theirs / 2 + 0.5
+    shared = both & (turn < SAME_WAY) & (aside <= HALF_LANE)
+    crosses = (turn >= SAME_WAY) & (turn <= np.pi - SAME_WAY)
+    return along, shared, both & crosses & (aside <= spacing[:, None] / 2 + 0.5)
 
 
 def _spacing(position: Reals, valid: Bools) -> Reals:
@@ -193,14 +234,13 @@ def _queue_gap(segment: RunSegment, others: NDArray[np.integer[Any]], sign: int)
     return np.where(long_enough, np.where(kept, gap, np.inf).min(1), np.inf)
 
 
-def _merge_gap(segment: RunSegment, other: int, shared: Bools, along: Reals) -> float:
-    """Seconds between the ego and another where their paths [T, T] become one; infinite if they always were.
+def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float:
+    """Seconds between the ego and another where their paths become one, at a step of each; infinite if they
+    always were one.
 
     Both paths are followed backwards from that place by the same distances: they must have been apart or at an
     angle. What one of them did before the log begins is unknown, so a short way back proves nothing.
     """
-    mine = int(shared.any(1).argmax())
-    theirs = int(np.where(shared[mine], along[mine], np.inf).argmin())
     ahead, beside = _way_back(segment, segment.ego, mine), _way_back(segment, other, theirs)
     reach = min(ahead[0][-1], beside[0][-1], LOOKBACK)
     back = np.arange(1.0, reach + 1e-6)

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from fnmatch import fnmatch
@@ -13,9 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from symphony.data import store_format
+from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.engine import Engine
-from symphony.data.parts import Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip
+from symphony.data.overlaps import TAG
+from symphony.data.parts import ODD, Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip, tags_of
 from symphony.data.report import Report, Skip
+from symphony.data.resample import MAX_SIGMA
 from symphony.data.sources import Reader, get_reader
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.data.unfinished import STORE, Draft, Job, folder_of, read_journal
@@ -23,6 +27,8 @@ from symphony.errors import ConfigError, DataError
 
 __all__ = ["Progress", "Report", "Skip", "convert", "expand", "info"]
 
+MIN_RATE, MAX_RATE = 1 / MAX_DT, 1 / MIN_DT
+MAX_WORKERS = 4096
 REASONS_SHOWN = 5
 """Reasons an error lists when nothing could be converted."""
 CHECKPOINT = 2.0
@@ -41,6 +47,8 @@ def convert(
     interactive: int = 2,
     smooth: float = 0.0,
     append: bool = False,
+    exclude_overlaps: bool = False,
+    radius: float | None = None,
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
@@ -62,6 +70,9 @@ def convert(
         interactive: interactive agents a segment must have at its first step (N_I).
         smooth: sigma in seconds of the smoothing of tracks before they are resampled; 0 for none.
         append: add to the store if there is one, skipping the segments it holds.
+        exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`); they
+            are counted either way.
+        radius: metres around the ego's path that are kept, of map and agents; None for all.
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
             depend on it.
@@ -78,19 +89,21 @@ def convert(
         DataError: ``out`` exists already, or not one segment could be converted.
         SymphonyError: a worker process died; what is done stays, as after an interrupt.
     """
-    _check_arguments(rate, interactive, smooth, workers)
+    _check_arguments(rate, interactive, smooth, workers, radius)
     out = Path(out).absolute()
     options = dict(reader_options or {})
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
+    settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
+    settings |= {} if radius is None else {"radius": radius}
     paths = expand(files, reader.patterns)
     draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
     with closing(draft):
         report = draft.report
         try:
             if not draft.finished:
-                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before)
+                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius)
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:
                 draft.finish(report)
@@ -103,15 +116,23 @@ def convert(
     raise _nothing(report)
 
 
-def _check_arguments(rate: float, interactive: int, smooth: float, workers: int) -> None:
+def _check_arguments(
+    rate: float, interactive: int, smooth: float, workers: int, radius: float | None
+) -> None:
+    if radius is not None and not 0 < radius < math.inf:
+        raise ConfigError(f"radius must be positive, is {radius}")
     if not 0 < rate < math.inf:
         raise ConfigError(f"rate must be positive, is {rate}")
+    if not MIN_RATE <= rate <= MAX_RATE:
+        raise ConfigError(f"rate must be between {MIN_RATE:g} and {MAX_RATE:g} steps per second, is {rate:g}")
     if not 0 <= smooth < math.inf:
         raise ConfigError(f"smooth must not be negative, is {smooth}")
-    if interactive < 1:
-        raise ConfigError(f"interactive must be at least 1, is {interactive}")
-    if workers < 1:
-        raise ConfigError(f"workers must be at least 1, is {workers}")
+    if smooth > MAX_SIGMA:
+        raise ConfigError(f"smooth must be at most {MAX_SIGMA:g} seconds, is {smooth:g}")
+    if not 1 <= interactive <= MAX_AGENTS:
+        raise ConfigError(f"interactive must be at least 1 and at most {MAX_AGENTS}, is {interactive}")
+    if not 1 <= workers <= MAX_WORKERS:
+        raise ConfigError(f"workers must be at least 1 and at most {MAX_WORKERS}, is {workers}")
 
 
 def _job(settings: Mapping[str, Any], paths: list[Path], out: Path, append: bool, dt: float) -> Job:
@@ -190,10 +211,16 @@ class _Run:
         else:
             try:
                 if isinstance(outcome, Stored):
+                    odd = outcome.store.tags(outcome.index).get(ODD, [])
                     writer.copy(outcome.store, outcome.index)
+                    overlaps = outcome.overlaps
                 else:
-                    writer.append(outcome)
+                    found = tags_of(outcome)
+                    odd, overlaps = found.get(ODD, []), TAG in found
+                    writer.append(outcome, tags=found or None)
                 self.report.converted += 1
+                self.report.odd = dict(Counter(self.report.odd) + Counter(odd))
+                self.report.overlaps += overlaps
             except DataError as error:
                 self.report.skipped.append(skip(error, path, outcome.segment_id))
 
@@ -232,6 +259,10 @@ def expand(files: Iterable[str | Path], patterns: tuple[str, ...]) -> list[Path]
         found += inside
     if not found:
         raise DataError("no files given")
+    for path in found:
+        # Reports are UTF-8; a name that is not could be neither written nor found again.
+        if any(0xD800 <= ord(letter) <= 0xDFFF for letter in path.name):
+            raise DataError("a file's name that is not UTF-8: give it another", file=path)
     return list(dict.fromkeys(found))
 
 
@@ -241,8 +272,9 @@ def info(path: str | Path) -> dict[str, Any]:
     Returns:
         Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each),
         ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
-        many of these under each of the paper's), ``problems`` (the reasons of the others) and ``unfinished``
-        (None, or how far a conversion is that will add to the store).
+        many of these under each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is
+        unusual about how many of the segments), ``groups`` (recordings the segments are of), ``overlaps`` (segments
+        in whose log boxes overlap) and ``unfinished`` (None, or how far a conversion is that will add to the store).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -261,6 +293,9 @@ def info(path: str | Path) -> dict[str, Any]:
         "exclusions": report.exclusions,
         "reasons": report.reasons,
         "problems": report.problems,
+        "odd": report.odd,
+        "overlaps": report.overlaps,
+        "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),
     }

@@ -179,7 +179,7 @@ def _ray(workers: int) -> Any:
     try:
         import ray  # noqa: PLC0415 (optional)
     except ImportError as error:
-        message = "the engine 'ray' needs Ray: pip install 'symphony[ray]'"
+        message = "the engine 'ray' needs Ray: pip install 'symphony-traffic[ray]'"
         raise ConfigError(message) from error
     if not ray.is_initialized():
         address = os.environ.get("RAY_ADDRESS")

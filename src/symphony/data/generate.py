@@ -12,7 +12,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -216,6 +216,7 @@ def harvest(task: Task) -> Harvest:
         except DataError as error:
             run.reasons[f"{error.field}: excluded by the paper's limits"] += 1
     taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
+    taken = [segment.replace(group=task.name) for segment in taken]
     return Harvest(task, taken, len(good), run.reasons, _cpu_seconds() - begin)
 
 
@@ -342,7 +343,8 @@ def _begin(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
     report = store.report
     if not report and not len(store):
         return Generation()
-    there = report.get("settings") or {}
+    there = report.get("settings")
+    there = there if isinstance(there, dict) else {}
     if "generation" not in report or there.get("reader") != "generate":
         raise DataError(
             "is a segment store that was not generated: refusing to write into it", file=store.path
@@ -353,8 +355,12 @@ def _begin(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
                 f"{store.path} was made with {name} {_plain(there.get(name))}, not {_plain(value)}: "
                 "give the same arguments to continue it, or choose another folder"
             )
-    known = {entry.name for entry in fields(Generation)}
-    return Generation(**{name: value for name, value in report["generation"].items() if name in known})
+    found, state = report["generation"], Generation()
+    for name, value in vars(state).items():
+        kind = (int, float) if isinstance(value, float) else type(value)
+        if not isinstance(found, dict) or not isinstance(found.get(name, value), kind):
+            raise DataError("not how far a generation is", file=store.path / store_format.REPORT, field=name)
+    return Generation(**{name: found[name] for name in vars(state) if name in found})
 
 
 def _plain(value: Any) -> str:

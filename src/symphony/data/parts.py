@@ -15,18 +15,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from symphony.data import overlaps
 from symphony.data import resample as resampling
+from symphony.data.bounds import oddities
+from symphony.data.crop import crop
 from symphony.data.engine import Engine, ordered_map
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
 from symphony.data.sources import Reader
+from symphony.data.sources.base import unexpected
 from symphony.data.store import SegmentStore, StoreWriter
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 
 PART_BYTES, PART_FILES = 8 << 20, 64
 """Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""
 PRESENT = "present"
+ODD = "odd"
+"""Tag of a segment with something unusual: the list of what it is."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,11 @@ class Stored:
     def segment_id(self) -> str:
         """Its id."""
         return self.store.ids[self.index]
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether boxes overlap in its log."""
+        return overlaps.TAG in self.store.tags(self.index)
 
 
 Outcome = RunSegment | Stored | Skip | None
@@ -56,6 +67,8 @@ class Recipe:
         sigma: of the smoothing in seconds, 0 for none.
         interactive: interactive agents a segment must have (N_I).
         before: path of the store that is added to, and the segments it held; their ids are passed over.
+        exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
+        radius: metres around the ego's path that are kept (see :mod:`symphony.data.crop`); None for all.
     """
 
     reader: Reader
@@ -63,6 +76,8 @@ class Recipe:
     sigma: float
     interactive: int
     before: tuple[str, int] | None = None
+    exclude_overlaps: bool = False
+    radius: float | None = None
 
     def outcomes(self, path: str) -> Iterator[Outcome]:
         """One for each record of a file, in its order."""
@@ -80,12 +95,27 @@ class Recipe:
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
             segment = resampling.resample(segment, self.dt)
+            if self.radius is not None:
+                segment = crop(segment, self.radius)
+            excluded = exclusion(segment, self.interactive)
         except DataError as error:
             return skip(error, path, segment.segment_id)
-        excluded = exclusion(segment, self.interactive)
+        except (OSError, ConfigError):  # the machine's fault or the caller's, not the record's
+            raise
+        except Exception as error:  # one bad record must not end a conversion
+            return skip(unexpected(error), path, segment.segment_id)
         if excluded is not None:
             return skip(excluded[1], path, segment.segment_id, excluded[0])
+        if self.exclude_overlaps and (pairs := len(overlaps.overlapping(segment))):
+            found = DataError(f"the boxes of {pairs} pairs of agents overlap in the log", field="agents")
+            return skip(found, path, segment.segment_id, overlaps.TAG)
         return segment
+
+
+def tags_of(segment: RunSegment) -> dict[str, Any]:
+    """What a segment is tagged with that has something unusual, or in whose log boxes overlap."""
+    odd = oddities(segment)
+    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {})
 
 
 def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:
@@ -162,7 +192,7 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
         if writer.has(outcome.segment_id):
             return writer.index_of(outcome.segment_id)
         try:
-            return writer.append(outcome)
+            return writer.append(outcome, tags=tags_of(outcome) or None)
         except DataError as error:
             outcome = skip(error, file, outcome.segment_id)
     return outcome.to_json() if isinstance(outcome, Skip) else PRESENT

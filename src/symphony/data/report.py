@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from symphony.data.overlaps import MANY
 from symphony.data.selection import EXCLUSIONS
 from symphony.errors import DataError
 
@@ -63,6 +64,9 @@ class Report:
         files: files read.
         skipped: what was left out, the paper's exclusions included.
         settings: arguments of the conversion.
+        odd: what is unusual, and about how many of the segments added.
+        overlaps: segments added in whose log a moving vehicle's box overlaps another (see
+            :mod:`symphony.data.overlaps`).
     """
 
     converted: int = 0
@@ -70,6 +74,19 @@ class Report:
     files: int = 0
     skipped: list[Skip] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
+    odd: dict[str, int] = field(default_factory=dict)
+    overlaps: int = 0
+
+    @property
+    def warning(self) -> str:
+        """What the user should hear; empty if nothing."""
+        if self.overlaps <= MANY * self.converted:
+            return ""
+        share = 100 * self.overlaps / self.converted
+        return (
+            f"in {self.overlaps} of {self.converted} segments ({share:.1f} %) boxes overlap in the log: there even "
+            "its playback collides; --exclude-overlaps leaves them out"
+        )
 
     @property
     def reasons(self) -> dict[str, int]:
@@ -83,7 +100,7 @@ class Report:
 
     @property
     def exclusions(self) -> dict[str, int]:
-        """Sound segments left out under each of the paper's exclusions, all of which are listed."""
+        """Sound segments left out under each of the exclusions, all of which are listed."""
         found = Counter(skip.exclusion for skip in self.skipped)
         return {name: found[name] for name in EXCLUSIONS}
 
@@ -96,18 +113,41 @@ class Report:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Report:
         """The reverse of :meth:`to_json`; an empty mapping gives an empty report."""
-        known = {key: value[key] for key in ("converted", "present", "files", "settings") if key in value}
+        kinds = {
+            "converted": int,
+            "present": int,
+            "files": int,
+            "settings": dict,
+            "odd": dict,
+            "overlaps": int,
+        }
+        known = {key: value[key] for key in kinds if key in value}
+        for key, found in known.items():
+            if not isinstance(found, kinds[key]):
+                raise DataError(f"not a conversion report: {str(found)[:40]!r}", field=key)
         try:
-            return cls(**known, skipped=[Skip(**skip) for skip in value.get("skipped", ())])
-        except TypeError as error:
+            skipped = [Skip(**{k: _text(v) for k, v in skip.items()}) for skip in value.get("skipped", ())]
+            return cls(**known, skipped=skipped)
+        except (TypeError, AttributeError) as error:
             raise DataError(f"not a conversion report: {error}", field="skipped") from error
 
     def after(self, earlier: Report) -> Report:
         """This report joined to the one of an earlier conversion into the same store."""
         skipped = list(dict.fromkeys([*earlier.skipped, *self.skipped]))
         return Report(
-            earlier.converted + self.converted, 0, earlier.files + self.files, skipped, self.settings
+            converted=earlier.converted + self.converted,
+            files=earlier.files + self.files,
+            skipped=skipped,
+            settings=self.settings,
+            odd=dict(Counter(earlier.odd) + Counter(self.odd)),
+            overlaps=earlier.overlaps + self.overlaps,
         )
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]!r} is no text")
+    return value
 
 
 def _count(skipped: list[Skip]) -> dict[str, int]:

@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_DT, MIN_DT, check_counts
 from symphony.data.segment import RunSegment, validate
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]
+
+MAX_SIGMA = 10.0
+"""Seconds of smoothing; a window that is much longer leaves nothing of the motion."""
+BLOCK = 1_000_000
 
 SLOW, FAST = 1.0, 2.0
 """m/s between which the heading goes over from the logged one to the direction of motion when smoothing."""
@@ -33,11 +38,14 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
         dt: seconds between the new steps.
 
     Raises:
-        ConfigError: ``dt`` is not positive.
-        DataError: fewer than two steps would remain, or the ego would be valid at none.
+        ConfigError: ``dt`` is not positive, or absurd.
+        DataError: fewer than two steps would remain, or more than a segment may have, or the ego would be valid at
+            none.
     """
-    if not (np.isfinite(dt) and dt > 0):
+    if not dt > 0:
         raise ConfigError(f"dt must be positive, is {dt}")
+    if not MIN_DT <= dt <= MAX_DT:
+        raise ConfigError(f"dt must be between {MIN_DT:g} and {MAX_DT:g} s, is {dt}")
     ratio = dt / segment.dt
     every = round(ratio)
     if every >= 1 and abs(ratio - every) < 1e-6 * every:
@@ -59,7 +67,9 @@ def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
 
 def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
     last = segment.num_steps - 1
-    where = np.arange(int(np.floor(last / ratio + 1e-6)) + 1) * ratio
+    steps = int(np.floor(last / ratio + 1e-6)) + 1
+    check_counts(segment.num_agents, steps, "valid")
+    where = np.arange(steps) * ratio
     before = np.minimum(np.floor(where + 1e-6).astype(np.int64), last)
     share = np.clip(where - before, 0, 1)
     share[share < 1e-6] = 0
@@ -100,17 +110,17 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
         sigma: standard deviation of the window in seconds; 0 changes nothing.
 
     Raises:
-        ConfigError: ``sigma`` is negative or not finite.
+        ConfigError: ``sigma`` is negative, above :data:`MAX_SIGMA` or not finite.
     """
-    if not (np.isfinite(sigma) and sigma >= 0):
-        raise ConfigError(f"sigma must not be negative, is {sigma}")
+    if not 0 <= sigma <= MAX_SIGMA:
+        raise ConfigError(f"sigma must not be negative or above {MAX_SIGMA:g} s, is {sigma}")
     if sigma == 0:
         return segment
     valid = segment.valid
-    position, slope, fitted = _local_line(segment.position.astype(np.float64), valid, segment.dt, sigma)
+    position, slope, fitted = local_line(segment.position.astype(np.float64), valid, segment.dt, sigma)
     velocity = np.where(fitted[..., None], slope[..., :2], segment.velocity)
     logged = segment.heading.astype(np.float64)
-    steady, _, _ = _local_line(_unwrapped(logged, valid)[..., None], valid, segment.dt, sigma)
+    steady, _, _ = local_line(_unwrapped(logged, valid)[..., None], valid, segment.dt, sigma)
     steady = steady[..., 0]
     speed = np.hypot(velocity[..., 0], velocity[..., 1])
     turn = wrap(np.arctan2(velocity[..., 1], velocity[..., 0]) - steady)
@@ -126,25 +136,43 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     )
 
 
-def _local_line(
+def local_line(
     values: Doubles, valid: NDArray[np.bool_], dt: float, sigma: float
 ) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
     """(value, slope, where a line could be fitted) at each step, of values [A, T, D]; values elsewhere."""
-    lag = (np.arange(valid.shape[1])[None] - np.arange(valid.shape[1])[:, None]) * dt
-    weight = np.where(np.abs(lag) <= 4 * sigma, np.exp(-0.5 * (lag / sigma) ** 2), 0.0)
     there = valid.astype(np.float64)
     # Offsets from the agent's mean keep the sums small, so that nothing is lost to cancellation.
     total = np.maximum(there.sum(axis=1), 1)[:, None, None]
     mean = (values * there[..., None]).sum(axis=1, keepdims=True) / total
     masked = (values - mean) * there[..., None]
-    s0, s1, s2 = (there @ (weight * lag**k).T for k in range(3))
-    y0, y1 = ((weight * lag**k) @ masked for k in range(2))
+    blocks = [_moments(there, masked, rows, dt, sigma) for rows in _blocks(valid.shape[1])]
+    s0, s1, s2, y0, y1 = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
     spread = s0 * s2 - s1**2
     fitted = valid & (spread > 1e-9 * s0**2 * sigma**2)
     safe = np.where(fitted, spread, 1.0)[..., None]
     value = (s2[..., None] * y0 - s1[..., None] * y1) / safe + mean
     slope = (s0[..., None] * y1 - s1[..., None] * y0) / safe
     return np.where(fitted[..., None], value, values), np.where(fitted[..., None], slope, 0.0), fitted
+
+
+def _blocks(steps: int) -> list[range]:
+    """Steps that are smoothed at a time: their lags to all others [rows, T] stay below ``BLOCK`` numbers."""
+    rows = max(BLOCK // steps, 1)
+    return [range(k, min(k + rows, steps)) for k in range(0, steps, rows)]
+
+
+def _moments(there: Doubles, masked: Doubles, rows: range, dt: float, sigma: float) -> tuple[Doubles, ...]:
+    """Weighted sums around some steps: of 1, lag and lag squared [A, rows]; of values, and by lag [A, rows, D]."""
+    steps = there.shape[1]
+    columns = slice(0, steps)
+    if len(rows) < steps:  # a long log: what is out of the window's reach is left out
+        reach = int(min(4 * sigma / dt + 1, steps))
+        columns = slice(max(rows.start - reach, 0), min(rows.stop + reach, steps))
+    lag = (np.arange(steps)[None, columns] - np.arange(steps)[rows.start : rows.stop, None]) * dt
+    weight = np.where(np.abs(lag) <= 4 * sigma, np.exp(-0.5 * (lag / sigma) ** 2), 0.0)
+    there, masked = there[:, columns], masked[:, columns]
+    sums = (there @ (weight * lag**k).T for k in range(3))
+    return *sums, *((weight * lag**k) @ masked for k in range(2))
 
 
 def _unwrapped(heading: Doubles, valid: NDArray[np.bool_]) -> Doubles:

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_COORDINATE, MAX_SIZE, size_checks, value_checks
 from symphony.errors import DataError
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
-
-MAX_COORDINATE = 20_000.0
-"""Metres from the origin beyond which float32 no longer resolves a millimetre; segments must be re-centred."""
 
 
 class AgentType(IntEnum):
@@ -164,6 +162,8 @@ class RunSegment:
         interest: [I] int32 agents the source marks as interacting.
         predict: [J] int32 agents the source marks for prediction.
         file: name of the file it was read from, without folder.
+        group: the recording it is part of. Segments of one recording share it, may overlap in time and are no
+            independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
     """
 
     segment_id: str
@@ -186,6 +186,7 @@ class RunSegment:
     interest: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     predict: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     file: str = ""
+    group: str = field(default="", metadata={"hashed": False})
 
     @property
     def num_agents(self) -> int:
@@ -203,7 +204,7 @@ class RunSegment:
 
 
 def content_hash(segment: RunSegment) -> str:
-    """SHA-256 over every field, array dtypes and shapes included; equal content gives equal hashes."""
+    """SHA-256 over every field but ``group``, array dtypes and shapes included; equal content, equal hashes."""
     digest = hashlib.sha256()
     _feed(digest, segment)
     return digest.hexdigest()
@@ -212,6 +213,8 @@ def content_hash(segment: RunSegment) -> str:
 def _feed(digest: Any, value: Any) -> None:
     if dataclasses.is_dataclass(value):
         for item in dataclasses.fields(value):
+            if not item.metadata.get("hashed", True):
+                continue
             digest.update(item.name.encode() + b"=")
             _feed(digest, getattr(value, item.name))
     elif isinstance(value, np.ndarray):
@@ -240,6 +243,7 @@ def validate(segment: RunSegment) -> RunSegment:
 def _checks(s: RunSegment) -> Any:
     agents, steps = s.num_agents, s.valid.shape[1] if s.valid.ndim == 2 else -1
     yield "segment_id", bool(s.segment_id) and "/" not in s.segment_id, "must be a non-empty name without '/'"
+    yield from size_checks(s)
     yield "dt", np.isfinite(s.dt) and s.dt > 0, f"must be positive, is {s.dt}"
     yield "valid", s.valid.dtype == np.bool_ and s.valid.shape == (agents, steps), "must be bool [A, T]"
     yield "valid", steps >= 2, f"needs at least 2 steps, has {steps}"
@@ -248,7 +252,7 @@ def _checks(s: RunSegment) -> Any:
     yield from _array("agent_type", s.agent_type, (agents,), np.uint8, len(AgentType))
     yield from _array("size", s.size, (agents, 3), np.float32)
     yield "size", bool((s.size[:, :2] > 0).all()), "length and width must be positive"
-    yield "size", bool((s.size < 100).all()), "a side of 100 m or more"
+    yield "size", bool((s.size < MAX_SIZE).all()), f"a side of {MAX_SIZE:g} m or more"
     yield from _array("position", s.position, (agents, steps, 3), np.float32)
     yield from _array("heading", s.heading, (agents, steps), np.float32)
     yield from _array("velocity", s.velocity, (agents, steps, 2), np.float32)
@@ -265,6 +269,7 @@ def _checks(s: RunSegment) -> Any:
     yield from _array("predict", s.predict, (len(s.predict),), np.int32, agents)
     yield "origin", s.origin.shape == (3,) and bool(np.isfinite(s.origin).all()), "must be 3 finite numbers"
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
+    yield from value_checks(s)
 
 
 def _checks_road(road: RoadMap) -> Any:

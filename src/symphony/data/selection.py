@@ -20,8 +20,9 @@ EXCLUSIONS = {
     "playback_agents": f"more than {MAX_PLAYBACK_AGENTS} playback agents",
     "roadgraph_points": f"more than {MAX_ROAD_POINTS} roadgraph points",
     "interactive_agents": "too few interactive agents",
+    "overlaps": "boxes that overlap in the log",
 }
-"""The paper's exclusions, in words."""
+"""The paper's exclusions, and last the one a conversion may add, in words."""
 POINT_SPACING = 2.0
 """Metres between the roadgraph points that are counted."""
 MOVING = 2.0
@@ -179,9 +180,9 @@ def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
         count: interactive agents it must have at its first step.
 
     Returns:
-        None, or the first of :data:`EXCLUSIONS` that applies and an error that says why: more than 256 playback
-        agents (those seen at some step), more than 10 000 roadgraph points (see :func:`road_points`), or too few
-        interactive agents.
+        None, or the first of the paper's :data:`EXCLUSIONS` that applies and an error that says why: more than 256
+        playback agents (those seen at some step), more than 10 000 roadgraph points (see :func:`road_points`), or
+        too few interactive agents.
     """
     where = {"file": segment.file or None, "segment": segment.segment_id}
     playback = int(segment.valid.any(1).sum()) - count

@@ -7,7 +7,7 @@ import json
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, SupportsIndex, cast, overload
@@ -18,9 +18,12 @@ from numpy.typing import NDArray
 from symphony.data import store_format as layout
 from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
 from symphony.data.store_format import MAPS, SEGMENTS, TableWriter
+from symphony.data.store_index import decoded, read_ids, read_indices, rows
 from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
+GROUP, NETWORK = "group", "network"
+"""Tags a segment's group is kept under: in this release, and by the generator before there were groups."""
 
 
 class StoreWriter:
@@ -60,10 +63,10 @@ class StoreWriter:
     def _open(self, fresh: bool, keep: int | None) -> None:
         if fresh:
             _create(self.path)
-        segments, maps = _read_indices(self.path, keep)
+        segments, maps = read_indices(self.path, keep)
         for table, records in ((SEGMENTS, segments), (MAPS, maps)):
             layout.check_columns(self.path, table, records)
-        self._ids = {name: k for k, name in enumerate(_read_ids(self.path, segments))}
+        self._ids = {name: k for k, name in enumerate(read_ids(self.path, segments))}
         self._roads = {record.tobytes(): k for k, record in enumerate(maps["hash"])}
         self._maps = TableWriter(self.path, MAPS, maps)
         self._segments = TableWriter(self.path, SEGMENTS, segments)
@@ -84,7 +87,8 @@ class StoreWriter:
 
         Args:
             segment: validated here.
-            tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`.
+            tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the name
+                ``group``, where the segment's group is kept.
 
         Returns:
             Its index.
@@ -97,7 +101,7 @@ class StoreWriter:
         try:
             if self.has(segment.segment_id):
                 raise DataError(TWICE, field="segment_id")
-            return self._append(segment, json.dumps(tags, ensure_ascii=False) if tags else "")
+            return self._append(segment, _tags_text(segment, tags))
         except DataError as error:
             raise error.at(file=segment.file or None, segment=segment.segment_id) from error
 
@@ -139,7 +143,7 @@ class StoreWriter:
         self._check_open()
         name, record, values, road = store.raw(index)
         if self.has(name):
-            file = bytes(values["file"]).decode() or None
+            file = decoded(bytes(values["file"]), "file") or None
             raise DataError(TWICE, file=file, segment=name, field="segment_id")
         key = road["hash"].tobytes()
         scalars = {field: record[field] for field, *_ in SEGMENTS.scalars}
@@ -180,24 +184,34 @@ class StoreWriter:
 class SegmentStore(Sequence[RunSegment]):
     """Read access to a store: ``store[i]`` reads that segment only, as read-only views of the mapped files.
 
-    Holds what was complete when it was opened. Pickles as its path, so each process maps the files itself.
+    Holds what was complete when it was opened. Pickles as its path, so each process maps the files itself. The first
+    time a process reads a segment, its content and its map's are compared with the hash that was written with it,
+    and checked against the schema.
 
     Args:
         path: the store's directory.
+        check: whether to look at what is read for the first time.
 
     Raises:
         DataError: not a store, of another version, or a file is missing, truncated or damaged.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, check: bool = True) -> None:
         self.path = Path(path).absolute()
         layout.check_header(self.path)
-        self._segments, self._maps = _read_indices(self.path)
+        self._segments, self._maps = read_indices(self.path)
+        longer = [
+            layout.check_columns(self.path, table, records)
+            for table, records in ((SEGMENTS, self._segments), (MAPS, self._maps))
+        ]
+        if any(longer):
+            layout.check_whole(self.path, len(self._segments))
+        self.check, self._unseen = check, np.full(len(self._segments), check)
         self._columns = layout.map_columns(self.path, SEGMENTS, self._segments)
         self._road_columns = layout.map_columns(self.path, MAPS, self._maps)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return SegmentStore, (str(self.path),)
+        return partial(SegmentStore, check=self.check), (str(self.path),)
 
     def __len__(self) -> int:
         return len(self._segments)
@@ -209,12 +223,24 @@ class SegmentStore(Sequence[RunSegment]):
     def __getitem__(self, index: SupportsIndex | slice) -> RunSegment | list[RunSegment]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        record = self._segments[self._row(index)]
-        parts = _rows(SEGMENTS, self._columns, record)
+        row = self._row(index)
+        try:
+            segment = self._read(row)
+            if self._unseen[row]:
+                self._check(row, segment)
+                self._unseen[row] = False
+        except DataError as error:
+            raise error.at(file=self.path, segment=self._name(row)) from error
+        return segment
+
+    def _read(self, row: int) -> RunSegment:
+        record = self._segments[row]
+        parts = rows(SEGMENTS, self._columns, record)
         agents, steps, lights = len(parts["agent_id"]), int(record["steps"]), len(parts["signal_lane"])
         parts.pop("tags")
         for name in ("segment_id", "source", "file"):
-            parts[name] = bytes(parts[name]).decode()
+            parts[name] = decoded(bytes(parts[name]), name)
+        parts["group"] = _group(self._tags(row), parts["segment_id"])
         for name in ("position", "heading", "velocity", "valid"):
             parts[name] = parts[name].reshape(agents, steps, *parts[name].shape[1:])
         parts["signal_state"] = parts["signal_state"].reshape(lights, steps)
@@ -226,6 +252,22 @@ class SegmentStore(Sequence[RunSegment]):
             current_step=int(record["current_step"]),
             origin=record["origin"].copy(),
         )
+
+    def _check(self, row: int, segment: RunSegment) -> None:
+        if content_hash(segment) != self._segments["hash"][row].tobytes().hex():
+            raise DataError("content does not match its hash: the store was damaged", file=self.path)
+        try:
+            validate(segment)
+        except DataError as error:
+            raise DataError(
+                error.message, file=self.path, segment=error.segment, field=error.field
+            ) from error
+
+    def _name(self, row: int) -> str:
+        try:
+            return self._text("segment_id", row)
+        except DataError:
+            return f"number {row}"
 
     def __iter__(self) -> Iterator[RunSegment]:
         return (self[i] for i in range(len(self)))
@@ -240,7 +282,7 @@ class SegmentStore(Sequence[RunSegment]):
         """One of the distinct maps (see :attr:`map_index`)."""
         if not 0 <= number < len(self._maps):
             raise IndexError(f"map {number} of {len(self._maps)}")
-        parts = _rows(MAPS, self._road_columns, self._maps[number])
+        parts = rows(MAPS, self._road_columns, self._maps[number])
         for name in ("lanes", "boundary", "marks"):
             parts[name] = Polylines(parts.pop(f"{name}.points"), parts.pop(f"{name}.offsets"))
         return RoadMap(**parts)
@@ -248,12 +290,12 @@ class SegmentStore(Sequence[RunSegment]):
     def raw(self, index: SupportsIndex) -> tuple[str, Any, dict[str, NDArray[Any]], Any]:
         """A segment as it is stored: id, index record, rows of every column, index record of its map."""
         record = self._segments[self._row(index)]
-        values = _rows(SEGMENTS, self._columns, record)
-        return bytes(values["segment_id"]).decode(), record, values, self._maps[int(record["map"])]
+        values = rows(SEGMENTS, self._columns, record)
+        return self._text("segment_id", self._row(index)), record, values, self._maps[int(record["map"])]
 
     def raw_road(self, number: int) -> dict[str, NDArray[Any]]:
         """Rows of every column of a map."""
-        return _rows(MAPS, self._road_columns, self._maps[number])
+        return rows(MAPS, self._road_columns, self._maps[number])
 
     @property
     def num_maps(self) -> int:
@@ -268,7 +310,7 @@ class SegmentStore(Sequence[RunSegment]):
     @cached_property
     def ids(self) -> list[str]:
         """Segment ids in order of insertion."""
-        return _read_ids(self.path, self._segments)
+        return read_ids(self.path, self._segments)
 
     @cached_property
     def _places(self) -> dict[str, int]:
@@ -286,32 +328,87 @@ class SegmentStore(Sequence[RunSegment]):
 
     def tags(self, index: SupportsIndex) -> dict[str, Any]:
         """What was given as ``tags`` when the segment was appended."""
-        text = self._text("tags", self._row(index))
-        return json.loads(text) if text else {}
+        found = self._tags(self._row(index))
+        return {name: value for name, value in found.items() if name != GROUP}
+
+    def _tags(self, row: int) -> dict[str, Any]:
+        try:
+            found = json.loads(self._text("tags", row) or "{}")
+        except (ValueError, RecursionError) as error:
+            raise self._damaged(row, "tags", f"not JSON: {error}") from error
+        if not isinstance(found, dict):
+            raise self._damaged(row, "tags", "not a JSON object")
+        return found
+
+    def _damaged(self, row: int, field: str, message: str) -> DataError:
+        return DataError(message, file=self.path, segment=self._name(row), field=field)
+
+    @cached_property
+    def groups(self) -> NDArray[np.str_]:
+        """[segments] the recording each segment is part of: :attr:`RunSegment.group`.
+
+        Its own id where the store does not know; the simulated network where an earlier release generated it.
+        """
+        found = [_group(self._tags(i), name) for i, name in enumerate(self.ids)]
+        return np.array(found, np.str_)
 
     def _text(self, column: str, row: int) -> str:
         axis = SEGMENTS.axes[column]
         begin, count = (int(self._segments[row][key][axis]) for key in ("begin", "count"))
-        return bytes(self._columns[column][begin : begin + count]).decode()
+        try:
+            return decoded(bytes(self._columns[column][begin : begin + count]), column)
+        except DataError as error:
+            name = f"number {row}" if column == "segment_id" else self._name(row)
+            raise error.at(file=self.path, segment=name) from error
 
     def checksum(self) -> str:
-        """SHA-256 over the segments' content hashes sorted by id: the order of insertion and the report,
-        say, do not enter.
+        """SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.
+
+        A hash covers all of a segment that :class:`~symphony.data.segment.RunSegment` holds, its map included; not
+        its tags, the order of insertion or the report. That the content still has these hashes is seen when it is
+        read (or by :meth:`verify`).
         """
         digest = hashlib.sha256()
         for i in sorted(range(len(self)), key=self.ids.__getitem__):
             digest.update(self._segments["hash"][i].tobytes())
         return digest.hexdigest()
 
-    def verify(self) -> None:
-        """Read everything and compare it with the content hashes written with it.
+    def verify(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Read everything, read before or not, and compare it with the hashes and the schema; the tags must be JSON.
+
+        Args:
+            progress: told how many segments are done, of how many.
 
         Raises:
-            DataError: naming the first segment whose data changed on disk.
+            DataError: naming the first segment that is not what was written, and its field where that is known.
         """
-        for i, segment_id in enumerate(self.ids):
-            if content_hash(self[i]) != self._segments["hash"][i].tobytes().hex():
-                raise DataError("content does not match its hash", file=self.path, segment=segment_id)
+        for number, key in enumerate(self._maps["hash"]):
+            if content_hash(cast(Any, self.road(number))) != key.tobytes().hex():
+                raise DataError(
+                    f"map {number} does not match its hash: the store was damaged", file=self.path
+                )
+        seen: dict[str, int] = {}
+        for row, name in enumerate(self.ids):
+            if seen.setdefault(name, row) != row:
+                raise DataError("two segments of this name", file=self.path, segment=name, field="segment_id")
+            try:
+                self._check(row, self._read(row))
+            except DataError as error:
+                raise error.at(file=self.path, segment=name) from error
+            self.tags(row)
+            self._unseen[row] = False
+            if progress is not None:
+                progress(row + 1, len(self))
+
+    @property
+    def num_steps(self) -> NDArray[np.int64]:
+        """Logged steps of every segment, the first included."""
+        return self._segments["steps"].astype(np.int64)
+
+    @property
+    def time_steps(self) -> NDArray[np.float64]:
+        """Seconds per step of every segment."""
+        return self._segments["dt"].astype(np.float64)
 
     @property
     def report(self) -> dict[str, Any]:
@@ -356,45 +453,21 @@ def _plain(segment: RunSegment) -> RunSegment:
     return segment.replace(dt=float(segment.dt), ego=int(segment.ego), current_step=int(segment.current_step))
 
 
+def _tags_text(segment: RunSegment, tags: Mapping[str, Any] | None) -> str:
+    """JSON of the tags and the group, which has no column of its own: older stores and releases have none."""
+    if tags and GROUP in tags:
+        raise DataError(f"{GROUP!r} is no name for a tag", field="tags")
+    known = segment.group not in {"", segment.segment_id}
+    found = {**(tags or {}), **({GROUP: segment.group} if known else {})}
+    return json.dumps(found, ensure_ascii=False) if found else ""
+
+
+def _group(tags: Mapping[str, Any], segment_id: str) -> str:
+    return str(tags.get(GROUP) or tags.get(NETWORK) or segment_id)
+
+
 def _road_values(road: RoadMap) -> dict[str, NDArray[Any]]:
     return {column.name: operator.attrgetter(column.name)(road) for column in MAPS.columns}
-
-
-def _rows(table: layout.Table, columns: Mapping[str, NDArray[Any]], record: Any) -> dict[str, Any]:
-    """Views of one record's rows of every column."""
-    begin, count = record["begin"].tolist(), record["count"].tolist()
-    found = {}
-    for column in table.columns:
-        axis = table.axes[column.axis]
-        found[column.name] = columns[column.name][begin[axis] : begin[axis] + count[axis]]
-    return found
-
-
-def _read_indices(path: Path, limit: int | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Records of the segments (the first ``limit``), and of the maps they lie on."""
-    segments = layout.read_index(path, SEGMENTS, limit)
-    count, axes = segments["count"], SEGMENTS.axes
-    agents, lights, steps = count[:, axes["agents"]], count[:, axes["signals"]], segments["steps"]
-    sound = (
-        (count[:, axes["states"]] == agents * steps)
-        & (count[:, axes["signal_states"]] == lights * steps)
-        & (segments["ego"] >= 0)
-        & (segments["ego"] < agents)
-        & (segments["map"] >= 0)
-    )
-    if not sound.all():
-        message = f"record {int(np.argmin(sound))} contradicts itself: the file is damaged"
-        raise DataError(message, file=SEGMENTS.index_path(path))
-    # Maps no segment points at belong to an append that never finished.
-    return segments, layout.read_index(path, MAPS, limit=int(segments["map"].max(initial=-1)) + 1)
-
-
-def _read_ids(path: Path, segments: NDArray[Any]) -> list[str]:
-    axis = SEGMENTS.axes["segment_id"]
-    column = next(c for c in SEGMENTS.columns if c.name == "segment_id")
-    data = SEGMENTS.column_path(path, column).read_bytes()
-    begin, count = segments["begin"][:, axis].tolist(), segments["count"][:, axis].tolist()
-    return [data[b : b + n].decode() for b, n in zip(begin, count, strict=True)]
 
 
 def _is_blank(path: Path) -> bool:

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.errors import DataError
+from symphony.files import locating
 
 try:
     import fcntl
@@ -163,6 +164,8 @@ def check_header(folder: Path) -> None:
         DataError: the folder is missing, not a store, or of another version.
     """
     path = folder / HEADER
+    if not folder.name:
+        raise DataError("not a segment store: it has no name of its own", file=folder)
     if not path.is_file():
         if not folder.is_dir():
             message = "no such directory" if not folder.exists() else "not a directory"
@@ -191,7 +194,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"cannot be read as JSON: {error}", file=path) from error
     if not isinstance(found, dict):
         raise DataError("cannot be read as JSON: not an object", file=path)
@@ -201,11 +204,12 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Replace a JSON file in one step, so that no reader sees half of it."""
     draft = path.with_name(path.name + ".tmp")
-    with draft.open("w", encoding="utf-8") as file:
-        json.dump(value, file, indent=1, ensure_ascii=False, default=str)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
+    with locating(path):
+        with draft.open("w", encoding="utf-8") as file:
+            json.dump(value, file, indent=1, ensure_ascii=False, default=str)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
 
 
 def read_index(folder: Path, table: Table, limit: int | None = None) -> NDArray[Any]:
@@ -228,7 +232,8 @@ def read_index(folder: Path, table: Table, limit: int | None = None) -> NDArray[
     records = _map(path, table.record, (count if limit is None else limit,))
     begin, rows = records["begin"], records["count"]
     chained = np.array_equal(begin[1:], begin[:-1] + rows[:-1]) and not begin[:1].any()
-    if not chained or (rows < 0).any():
+    # Sums that pass the largest integer wrap around, and would follow one another again.
+    if not chained or (rows < 0).any() or (begin < 0).any():
         raise DataError("index records do not follow one another: the file is damaged", file=path)
     return records
 
@@ -240,13 +245,16 @@ def ends(records: NDArray[Any], table: Table) -> NDArray[np.int64]:
     return np.asarray(records[-1]["begin"] + records[-1]["count"], np.int64)
 
 
-def check_columns(folder: Path, table: Table, records: NDArray[Any]) -> None:
+def check_columns(folder: Path, table: Table, records: NDArray[Any]) -> bool:
     """See that every column holds what the index says.
 
+    Returns:
+        Whether one holds more: a writer is at work or has died, or the index was cut short.
+
     Raises:
-        DataError: naming the first column that is missing or too short.
+        DataError: locating the first column that is missing or too short.
     """
-    rows = ends(records, table)
+    rows, more = ends(records, table), False
     for column in table.columns:
         path = table.column_path(folder, column)
         try:
@@ -257,6 +265,23 @@ def check_columns(folder: Path, table: Table, records: NDArray[Any]) -> None:
         if size < need:
             message = f"column is truncated: {size} of {need} bytes"
             raise DataError(message, file=path, field=column.name)
+        more |= size > need
+    return more
+
+
+def check_whole(folder: Path, segments: int) -> None:
+    """See that the index holds as many segments as the report has counted.
+
+    Raises:
+        DataError: it holds fewer.
+    """
+    path = folder / REPORT
+    counted = read_json(path).get("converted") if path.exists() else None
+    if isinstance(counted, int) and counted > segments:
+        message = (
+            f"index holds {segments} segments, the report of their conversion {counted}: it was cut short"
+        )
+        raise DataError(message, file=SEGMENTS.index_path(folder))
 
 
 def _map(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -269,7 +294,6 @@ def _map(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 def map_columns(folder: Path, table: Table, records: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Every column, [rows in use, *tail], memory-mapped."""
-    check_columns(folder, table, records)
     rows = ends(records, table)
     return {
         c.name: _map(table.column_path(folder, c), c.dtype, (int(rows[table.axes[c.axis]]), *c.tail))
@@ -352,7 +376,8 @@ class TableWriter:
     def sync(self) -> None:
         """Bring everything to the disk, columns before the index."""
         for file in (*self._files.values(), self._index):
-            os.fsync(file.fileno())
+            with locating(file.name):
+                os.fsync(file.fileno())
 
     def close(self) -> None:
         """Bring everything to the disk, and write no more."""
@@ -380,6 +405,7 @@ def lock(folder: Path) -> BinaryIO:
 
 def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:
     data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-    file.seek(offset)
-    while data:
-        data = data[file.write(data) :]
+    with locating(file.name):
+        file.seek(offset)
+        while data:
+            data = data[file.write(data) :]

@@ -25,6 +25,7 @@ from symphony.data import store_format
 from symphony.data.report import Report, Skip
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.errors import ConfigError, DataError
+from symphony.files import locating
 
 FORMAT, VERSION = "symphony conversion", 1
 JOURNAL, STORE, PARTS = "journal.jsonl", "store", "parts"
@@ -50,7 +51,7 @@ class Job:
         """Refuse to go on with a conversion that was begun otherwise.
 
         Raises:
-            ConfigError: naming the first setting that differs.
+            ConfigError: locating the first setting that differs.
         """
         names = dict.fromkeys([*begun.settings, *self.settings])
         pairs = [(name, begun.settings.get(name), self.settings.get(name)) for name in names]
@@ -170,14 +171,16 @@ class Draft:
         """Put on record that ``report.files`` files are done; this survives whatever comes."""
         writer.sync()
         skipped = [skip.to_json() for skip in report.skipped[self._told :]]
-        counts = {name: getattr(report, name) for name in ("files", "converted", "present")}
+        names = ("files", "converted", "present", "odd", "overlaps")
+        counts = {name: getattr(report, name) for name in names}
         self._write(counts | {"segments": len(writer), "skipped": skipped})
         self._told = len(report.skipped)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        self._journal.write(json.dumps(line, ensure_ascii=False, default=str).encode() + b"\n")
-        self._journal.flush()
-        os.fsync(self._journal.fileno())
+        with locating(self.folder / JOURNAL):
+            self._journal.write(json.dumps(line, ensure_ascii=False, default=str).encode() + b"\n")
+            self._journal.flush()
+            os.fsync(self._journal.fileno())
 
     def finish(self, report: Report) -> None:
         """Give the store its name, or add what was collected to the store that is there; then tidy up."""
@@ -221,7 +224,13 @@ class Draft:
 
 
 def folder_of(out: Path) -> Path:
-    """Where the unfinished conversion into a store lies."""
+    """Where the unfinished conversion into a store lies.
+
+    Raises:
+        DataError: the root of a file system can't be a store.
+    """
+    if not out.name:
+        raise DataError("no place for a store: it has no name of its own", file=out)
     return out.with_name(out.name + store_format.PARTIAL)
 
 
@@ -243,16 +252,20 @@ def read_journal(folder: Path) -> Begun | None:
         if head["format"] != FORMAT or head["version"] != VERSION:
             message = f"a {head['format']} of version {head['version']}; this release knows version {VERSION}"
             raise DataError(message, file=path)
-        job = Job(**head["job"] | {"files": [(name, size) for name, size in head["job"]["files"]]})
+        job = Job(**head["job"] | {"files": [(str(name), int(size)) for name, size in head["job"]["files"]]})
         report, segments, finished = Report(settings=dict(job.settings)), 0, False
         for line in lines:
             if "finished" in line:
                 finished = True
                 continue
-            report.files, report.converted = line["files"], line["converted"]
-            report.present, segments = line["present"], line["segments"]
+            names = ("files", "converted", "present", "segments", "overlaps")
+            counts = [line.get(name, 0) if name == "overlaps" else line[name] for name in names]
+            if not all(type(count) is int and count >= 0 for count in counts) or counts[0] > len(job.files):
+                raise ValueError(f"{counts} are no counts of {len(job.files)} files")
+            report.files, report.converted, report.present, segments, report.overlaps = counts
+            report.odd = dict(line.get("odd", {}))
             report.skipped += [Skip(**skip) for skip in line["skipped"]]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(f"not the journal of a conversion: {error}", file=path) from error
     return Begun(job, report, segments, finished, size)
 

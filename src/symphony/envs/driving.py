@@ -27,6 +27,7 @@ from symphony.envs.observation import (
 )
 from symphony.envs.routes import ROUTE_FEATURES, pick_routes, route_ahead, route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
+from symphony.envs.tables import Tables
 from symphony.errors import ConfigError
 from symphony.geometry.frames import forward_speed
 from symphony.streams import fold_in
@@ -140,27 +141,31 @@ class DrivingEnv(EnvBase):
         def numbers() -> Unbounded:
             return Unbounded(shape=(1,), dtype=torch.int64, device=device)
 
-        seen = Composite(
-            {
-                "own": floats(n, SELF_FEATURES),
-                "objects": floats(n, config.num_objects, OBJECT_FEATURES),
-                "objects_mask": flags(n, config.num_objects),
-                "points": floats(n, config.num_points, POINT_FEATURES),
-                "points_mask": flags(n, config.num_points),
-            },
-            shape=(n,),
-        )
+        self._tables: Tables | None = None
+        seen = Composite(shape=(n,))
+        if config.own:
+            seen["own"] = floats(n, SELF_FEATURES)
+        for name, count, width in (
+            ("objects", config.num_objects, OBJECT_FEATURES),
+            ("points", config.num_points, POINT_FEATURES),
+        ):
+            if count:
+                seen[name], seen[f"{name}_mask"] = floats(n, count, width), flags(n, count)
         if config.route:
             seen["route"] = floats(n, ROUTE_FEATURES)
         if config.clearance:
-            seen["gap"], seen["road"] = floats(n, config.num_objects), floats(n, 5)
-            if config.foresight:
-                seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
+            seen["road"] = floats(n, 5)
+            if config.num_objects:
+                seen["gap"] = floats(n, config.num_objects)
+                if config.foresight:
+                    seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
 
         def goals() -> Unbounded:
             return Unbounded(shape=(n,), dtype=torch.int64, device=device)
 
-        agents = {"observation": seen, "valid": flags(n), "state": floats(n, 4), "goal": goals()}
+        agents = {"valid": flags(n), "state": floats(n, 4), "goal": goals()}
+        if not seen.is_empty():
+            agents["observation"] = seen
         outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
         progress = {"scene": numbers(), "step": numbers(), "stream": numbers()}
         self.observation_spec = Composite(
@@ -301,7 +306,7 @@ class DrivingEnv(EnvBase):
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
         index = self.scenes.interactive[row]
         objects = objects_at(self.scenes, row, at, moved, index, real)
-        seen = observe(self.scenes, row, at, objects, index, self.observation)
+        seen = observe(self.scenes, row, at, objects, index, self.observation, self._kept())
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
@@ -320,7 +325,6 @@ class DrivingEnv(EnvBase):
         each = [*shape, self.num_agents]
         agents = TensorDict(
             {
-                "observation": TensorDict({k: back(v) for k, v in observation.items()}, batch_size=each),
                 "valid": valid,
                 "state": state,
                 "goal": goal,
@@ -328,7 +332,11 @@ class DrivingEnv(EnvBase):
                 "offroad": back(offroad)[..., None],
             },
             batch_size=each,
+            device=self.device,  # one without a device would be taken for a transfer, and waited for
         )
+        if observation:
+            parts = {name: back(value) for name, value in observation.items()}
+            agents.set("observation", TensorDict(parts, batch_size=each, device=self.device))
         return TensorDict(
             {
                 "scene": scene[..., None],
@@ -352,7 +360,13 @@ class DrivingEnv(EnvBase):
         if seen.road is not None:
             return collision, (seen.road[..., 0] > 0) & valid
         position = _rows_of(objects.state, index)[..., :2]
-        return collision, offroad_flags(self.scenes, scene, position) & valid
+        return collision, offroad_flags(self.scenes, scene, position, self._kept()) & valid
+
+    def _kept(self) -> Tables:
+        """What is looked up at each step of the present scenes."""
+        if self._tables is None or self._tables.scenes is not self.scenes:
+            self._tables = Tables(self.scenes, self.observation)
+        return self._tables
 
 
 def _rows_of(values: Tensor, index: Tensor) -> Tensor:

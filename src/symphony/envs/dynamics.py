@@ -7,13 +7,16 @@ place. Shapes: ``...`` any batch, T steps.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
 
 WHEELBASE = 0.6
@@ -127,11 +130,11 @@ class Dynamics(Protocol):
         ...
 
 
-def _quadratic(count: int) -> Float[Tensor, " K"]:
-    """An odd number of values from -1 to 1, dense about the middle one, which is exactly 0."""
+def _quadratic(largest: float, count: int) -> NDArray[np.float32]:
+    """An odd number of values up to ``largest`` either way, dense about the middle one, which is exactly 0."""
     half = count // 2
-    unit = (torch.arange(count) - half) / half
-    return unit * unit.abs()
+    unit = (np.arange(count) - half).astype(np.float32) / np.float32(half)
+    return np.float32(largest) * (unit * np.abs(unit))
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,13 @@ class Bicycle:
     effort: float = 0.002
     discrete: Literal[True] = True
     numbers: Literal[0] = 0
+    _joint: tuple[tuple[float, ...], tuple[float, ...]] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        acceleration = _quadratic(self.max_acceleration, self.num_acceleration)
+        steering = _quadratic(self.max_steering, self.num_steering)
+        joint = np.repeat(acceleration, self.num_steering), np.tile(steering, self.num_acceleration)
+        object.__setattr__(self, "_joint", tuple(tuple(values.tolist()) for values in joint))
 
     @property
     def num_actions(self) -> int:
@@ -170,12 +180,8 @@ class Bicycle:
 
     def grid(self, like: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
-        acceleration = self.max_acceleration * _quadratic(self.num_acceleration)
-        steering = self.max_steering * _quadratic(self.num_steering)
-        return (
-            acceleration.repeat_interleave(self.num_steering).to(like),
-            steering.repeat(self.num_acceleration).to(like),
-        )
+        acceleration, steering = self._joint
+        return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
 
     def step(
         self,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.data.segment import RunSegment
+from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
 from symphony.roadgraph import (
     LaneGraph,
@@ -101,7 +102,7 @@ def route_ahead(
         # The last point has nothing ahead of it, so the one before gives the direction.
         nearest = squared.masked_fill(~exists, torch.inf).argmin(-1)
         nearest = nearest.minimum((count - 2).clamp_min(0))
-        which = nearest[..., None] + torch.tensor(AHEAD, device=points.device)
+        which = nearest[..., None] + constant(AHEAD, torch.int64, points.device)
         there = which < count[..., None]
         which = which.clamp_max(points.shape[2] - 1)
     seen = points.gather(2, which[..., None].expand(*which.shape, 2))

@@ -83,15 +83,15 @@ class SceneBatch(TensorClass):
         point: [B, P, 2].
         point_direction: [B, P, 2] unit vector along the line; for lights from the stop point to where their lane
             leads.
-        point_type: [B, P] int64, :class:`PointType`.
+        point_type: [B, P] uint8, :class:`PointType`.
         point_speed: [B, P] speed limit of the lane, m/s, 0 where unknown.
-        point_light: [B, P] int64 row of Q for lights, else -1.
+        point_light: [B, P] int16 row of Q for lights, else -1.
         point_valid: [B, P].
-        light: [B, T, Q] int64, ``SignalState``.
+        light: [B, T, Q] uint8, ``SignalState``.
         edge_start: [B, E, 2] boundary segments, the drivable side on their left.
         edge_end: [B, E, 2].
-        edge_previous: [B, E] int64 segment that ends where this one starts, -1 if none.
-        edge_following: [B, E] int64.
+        edge_previous: [B, E] int32 segment that ends where this one starts, -1 if none.
+        edge_following: [B, E] int32.
         edge_valid: [B, E].
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
         segment: [B] int64 number of the run segment among those that scenes are drawn from.
@@ -168,11 +168,11 @@ def scene(
         "interactive": chosen.astype(np.int64),
         "interactive_valid": np.ones(len(chosen), bool),
         "last_step": np.array(segment.num_steps - 1),
-        "light": segment.signal_state.T.astype(np.int64),
+        "light": segment.signal_state.T.astype(np.uint8),
         "edge_start": start,
         "edge_end": end,
-        "edge_previous": previous,
-        "edge_following": following,
+        "edge_previous": previous.astype(np.int32),
+        "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
         "stream": np.array(stream_of(segment.segment_id)),
         "segment": np.array(number),
@@ -265,9 +265,9 @@ def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
     return {
         "point": np.concatenate(point).astype(np.float32),
         "point_direction": np.concatenate(direction).astype(np.float32),
-        "point_type": np.concatenate(kind).astype(np.int64),
+        "point_type": np.concatenate(kind).astype(np.uint8),
         "point_speed": np.concatenate(speed).astype(np.float32),
-        "point_light": light.astype(np.int64),
+        "point_light": light.astype(np.int16),
         "point_valid": np.ones(len(light), bool),
     }
 

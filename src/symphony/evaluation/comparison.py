@@ -22,8 +22,9 @@ from symphony.evaluation.records import (
     updates_done,
 )
 
-PLAYBACK = "playback"
-ROWS: tuple[str, ...] = (PLAYBACK, *get_args(Method))
+BASELINES = {"playback": "Playback", "constant_velocity": "Constant velocity"}
+"""Rows that every table begins with."""
+ROWS: tuple[str, ...] = (*BASELINES, *get_args(Method))
 SETTINGS: dict[Setting, tuple[int, int]] = {"main": (2, 10), "long": (2, 20), "many": (8, 10)}
 """Interactive agents and seconds."""
 WHOLE_LOG = 10
@@ -67,6 +68,8 @@ COLUMNS = (
     Column("curvature_jsd", "curvature JSD", "10⁻³", 1000.0),
 )
 """In the paper's order and units."""
+COST = Column("cost", "CPU", "s/segment", digits=2)
+"""Of the simulation of all rollouts of a segment."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +120,14 @@ class Comparison:
     Attributes:
         setting: which of the paper's.
         dataset: whose figures stand beside ours; None for none.
+        columns: the paper's metrics, metrics of the user's own, the cost.
         rows: in the paper's order, of the methods there are.
         notes: what else must be known to read it.
     """
 
     setting: Setting
     dataset: PaperData | None
+    columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
 
@@ -155,7 +160,7 @@ class Entry:
 
 def method_name(method: str) -> str:
     """A method as the paper writes it, such as BC+TS+H."""
-    return "Playback" if method == PLAYBACK else method.upper().replace("_", "+")
+    return BASELINES.get(method) or method.upper().replace("_", "+")
 
 
 def family(method: str) -> str:
@@ -255,7 +260,7 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
     """The table of some evaluated runs; their order does not matter.
 
     Raises:
-        ConfigError: no runs, runs judged on different segments, seeds of a method judged in different ways, or
+        ConfigError: no runs, runs evaluated on different segments, seeds of a method evaluated in different ways, or
             figures that the paper does not have.
         DataError: an evaluation without a number that is needed.
     """
@@ -266,26 +271,37 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
         raise ConfigError(f"no evaluated runs of setting '{setting}'")
     entries = sorted(entries, key=lambda entry: (ROWS.index(entry.method), entry.seed))
     _check_comparable(entries)
-    rows = [_playback_row(entries[0])]
+    # Beside the paper's figures stand only what the paper has.
+    columns = COLUMNS if figures else (*COLUMNS, *_own_columns(entries), COST)
+    rows = [_baseline_row(entries[0], name, columns) for name in BASELINES]
     for method in dict.fromkeys(entry.method for entry in entries):
         mine = [entry for entry in entries if entry.method == method]
-        cells = {column.key: Cell.of([_number(entry, column.key) for entry in mine]) for column in COLUMNS}
+        cells = {column.key: Cell.of([_number(entry, column.key) for entry in mine]) for column in columns}
         seeds, names = tuple(entry.seed for entry in mine), tuple(entry.name for entry in mine)
         rows.append(Row(method, seeds, cells, evaluations=names))
-    ours = _with_best({row.method: row.cells for row in rows})
-    theirs = _with_best(_paper_cells(figures or {}))
+    ours = _with_best({row.method: row.cells for row in rows}, columns)
+    theirs = _with_best(_paper_cells(figures or {}), COLUMNS)
     rows = [
         Row(row.method, row.seeds, ours[row.method], theirs.get(row.method, {}), row.evaluations)
         for row in rows
     ]
-    return Comparison(setting, dataset, tuple(rows), tuple(_notes(entries, dataset)))
+    return Comparison(setting, dataset, columns, tuple(rows), tuple(_notes(entries, dataset)))
 
 
-def _playback_row(entry: Entry) -> Row:
-    """The log is at no distance from itself, so only its collisions and its time off the road say anything."""
-    blank = {key: Cell((), math.nan, math.nan) for key in METRICS[2:]}
-    cells = {key: Cell.of([_number(entry, key, PLAYBACK)]) for key in METRICS[:2]}
-    return Row(PLAYBACK, (), cells | blank)
+def _own_columns(entries: Sequence[Entry]) -> list[Column]:
+    """A column for each metric of a user's own that all evaluations have."""
+    paths = [set(entry.record["config"].get("metric", ())) for entry in entries]
+    return [Column(path, path.rpartition(":")[2], "", digits=3) for path in sorted(set.intersection(*paths))]
+
+
+def _baseline_row(entry: Entry, name: str, columns: Sequence[Column]) -> Row:
+    """What the evaluations say of the log or of constant velocity."""
+    cells = {column.key: Cell((), math.nan, math.nan) for column in columns}
+    # The log is at no distance from itself, so only its collisions and its time off the road say anything.
+    known = METRICS[:2] if name == "playback" else METRICS
+    for key in known:
+        cells[key] = Cell.of([_number(entry, key, name)])
+    return Row(name, (), cells)
 
 
 def _paper_cells(figures: Mapping[str, Mapping[str, tuple[float, float]]]) -> dict[str, dict[str, Cell]]:
@@ -295,24 +311,30 @@ def _paper_cells(figures: Mapping[str, Mapping[str, tuple[float, float]]]) -> di
     }
 
 
-def _with_best(table: Mapping[str, Mapping[str, Cell]]) -> dict[str, dict[str, Cell]]:
+def _with_best(
+    table: Mapping[str, Mapping[str, Cell]], columns: Sequence[Column]
+) -> dict[str, dict[str, Cell]]:
     """Mark the lowest value of every metric in each family of two methods or more.
 
     What looks equal in the table is equally good.
     """
-    shown = {column.key: column.shown for column in COLUMNS}
+    shown = {column.key: column.shown for column in columns}
+    ranked = {column.key for column in COLUMNS}
     done: dict[str, dict[str, Cell]] = {}
     for method, cells in table.items():
         rivals = [other for other in table if family(other) == family(method)]
         done[method] = {}
         for key, cell in cells.items():
             means = [table[other][key].mean for other in rivals if not math.isnan(table[other][key].mean)]
-            best = method != PLAYBACK and len(means) > 1 and shown[key](cell.mean) == shown[key](min(means))
+            rated = key in ranked and method not in BASELINES and len(means) > 1
+            best = rated and shown[key](cell.mean) == shown[key](min(means))
             done[method][key] = Cell(cell.values, cell.mean, cell.error, best)
     return done
 
 
 def _number(entry: Entry, key: str, part: str = "") -> float:
+    if key == COST.key:
+        return float(entry.record["cost"]["simulation"]) / max(1, entry.record["segments"])
     where = entry.record[part] if part else entry.record
     value = where.get(key, "")
     # JSON has no NaN, which stands for a mean over nothing.
@@ -325,17 +347,17 @@ def _number(entry: Entry, key: str, part: str = "") -> float:
 
 def _check_comparable(entries: Sequence[Entry]) -> None:
     first = entries[0]
-    judged: dict[str, Entry] = {}
+    known: dict[str, Entry] = {}
     for entry in entries:
         if entry.record["data"].get("checksum") != first.record["data"].get("checksum"):
             raise ConfigError(
-                f"judged on different run segments, choose with --evaluation: {first.folder} ({first.name}), "
+                f"evaluated on different run segments, choose with --evaluation: {first.folder} ({first.name}), "
                 f"{entry.folder} ({entry.name})"
             )
-        other = judged.setdefault(entry.method, entry)
+        other = known.setdefault(entry.method, entry)
         if _way(other) != _way(entry):
             raise ConfigError(
-                f"seeds of {method_name(entry.method)} judged in different ways, choose with --evaluation: "
+                f"seeds of {method_name(entry.method)} evaluated in different ways, choose with --evaluation: "
                 f"{other.folder} ({other.name}), {entry.folder} ({entry.name})"
             )
 
@@ -364,9 +386,9 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
         if differing:
             notes.append(f"runs of {method_name(method)} differ in {', '.join(differing)}")
     for entry in entries:
-        judged, now = entry.record["run"]["updates"], updates_done(entry.folder)
-        if judged and now and judged != now:
-            notes.append(f"{entry.folder} was judged after {judged} updates and has {now} now")
+        then, now = entry.record["run"]["updates"], updates_done(entry.folder)
+        if then and now and then != now:
+            notes.append(f"{entry.folder} was evaluated after {then} updates and has {now} now")
     if dataset is not None:
         notes.append(f"paper: Igl et al. 2022, {dataset} dataset, five seeds")
     return notes

@@ -2,35 +2,52 @@
 
 from __future__ import annotations
 
+import dataclasses
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
-from symphony.agents.agent import Agent, load_agent
-from symphony.collectors import KeepAll, max_then_sum
+from symphony.agents import Agent, load_agent
 from symphony.config import EvaluateConfig
+from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
-from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
-from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds, collisions, offroad
-from symphony.modules import SeededNoise
+from symphony.imports import load_object
+from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.simulation.demonstrations import SceneDataset, logged
-from symphony.simulation.rollouts import (
-    Rollouts,
-    plant,
-    pruning_rule,
-    rollouts_of,
-    search,
-    simulate,
-)
+from symphony.simulation.driving import driven_by, search_kind
+from symphony.simulation.finite import NotFiniteError
+from symphony.simulation.rollouts import Rollouts
+
+BASELINES = ("playback", "constant_velocity")
+"""Evaluated beside every agent, on the agents it drives and for as long."""
+Metric = Callable[[SceneBatch, Rollouts], Tensor]
+"""A metric of a user's own: a number [B, K] per rollout, NaN where there is none."""
+
+
+class EvaluatedBatch(NamedTuple):
+    """Scenes and the very rollouts that the metrics are of.
+
+    Attributes:
+        items: numbers of the run segments in their dataset.
+        segments: the run segments.
+        scenes: B scenes, on the CPU.
+        rollouts: [B, K, ...], on the CPU.
+    """
+
+    items: list[int]
+    segments: list[RunSegment]
+    scenes: SceneBatch
+    rollouts: Rollouts
 
 
 @dataclass(frozen=True)
@@ -40,9 +57,12 @@ class Evaluation:
     Attributes:
         agent: its name.
         metrics: accumulated over all run segments.
-        config: how it was judged.
+        config: how it was evaluated.
         interactive: agents per segment that acted.
         search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
+        own: mean of each metric of the user's own per run segment, by import path.
+        seconds: CPU time of the simulation, what it costs.
+        baselines: the same of :data:`BASELINES`, where they were asked for.
     """
 
     agent: str
@@ -50,12 +70,22 @@ class Evaluation:
     config: EvaluateConfig
     interactive: int
     search: str
+    own: dict[str, list[float]] = field(default_factory=dict)
+    seconds: float = 0.0
+    baselines: tuple[Evaluation, ...] = ()
 
     def numbers(self) -> dict[str, float | int | str]:
         """The table row: rates in percent, distances in metres, divergence in nats, standard errors beside them."""
+        own: dict[str, float] = {}
+        for path, values in self.own.items():
+            found = np.array([value for value in values if np.isfinite(value)])
+            many = len(found) > 1
+            own[path] = float(found.mean()) if len(found) else np.nan
+            own[f"{path}_se"] = float(found.std(ddof=1) / np.sqrt(len(found))) if many else np.nan
         return {
             "agent": self.agent,
             **self.metrics.compute(),
+            **own,
             "interactive": self.interactive,
             "search": self.search,
             "trees": self.config.trees if self.search in ("tree", "oracle") else 0,
@@ -68,16 +98,22 @@ def evaluate(
     data: SegmentStore | Path,
     config: EvaluateConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    baselines: bool = False,
+    observe: Callable[[EvaluatedBatch], None] | None = None,
 ) -> Evaluation:
-    """Judge an agent on every run segment of a store (paper, section V-B).
+    """Evaluate an agent on every run segment of a store (paper, section V-B).
 
     Args:
         agent: an agent, or the name of one (see :func:`symphony.agents.load_agent`).
         data: a store, or its folder.
         config: how.
         progress: called with the segments done and their total.
+        baselines: evaluate :data:`BASELINES` on the same segments, too.
+        observe: called with every batch of rollouts, to draw or keep them.
 
     Raises:
+        ConfigError: if the agent learned another time step than the store has.
         DataError: if the store is empty, or a segment has too few agents for so many interactive ones.
     """
     config = EvaluateConfig() if config is None else config
@@ -85,25 +121,27 @@ def evaluate(
     store = data if isinstance(data, SegmentStore) else SegmentStore(data)
     if len(store) == 0:
         raise DataError("the store holds no run segments", file=store.path)
-    interactive = config.interactive or agent.interactive
     dataset = SceneDataset(
         store,
-        interactive,
+        config.interactive or agent.interactive,
         agent.dynamics,
         routes=agent.goals is not None,
         duration=config.duration or agent.duration,
         keep=config.batch,
     )
-    return judge(agent, dataset, config, progress)
+    return evaluate_dataset(agent, dataset, config, progress, baselines=baselines, observe=observe)
 
 
-def judge(
+def evaluate_dataset(
     agent: Agent,
     dataset: SceneDataset,
     config: EvaluateConfig,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    baselines: bool = False,
+    observe: Callable[[EvaluatedBatch], None] | None = None,
 ) -> Evaluation:
-    """Judge an agent on every run segment of a prepared dataset, as :func:`evaluate` does.
+    """Evaluate an agent on every run segment of a prepared dataset, as :func:`evaluate` does.
 
     Args:
         agent: the agent, on ``config.device``.
@@ -111,42 +149,77 @@ def judge(
             for how long.
         config: how else.
         progress: called with the segments done and their total.
+        baselines: evaluate :data:`BASELINES` too.
+        observe: called with every batch of rollouts.
 
     Raises:
+        ConfigError: if the agent learned another time step than the dataset has.
         DataError: if a segment has too few agents for so many interactive ones.
+        NotFiniteError: if a network of the agent puts out a number that is not finite.
     """
-    metrics = RolloutMetrics()
+    agent.check_step(dataset.dt)
+    others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
+    everyone = [agent, *(other for other in others if other.name != agent.name)]
+    # Baselines always do the same, and have no discriminator to search by.
+    once = dataclasses.replace(config, rollouts=1, trees=1, search="none")
+    own = {path: load_object(path) for path in config.metric}
+    found = [
+        Evaluation(one.name, RolloutMetrics(), how, dataset.interactive, search_kind(one, how))
+        for one, how in zip(everyone, [config] + [once] * len(others), strict=False)
+    ]
+    seconds = [0.0] * len(everyone)
     for first in range(0, len(dataset), config.batch):
         items = list(range(first, min(first + config.batch, len(dataset))))
-        _evaluate_batch(agent, dataset, items, config, metrics)
+        scenes = dataset.scenes(items).to(torch.device(config.device))
+        for k, (one, evaluation) in enumerate(zip(everyone, found, strict=True)):
+            began = time.process_time()
+            try:
+                rollouts = driven_by(one, scenes, evaluation.config)
+            except NotFiniteError as error:
+                raise error.named(dataset.segment(items[error.row]).segment_id) from error
+            seconds[k] += time.process_time() - began
+            _add(evaluation, dataset, items, scenes, rollouts, own)
+            if observe is not None and one is agent:
+                segments = [dataset.segment(i) for i in items]
+                observe(EvaluatedBatch(items, segments, scenes.cpu(), rollouts.cpu()))
         if progress is not None:
             progress(items[-1] + 1, len(dataset))
-    kind = "log" if agent.policy is None else _kind(agent, config)
-    return Evaluation(agent.name, metrics, config, dataset.interactive, kind)
+    found = [dataclasses.replace(one, seconds=spent) for one, spent in zip(found, seconds, strict=True)]
+    # The evaluated agent itself where it is one of the baselines.
+    named = {evaluation.agent: evaluation for evaluation in found}
+    return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
 
 
-def _evaluate_batch(
-    agent: Agent, dataset: SceneDataset, items: list[int], config: EvaluateConfig, metrics: RolloutMetrics
+def _add(
+    evaluation: Evaluation,
+    dataset: SceneDataset,
+    items: list[int],
+    scenes: SceneBatch,
+    rollouts: Rollouts,
+    own: dict[str, Metric],
 ) -> None:
-    scenes = dataset.scenes(items).to(torch.device(config.device))
+    """Add the rollouts of some run segments to what was found."""
     log, log_valid = logged(scenes)
-    playing = agent.policy is None
-    rollouts = driven_by(agent, scenes, config)
-    segments = [dataset.segment(i).segment_id for i in items]
-    kinds = _kinds(scenes, rollouts, log_valid if playing else None)
+    kinds = _kinds(scenes, rollouts, log_valid if evaluation.search == "log" else None)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
-    driven, judged, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
+    for path, metric in own.items():
+        values = metric(scenes, rollouts)
+        if values.shape != rollouts.state.shape[:2]:
+            shape = tuple(rollouts.state.shape[:2])
+            raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")
+        evaluation.own.setdefault(path, []).extend(values.double().nanmean(-1).tolist())
+    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
     regions, regions_log = [], []
     for b, item in enumerate(items):
         graph = dataset.graph(item)
-        regions.append(_curvatures(graph, driven[b], judged[b]))
+        regions.append(_curvatures(graph, driven[b], counted[b]))
         regions_log.append(_curvatures(graph, log[b], log_valid[b, 1:]))
-    metrics.update(
-        segments,
+    evaluation.metrics.update(
+        [dataset.segment(i).segment_id for i in items],
         collided=rollouts.collision.transpose(2, 3).cpu(),
         offroad=rollouts.offroad.transpose(2, 3).cpu(),
         displacement=away.transpose(2, 3).cpu(),
-        simulated=judged.transpose(2, 3),
+        simulated=counted.transpose(2, 3),
         logged=log_valid[:, 1:].transpose(1, 2),
         curvature=regions,
         curvature_log=regions_log,
@@ -171,104 +244,6 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> 
         scenes.log_valid[:, None, :steps].transpose(2, 3),
         scenes.box_size[:, None],
     )
-
-
-def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
-    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
-
-    Raises:
-        ConfigError: if the search needs a discriminator and the agent has none.
-    """
-    if agent.policy is None:
-        raise ValueError("log playback has nothing to simulate")
-    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
-    trees, branches, taken = _plan(agent, config)
-    start = plant(
-        env,
-        agent.goals,
-        trees=trees,
-        branches=branches,
-        seed=config.seed,
-        logged_goals=config.logged_goals,
-    )
-    if _kind(agent, config) == "none":
-        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), agent.policy)
-        found = simulate(env, policy, start)
-    else:
-        best = config.search == "best"
-        settings = config.pruning(agent.search)
-        with torch.no_grad():
-            result = search(
-                env,
-                agent.policy,
-                None if config.search == "oracle" else agent.discriminator,
-                start,
-                seed=config.seed,
-                rule=KeepAll() if best else pruning_rule(settings),
-                prune_every=settings.prune_every,
-                leaves=None if best else taken,
-                retries=0 if best else config.retries,
-                retry_above=config.retry_above,
-            )
-        found = rollouts_of(env, start, result.trajectories)
-        if best:
-            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
-            found = Rollouts(*(_branches(part, order) for part in found))
-    return Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
-
-
-def _kind(agent: Agent, config: EvaluateConfig) -> str:
-    if config.search == "agent":
-        return "tree" if agent.searches and agent.discriminator is not None else "none"
-    if config.search in ("tree", "best") and agent.discriminator is None:
-        raise ConfigError(
-            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none"
-        )
-    return config.search
-
-
-def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
-    """Trees per segment, branches per tree, and rollouts taken from each tree."""
-    kind = _kind(agent, config)
-    if kind == "none":
-        return config.rollouts, 1, 1
-    branches = config.branches or agent.search.test_branches
-    if kind == "best":
-        return config.rollouts, branches, 1
-    taken = config.rollouts // config.trees
-    if taken > branches:
-        raise ConfigError(
-            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-        )
-    return config.trees, branches, taken
-
-
-def _branches(part: Tensor, order: Tensor) -> Tensor:
-    """part [B, trees, S, ...] at the branches order [B, trees, K]."""
-    index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
-    return part.gather(2, index)
-
-
-def driven_by(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
-    """What an agent does [B, K, ...]: :func:`playback` of the log, or :func:`simulated`."""
-    return playback(scenes) if agent.policy is None else simulated(agent, scenes, config)
-
-
-def playback(scenes: SceneBatch) -> Rollouts:
-    """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
-    log, valid = logged(scenes)
-    position, heading = scenes.log_state[..., :2].transpose(1, 2), scenes.log_state[..., 2].transpose(1, 2)
-    everyone = scenes.log_valid.transpose(1, 2)
-    hit = collisions(position, heading, scenes.box_size, everyone, scenes.interactive).transpose(1, 2) & valid
-    edges = (
-        scenes.edge_start,
-        scenes.edge_end,
-        scenes.edge_valid,
-        scenes.edge_previous,
-        scenes.edge_following,
-    )
-    off = offroad(log[..., :2], *edges) & valid
-    return Rollouts(log[:, None], hit[:, None, 1:], off[:, None, 1:], valid[:, None, 1:])
 
 
 def _curvatures(graph: LaneGraph, state: Tensor, counted: Tensor) -> NDArray[np.float64]:

@@ -13,10 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from symphony.config import TableFormat
-from symphony.evaluation.comparison import COLUMNS, SETTINGS, Cell, Column, Comparison, Row, family
+from symphony.evaluation.comparison import SETTINGS, Cell, Column, Comparison, Row, family
 from symphony.files import json_text
 
 NOTHING = "–"
+ABSENT = Cell((), math.nan, math.nan)
 WIDE = 200
 """Columns of text that goes to no terminal."""
 
@@ -24,17 +25,17 @@ WIDE = 200
 def print_text(comparison: Comparison, console: Console) -> None:
     """Print the table; the best values bold on a terminal and with a star elsewhere."""
     table = Table(title=comparison.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("method", no_wrap=True)
+    table.add_column("method", max_width=10)  # wide enough for MGAIL+TS+H
     table.add_column("seeds", justify="right")
-    for column in COLUMNS:
+    for column in comparison.columns:
         table.add_column(f"{column.title}\n{column.unit}", justify="right", no_wrap=True)
     for row, following in zip(comparison.rows, [*comparison.rows[1:], None], strict=True):
         cells = []
-        for column in COLUMNS:
+        for column in comparison.columns:
             text = Text(justify="right")
             lines = [(row.cells[column.key], "bold", "")]
             if comparison.dataset is not None:
-                lines.append((row.paper[column.key], "bold dim", "dim"))
+                lines.append((row.paper.get(column.key, ABSENT), "bold dim", "dim"))
             for number, (cell, strong, weak) in enumerate(lines):
                 star = "*" if cell.best and not console.is_terminal else ""
                 text.append("\n" if number else "")
@@ -66,7 +67,7 @@ def as_text(comparison: Comparison) -> str:
 def as_markdown(comparison: Comparison) -> str:
     """The table in Markdown; the paper's figures have columns of their own."""
     head = ["method", "seeds"]
-    for column in COLUMNS:
+    for column in comparison.columns:
         head.append(f"{column.title} {column.unit}")
         if comparison.dataset is not None:
             head.append("paper")
@@ -82,14 +83,17 @@ def as_markdown(comparison: Comparison) -> str:
 def as_latex(comparison: Comparison) -> str:
     """The table as a LaTeX ``tabular`` that needs no package."""
     double = comparison.dataset is not None
-    heads = [column.title.replace("curvature JSD", "curv. JSD") for column in COLUMNS]
-    units = [{"%": r"\%", "10⁻³": r"$\times 10^{-3}$"}.get(column.unit, column.unit) for column in COLUMNS]
+    heads = [column.title.replace("curvature JSD", "curv. JSD") for column in comparison.columns]
+    units = [
+        {"%": r"\%", "10⁻³": r"$\times 10^{-3}$"}.get(column.unit, column.unit)
+        for column in comparison.columns
+    ]
     first, second = ["Method", "Seeds"], ["", ""]
     for head, unit in zip(heads, units, strict=True):
         first.append(rf"\multicolumn{{2}}{{c}}{{{head} ({unit})}}" if double else f"{head} ({unit})")
         second += ["ours", "paper"]
     lines = [*(f"% {note}" for note in comparison.notes)]
-    lines.append(rf"\begin{{tabular}}{{lr{'r' * len(COLUMNS) * (2 if double else 1)}}}")
+    lines.append(rf"\begin{{tabular}}{{lr{'r' * len(comparison.columns) * (2 if double else 1)}}}")
     lines += [r"\hline", rf"{' & '.join(first)} \\"]
     if double:
         lines.append(rf"{' & '.join(second)} \\")
@@ -143,10 +147,10 @@ def _json_row(row: Row) -> dict[str, Any]:
 def _cells(row: Row, comparison: Comparison, text: Callable[[Cell, Column], str]) -> Sequence[str]:
     """Our cells, each followed by the paper's where it is asked for."""
     found = []
-    for column in COLUMNS:
+    for column in comparison.columns:
         found.append(text(row.cells[column.key], column))
         if comparison.dataset is not None:
-            found.append(text(row.paper[column.key], column))
+            found.append(text(row.paper.get(column.key, ABSENT), column))
     return found
 
 

@@ -19,9 +19,9 @@ from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle
 from symphony.envs.scene import scene
 from symphony.errors import DataError
-from symphony.evaluation.evaluator import playback
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, visited_regions
+from symphony.simulation.driving import playback
 
 PERCENTILES = (1, 5, 50, 95, 99)
 STRAIGHT = 0.5

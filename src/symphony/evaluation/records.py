@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from symphony.agents.choice import choose, split_name
+from symphony.agents.included import is_pretrained
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
-from symphony.files import json_text
+from symphony.files import write_json
 
 if TYPE_CHECKING:
     from symphony.agents import Agent
     from symphony.data.store import SegmentStore
     from symphony.evaluation import Evaluation
 
-FORMAT = 1
+FORMAT = 2
 """Version of a kept evaluation."""
 FOLDER = "evaluations"
 
@@ -38,24 +38,23 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "data": ("name", "checksum"),
     "config": _NAMED,
     "playback": (),
+    "constant_velocity": (),
     "curvature": ("policy", "log"),
 }
 """What a kept evaluation must have."""
 
 
-def evaluation_record(
-    agent: Agent, result: Evaluation, playback: Evaluation, store: SegmentStore
-) -> dict[str, Any]:
+def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> dict[str, Any]:
     """An evaluation as JSON can hold it.
 
     Args:
-        agent: that was judged.
-        result: what the evaluator found.
-        playback: the same for the log.
+        agent: that was evaluated.
+        result: what the evaluator found, with its baselines.
         store: the run segments.
 
     Returns:
-        The numbers of ``result`` themselves; ``playback``: those of the log; ``run``: ``method``, ``seed``,
+        The numbers of ``result`` themselves; ``playback`` and ``constant_velocity``: those of baselines; ``cost``:
+        seconds of CPU time for ``simulation``, all rollouts of all segments together; ``run``: ``method``, ``seed``,
         ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was judged and whether
         that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
         store; ``config``: the settings of the evaluation, with what was left to the agent filled
@@ -69,7 +68,8 @@ def evaluation_record(
         "run": _run_facts(agent.name),
         "data": {"name": store.path.resolve().name, "checksum": store.checksum()},
         "config": _filled_in(agent, result),
-        "playback": playback.numbers(),
+        **{baseline.agent: baseline.numbers() for baseline in result.baselines},
+        "cost": {"simulation": result.seconds},
         "curvature": {"policy": visited.tolist(), "log": visited_log.tolist()},
         "per_segment": result.metrics.rows(),
     }
@@ -80,15 +80,15 @@ def _run_facts(name: str) -> dict[str, Any] | None:
     if not (folder / "config.json").is_file():
         return None
     config = read_run(folder)
-    own, judged = choose(folder), choose(folder, which)
+    own, chosen = choose(folder), choose(folder, which)
     return {
         "method": config["method"],
         "seed": config.get("seed", 0),
         "interactive": run_interactive(config),
         "duration": config.get("duration", 0),
         "updates": updates_done(folder),
-        "checkpoint": int(judged.name[-12:]),
-        "named": judged != own,
+        "checkpoint": int(chosen.name[-12:]),
+        "named": chosen != own,
     }
 
 
@@ -130,8 +130,9 @@ def evaluation_name(record: dict[str, Any]) -> str:
         parts.append(f"step{record['run']['checkpoint']}")
     for field in dataclasses.fields(EvaluateConfig):
         value = config.get(field.name, field.default)
-        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY) and value != field.default:
+        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY, "metric") and value != field.default:
             parts.append(field.name if value is True else f"{field.name}={value}")
+    parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
     return "-".join(parts)
 
 
@@ -149,17 +150,19 @@ def simulation_name(config: dict[str, Any]) -> str:
     return "-".join(words)
 
 
-def keep_evaluation(run: Path, record: dict[str, Any]) -> Path:
-    """Write an evaluation into the folder of its run and return the file."""
-    file = run / FOLDER / f"{evaluation_name(record)}.json"
-    file.parent.mkdir(exist_ok=True)
+def keep_evaluation(agent: str, record: dict[str, Any]) -> Path | None:
+    """Write an evaluation into the folder of its run and return the file.
+
+    Args:
+        agent: its name. A baseline has no folder, and the folder of an agent that comes with the package is not the
+            user's: nothing is written for them.
+        record: see :func:`evaluation_record`.
+    """
+    if record["run"] is None or is_pretrained(agent):
+        return None
+    file = split_name(agent)[0] / FOLDER / f"{evaluation_name(record)}.json"
     # An interrupted write must not leave half a file where a table looks for a whole one.
-    unfinished = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        unfinished.write_text(json_text(record), encoding="utf-8")
-        unfinished.replace(file)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_json(file, record)
     return file
 
 

@@ -146,7 +146,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
             raise DataError("the ego was not driven", segment=segment.segment_id, field="agents")
     graph = LaneGraph(segment.road)
     numbers, events = _numbers(saved, who, graph)
-    group = saved.group or segment.segment_id
+    group = segment.group or segment.segment_id
     for k, values in enumerate(numbers):
         found.rows.append(_row(segment.segment_id, k, group, saved.failed.get(k, ""), values))
     for hit in (event for event in events if event.kind == "collision" and event.rollout not in saved.failed):

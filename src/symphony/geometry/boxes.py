@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from symphony.geometry.constants import constant
+
 _CORNER_SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
@@ -63,7 +65,7 @@ def box_gap(
 
 
 def _local_corners(size: Tensor) -> Tensor:
-    signs = torch.tensor(_CORNER_SIGNS, dtype=size.dtype, device=size.device)
+    signs = constant(_CORNER_SIGNS, size.dtype, size.device)
     return 0.5 * size[..., None, :] * signs
 
 
@@ -104,9 +106,27 @@ def _corner_distance(
     delta, turn = other - center, other_heading - heading
     cos, sin = torch.cos(heading), torch.sin(heading)
     x, y = delta[..., 0], delta[..., 1]
-    moved = torch.stack((cos * x + sin * y, cos * y - sin * x), dim=-1)
-    beyond = (box_corners(moved, turn, other_size).abs() - 0.5 * size[..., None, :]).clamp(min=0)
-    squared = beyond.square().sum(-1).amin(-1)
+    x, y = cos * x + sin * y, cos * y - sin * x
+    half_length, half_width = 0.5 * size[..., 0], 0.5 * size[..., 1]
+    # The corners in this box's frame, component by component: operations on last dimensions of 2 and 4 are slow.
+    cos, sin = torch.cos(turn), torch.sin(turn)
+    length, width = 0.5 * other_size[..., 0], 0.5 * other_size[..., 1]
+    x_of_length, x_of_width, y_of_length, y_of_width = cos * length, sin * width, sin * length, cos * width
+    near_x, far_x = x_of_length - x_of_width, x_of_length + x_of_width
+    near_y, far_y = y_of_length - y_of_width, y_of_length + y_of_width
+    corners = (
+        (x + near_x, y + far_y),
+        (x - far_x, y - near_y),
+        (x - near_x, y - far_y),
+        (x + far_x, y + near_y),
+    )
+    squared = torch.stack(
+        [
+            (along.abs() - half_length).clamp(min=0).square()
+            + (across.abs() - half_width).clamp(min=0).square()
+            for along, across in corners
+        ]
+    ).amin(0)
     positive = squared > 0
     # The square root of a stand-in keeps the gradient finite where the distance is 0.
     return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.geometry.nearest import on_host
+
 NO_BOUNDARY = -1e6
 """Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
 
@@ -52,49 +54,71 @@ def signed_distance(
     if start.shape[1] == 0:
         return points.sum(-1) * 0 + NO_BOUNDARY
     with torch.no_grad():
-        valid = valid & ((start[..., 0] != end[..., 0]) | (start[..., 1] != end[..., 1]))
+        valid = valid & has_length(start, end)
         nearest = _nearest_segment(points.detach(), start, end, valid)
-    here = _Side.of(points, _take(start, nearest), _take(end, nearest))
-    sign = here.sign
-    if previous is not None:
-        sign = torch.where(
-            here.fraction < 0, _corner_sign(points, start, end, valid, previous, nearest, here, False), sign
-        )
-    if following is not None:
-        sign = torch.where(
-            here.fraction > 1, _corner_sign(points, start, end, valid, following, nearest, here, True), sign
-        )
-    inner = (here.fraction >= 0) & (here.fraction <= 1)
-    distance = torch.where(inner, here.offset, sign * here.to_end)
+    distance = distance_to(points, start, end, valid, previous, following, nearest)
     return torch.where(valid.any(-1, keepdim=True), distance, NO_BOUNDARY)
+
+
+def has_length(start: Float[Tensor, "B E 2"], end: Float[Tensor, "B E 2"]) -> Bool[Tensor, "B E"]:
+    """Which segments are more than a point."""
+    return (start[..., 0] != end[..., 0]) | (start[..., 1] != end[..., 1])
+
+
+def distance_to(
+    points: Float[Tensor, "B M 2"],
+    start: Float[Tensor, "B E 2"],
+    end: Float[Tensor, "B E 2"],
+    valid: Bool[Tensor, "B E"],
+    previous: Int[Tensor, "B E"] | None,
+    following: Int[Tensor, "B E"] | None,
+    nearest: Int[Tensor, "B M"],
+) -> Float[Tensor, "B M"]:
+    """What :func:`signed_distance` gives where the nearest segments are known; ``valid`` ones have a length."""
+    here = _Side(points, _take(start, nearest), _take(end, nearest))
+    sign = here.sign
+    for neighbor, beyond, ahead in (
+        (previous, here.fraction < 0, False),
+        (following, here.fraction > 1, True),
+    ):
+        # Most positions lie beside their segment; on the CPU it pays to see whether any lies past a corner.
+        if neighbor is not None and not (on_host(points) and not bool(beyond.any())):
+            corner = _corner_sign(points, start, end, valid, neighbor, nearest, here, ahead)
+            sign = torch.where(beyond, corner, sign)
+    inner = (here.fraction >= 0) & (here.fraction <= 1)
+    return torch.where(inner, here.offset, sign * here.to_end)
 
 
 class _Side:
     """Where points [B, M, 2] lie relative to one segment each."""
 
-    def __init__(self, fraction: Tensor, offset: Tensor, to_end: Tensor, direction: Tensor) -> None:
-        self.fraction, self.offset, self.to_end, self.direction = fraction, offset, to_end, direction
-
-    @classmethod
-    def of(cls, points: Tensor, start: Tensor, end: Tensor) -> _Side:
-        along = end - start
-        squared = along.square().sum(-1)
+    def __init__(self, points: Tensor, start: Tensor, end: Tensor) -> None:
+        self.direction = end - start
+        # Component by component: sums over a last dimension of 2 are slow.
+        (along_x, along_y), (x, y) = self.direction.unbind(-1), (points - start).unbind(-1)
+        squared = along_x.square() + along_y.square()
         squared = torch.where(squared > 0, squared, 1.0)
-        away = points - start
-        fraction = ((away * along).sum(-1) / squared).detach()
+        self.fraction = ((x * along_x + y * along_y) / squared).detach()
         # Positive to the right of the direction of travel.
-        offset = (away[..., 0] * along[..., 1] - away[..., 1] * along[..., 0]) * squared.rsqrt()
-        gap = (away - (fraction > 0.5)[..., None] * along).square().sum(-1)
+        self.offset = (x * along_y - y * along_x) * squared.rsqrt()
+        self._away = x, y, along_x, along_y
+
+    @property
+    def to_end(self) -> Tensor:
+        """Distance to the nearer end."""
+        x, y, along_x, along_y = self._away
+        beyond = self.fraction > 0.5
+        gap = (x - beyond * along_x).square() + (y - beyond * along_y).square()
         apart = gap > 0
-        to_end = torch.where(apart, torch.where(apart, gap, 1.0).sqrt(), 0.0)
-        return cls(fraction, offset, to_end, along)
+        return torch.where(apart, torch.where(apart, gap, 1.0).sqrt(), 0.0)
 
     @property
     def sign(self) -> Tensor:
         """+1 on the right, -1 on the left and on the line itself."""
-        return torch.where(self.offset.detach() > 0, 1.0, -1.0).to(self.offset.dtype)
+        return 2.0 * (self.offset.detach() > 0).to(self.offset.dtype) - 1.0
 
 
+@torch.no_grad()
 def _corner_sign(
     points: Tensor,
     start: Tensor,
@@ -106,14 +130,15 @@ def _corner_sign(
     ahead: bool,
 ) -> Tensor:
     """Sign at a corner: right of either segment where the line turns left, of both where it turns right."""
-    index = neighbor.gather(1, nearest)
+    index = neighbor.gather(1, nearest).long()
     exists = (index >= 0) & valid.gather(1, index.clamp(min=0))
     index = index.clamp(min=0)
-    other = _Side.of(points, _take(start, index), _take(end, index))
+    other = _Side(points, _take(start, index), _take(end, index))
     first, second = (here, other) if ahead else (other, here)
     left = _cross(first.direction, second.direction) > 0
-    both = torch.where(left, torch.maximum(here.sign, other.sign), torch.minimum(here.sign, other.sign))
-    return torch.where(exists, both, here.sign)
+    one, two = here.sign, other.sign
+    both = torch.where(left, torch.maximum(one, two), torch.minimum(one, two))
+    return torch.where(exists, both, one)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

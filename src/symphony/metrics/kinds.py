@@ -40,6 +40,8 @@ class CollisionKind(IntEnum):
         SIDESWIPE: same way, flank to flank, as after a lane change.
         OTHER: same way, end to end, because one backed into the other, which stood or backed too.
         REAR_ENDED: same way, its tail was met by the front of one behind.
+        PEDESTRIAN: the other is a pedestrian, wherever they came from.
+        CYCLIST: the other is a cyclist, likewise.
     """
 
     INTO_LEADER = 0
@@ -48,6 +50,14 @@ class CollisionKind(IntEnum):
     SIDESWIPE = 3
     OTHER = 4
     REAR_ENDED = 5
+    PEDESTRIAN = 6
+    CYCLIST = 7
+
+
+_RANK = (0, 1, 2, 3, 4, 7, 5, 6)
+"""Place of each kind when two happen at the same step: who was hit from behind comes last."""
+_TYPES = {2: CollisionKind.PEDESTRIAN, 3: CollisionKind.CYCLIST}
+"""Agent types (see ``symphony.data.segment.AgentType``) that are kinds of their own."""
 
 
 class CollisionKinds(NamedTuple):
@@ -69,15 +79,17 @@ class CollisionKinds(NamedTuple):
         """Kind (-1 for none) and `playback` of the first collision of each rollout.
 
         Of collisions at the same step, as when two interactive agents meet, the first of :class:`CollisionKind`
-        counts: the one who ran into the other, not the one who was hit.
+        counts, being rear-ended last: the one who ran into the other, not the one who was hit.
         """
         number = len(CollisionKind)
         none = torch.iinfo(torch.int64).max
-        key = 2 * (number * self.step + self.kind) + (~self.playback).long()
+        rank = torch.tensor(_RANK, device=self.kind.device)
+        key = 2 * (number * self.step + rank[self.kind.clamp(min=0)]) + (~self.playback).long()
         key = torch.where(self.kind < 0, none, key)
         key = torch.cat([key, key.new_full((*key.shape[:-1], 1), none)], -1).amin(-1)
         happened = key != none
-        return torch.where(happened, key // 2 % number, -1), happened & (key % 2 == 0)
+        kind = rank.argsort()[key // 2 % number]
+        return torch.where(happened, kind, -1), happened & (key % 2 == 0)
 
 
 class _Poses(NamedTuple):
@@ -101,6 +113,7 @@ def collision_kinds(
     log_state: Float[Tensor, "*#lead A T+1 5"],
     log_valid: Bool[Tensor, "*#lead A T+1"],
     size: Float[Tensor, "*#lead A 2"],
+    agent_type: Int[Tensor, "*#lead A"] | None = None,
 ) -> CollisionKinds:
     """With whom, when and how each interactive agent collides first. Leading dimensions broadcast.
 
@@ -117,12 +130,14 @@ def collision_kinds(
             interactive agents are not read.
         log_valid: [..., A, T+1].
         size: [..., A, 2] length and width.
+        agent_type: [..., A] ``AgentType`` numbers; without them all count as vehicles, and a pedestrian who is run
+            over as crossing, say.
 
     Raises:
         ValueError: for shapes that do not fit together, or a flagged agent that touches nobody.
     """
     # One leading dimension more, so that there always is one.
-    lead = (1, *_lead(collided, state, exists, subject, log_state, log_valid, size))
+    lead = (1, *_lead(collided, state, exists, subject, log_state, log_valid, size, agent_type))
     collided = collided.expand(*lead, *collided.shape[-2:])
     subject = subject.expand(*lead, subject.shape[-1])
     hit = collided.any(-1)
@@ -153,6 +168,11 @@ def collision_kinds(
     seen = one.valid & two.valid
     one, two = _chosen(seen, one, one_hit), _chosen(seen, two, two_hit)
     kind = _classify(one, two, one_hit, two_hit, ours, theirs)
+    if agent_type is not None:
+        types = agent_type.expand(*lead, agent_type.shape[-1])[tuple(where)]
+        hit_type = types.gather(-1, other[:, None])[:, 0]
+        for number, named in _TYPES.items():
+            kind = torch.where(hit_type == number, int(named), kind)
     playback = ~(other[:, None] == rows).any(-1)
 
     def filled(values: Tensor) -> Tensor:
@@ -245,6 +265,7 @@ def _lead(
     log_state: Tensor,
     log_valid: Tensor,
     size: Tensor,
+    agent_type: Tensor | None,
 ) -> torch.Size:
     (agents, steps), everyone = collided.shape[-2:], size.shape[-2]
     expected = {
@@ -255,6 +276,8 @@ def _lead(
         "log_valid": (log_valid, (everyone, steps + 1)),
         "size": (size, (everyone, 2)),
     }
+    if agent_type is not None:
+        expected["agent_type"] = agent_type, (everyone,)
     for name, (value, shape) in expected.items():
         if value.shape[-len(shape) :] != shape:
             raise ValueError(f"{name} is {list(value.shape)}, expected {list(shape)} at the end")

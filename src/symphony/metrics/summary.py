@@ -35,6 +35,10 @@ class SegmentResult:
         histogram_log: [201] likewise by the log.
         kinds: [kinds, 2] rollouts by the :class:`CollisionKind` of their first collision, with an interactive agent
             and with a playback agent; None where not asked for.
+        agents: [2, kinds] agents of all rollouts by the kind of their first collision: egos, other interactive
+            agents; None where kinds are.
+        simulated: egos, and other interactive agents, in all rollouts.
+        group: the recording the segment is part of; None where not given.
     """
 
     collided: int
@@ -46,6 +50,9 @@ class SegmentResult:
     histogram: NDArray[np.int64]
     histogram_log: NDArray[np.int64]
     kinds: NDArray[np.int64] | None = None
+    agents: NDArray[np.int64] | None = None
+    simulated: tuple[int, int] = (0, 0)
+    group: str | None = None
 
 
 class RolloutMetrics:
@@ -69,6 +76,7 @@ class RolloutMetrics:
         curvature: Sequence[NDArray[Any]],
         curvature_log: Sequence[NDArray[Any]],
         kinds: CollisionKinds | None = None,
+        groups: Sequence[str] | None = None,
     ) -> None:
         """Add the rollouts of some segments.
 
@@ -81,7 +89,9 @@ class RolloutMetrics:
             logged: where the log is valid; the rest does not count for ADE and minSADE.
             curvature: per segment, the average curvature of every branching region visited by each rollout.
             curvature_log: per segment, likewise by the log.
-            kinds: [B, K, N] of the collisions of simulated agents, for all segments or for none.
+            kinds: [B, K, N] of the collisions of simulated agents, the ego first, for all segments or for none.
+            groups: [B] the recording each segment is part of (see ``RunSegment.group``), for all segments or for
+                none. Segments of one recording are no independent samples: standard errors are then over groups.
 
         Raises:
             ValueError: for a segment that was added before, shapes that do not fit together, a displacement or
@@ -99,6 +109,10 @@ class RolloutMetrics:
             raise ValueError(f"segment {bad}: displacement is not finite")
         hit = (collided & simulated).flatten(2).any(-1)
         counts = None if kinds is None else _count_kinds(segment_ids, kinds, hit)
+        by_agent = None if kinds is None else _count_agents(kinds)
+        there = simulated.any(-1).sum(1)
+        if groups is not None and len(groups) != len(segment_ids):
+            raise ValueError(f"{len(groups)} groups for {len(segment_ids)} segments")
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
         # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
@@ -116,6 +130,9 @@ class RolloutMetrics:
                 histogram=curvature_histogram(seen),
                 histogram_log=curvature_histogram(seen_log),
                 kinds=None if counts is None else counts[b],
+                agents=None if by_agent is None else by_agent[b],
+                simulated=(int(there[b, 0]), int(there[b, 1:].sum())),
+                group=None if groups is None else groups[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -165,10 +182,14 @@ class RolloutMetrics:
             ``segments`` and ``rollouts`` (per segment). Where kinds were given, likewise the percent of rollouts
             whose first collision is of a kind, ``collision_into_leader`` and so on for every
             :class:`CollisionKind` (they sum to ``collision_rate``), that is with a playback agent,
-            ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``.
+            ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
+            themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
+            ``others_collision_rate``, and by kind, ``ego_collision_into_leader`` and so on.
+            Where groups were given, ``groups`` is how many, and all standard errors are over them (as if each were
+            one segment: cluster-robust, and a jackknife that leaves out a group).
 
         Raises:
-            ValueError: if nothing was added, or kinds for some segments only.
+            ValueError: if nothing was added, or kinds or groups for some segments only.
         """
         if not self.segments:
             raise ValueError("no segments were added")
@@ -187,14 +208,19 @@ class RolloutMetrics:
             "ade": (column([s.error.mean() for s in found]), logged),
             "min_sade": (column([s.error.min() for s in found]), logged),
             **_kind_rates(found),
+            **_agent_rates(found),
         }
+        member = _groups(found)
         out: dict[str, Any] = {}
         for name, (total, weight) in parts.items():
-            out[name], out[f"{name}_se"] = _ratio(total, weight)
+            out[name], out[f"{name}_se"] = _ratio(total, weight, member)
         out["curvature_jsd"], out["curvature_jsd_se"] = _divergence(
-            np.stack([s.histogram for s in found]), np.stack([s.histogram_log for s in found])
+            _summed(np.stack([s.histogram for s in found]), member),
+            _summed(np.stack([s.histogram_log for s in found]), member),
         )
         out["segments"] = len(found)
+        if member is not None:
+            out["groups"] = int(member.max()) + 1
         out["rollouts"] = max(s.rollouts for s in found)
         return out
 
@@ -230,11 +256,57 @@ def _kind_rates(
     return {f"collision_{name}": (total, rollouts) for name, total in rates.items()}
 
 
-def _ratio(total: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, float]:
-    """Ratio of sums and its standard error over segments (linearised; NaN for a single segment)."""
+def _count_agents(kinds: CollisionKinds) -> NDArray[np.int64]:
+    """Agents [B, 2, kinds] by kind: egos, other interactive agents, of all rollouts."""
+    same = kinds.kind.cpu().numpy()[..., None] == np.array(CollisionKind)
+    counts = same.sum(1)
+    return np.stack([counts[:, 0], counts[:, 1:].sum(1)], axis=1)
+
+
+def _agent_rates(
+    found: Sequence[SegmentResult],
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Percent times agents, and agents, of every segment: all kinds, then each."""
+    given = [s.agents for s in found if s.agents is not None]
+    if not given:
+        return {}
+    counts = 100.0 * np.stack(given)
+    weights = np.array([s.simulated for s in found], dtype=np.float64)
+    rates = {}
+    for k, who in enumerate(("ego", "others")):
+        rates[f"{who}_collision_rate"] = counts[:, k].sum(-1), weights[:, k]
+        for kind in CollisionKind:
+            rates[f"{who}_collision_{kind.name.lower()}"] = counts[:, k, kind], weights[:, k]
+    return rates
+
+
+def _groups(found: Sequence[SegmentResult]) -> NDArray[np.int64] | None:
+    """[segments] number of the group each is in, from 0; None where none were given."""
+    given = [s.group for s in found if s.group is not None]
+    if not given:
+        return None
+    if len(given) < len(found):
+        raise ValueError(f"groups were given for {len(given)} of {len(found)} segments")
+    return np.unique(np.array(given), return_inverse=True)[1]
+
+
+def _summed(values: NDArray[Any], member: NDArray[np.int64] | None) -> NDArray[Any]:
+    """Sums over the segments of each group; the segments' own values without groups."""
+    if member is None:
+        return values
+    out = np.zeros((int(member.max()) + 1, *values.shape[1:]), values.dtype)
+    np.add.at(out, member, values)
+    return out
+
+
+def _ratio(
+    total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64] | None = None
+) -> tuple[float, float]:
+    """Ratio of sums and its standard error over segments or groups (linearised; NaN for a single one)."""
     if weight.sum() == 0:
         return math.nan, math.nan
     ratio = total.sum() / weight.sum()
+    total, weight = _summed(total, member), _summed(weight, member)
     count = len(total)
     if count < 2:
         return float(ratio), math.nan
@@ -243,7 +315,7 @@ def _ratio(total: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[flo
 
 
 def _divergence(counts: NDArray[np.int64], counts_log: NDArray[np.int64]) -> tuple[float, float]:
-    """Divergence of the summed histograms [segments, 201] and its jackknife standard error over segments."""
+    """Divergence of the summed histograms [segments or groups, 201] and its jackknife standard error over those."""
     total, total_log = counts.sum(0), counts_log.sum(0)
     value, number = float(jensen_shannon(total, total_log)), len(counts)
     if number < 2:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, Normal, constraints
 
 from symphony.keys import ACTION, NOISE, OWN, STATE, VALID
-from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.policy import NoiseSampler
 from symphony.modules.pooling import PoolMode
 
@@ -162,7 +162,7 @@ def displacement_policy(
     *,
     hidden: int = 64,
     head: Sequence[int] = (128, 128),
-    dt: float = 0.2,
+    dt: float,
     size_scale: float = 5.0,
     max_acceleration: float = 4.0,
     max_lateral: float = 6.0,
@@ -175,6 +175,7 @@ def displacement_policy(
     action_key: NestedKey = ACTION,
     noise_key: NestedKey = NOISE,
     pool: PoolMode = "auto",
+    encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section V-A).
 
@@ -200,6 +201,7 @@ def displacement_policy(
         action_key: written.
         noise_key: `[..., N, 2]`, optional in the TensorDict.
         pool: see :func:`symphony.modules.pool_elements`.
+        encoder: a class with the arguments of :class:`SceneEncoder`.
     """
     for name, value in (
         ("dt", dt),
@@ -210,8 +212,8 @@ def displacement_policy(
     ):
         if not value > 0.0:
             raise ValueError(f"{name} must be positive, is {value}")
-    encoder = SceneEncoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
-    network = SceneNetwork(encoder, 4, head=head)
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
+    network = SceneNetwork(encoding, 4, head=head)
     parameters: list[NestedKey] = [("agents", name) for name in ("loc", "scale", "pace", "slope")]
     return ProbabilisticTensorDictSequential(
         scene_module(network, groups, ("agents", "head"), own_keys=own_keys, valid_key=valid_key),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -28,6 +29,10 @@ class ElementGroup:
     key: NestedKey
     mask_key: NestedKey
     features: int
+
+
+EncoderClass = Callable[..., Any]
+"""Called with the arguments of :class:`SceneEncoder`; gives a module that is called as that is, with its `width`."""
 
 
 class SceneEncoder(nn.Module):

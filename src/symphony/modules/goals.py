@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from symphony.keys import GOAL, GOAL_LOGITS, GOAL_NOISE, OWN, ROUTES, ROUTES_MASK, VALID
-from symphony.modules.encoder import ElementGroup, SceneEncoder, scene_module
+from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, scene_module
 from symphony.modules.policy import NoiseSampler
 from symphony.modules.pooling import PoolMode
 from symphony.modules.rows import in_blocks, mlp
@@ -57,14 +57,16 @@ def goal_policy(
     own_keys: Sequence[NestedKey] = (OWN,),
     valid_key: NestedKey = VALID,
     pool: PoolMode = "auto",
+    encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """A categorical over each agent's feasible routes, given the first state: h(g | s_1).
 
     Writes logits `[..., N, G]` and goals `[..., N]` int64 (meaningless for agents without a route: see
-    :func:`drawn_goals`). A uniform number under `GOAL_NOISE`, if there is one, decides the draw.
+    :func:`drawn_goals`). A uniform number under `GOAL_NOISE`, if there is one, decides the draw. Another `encoder`
+    takes the arguments of :class:`SceneEncoder`.
     """
-    encoder = SceneEncoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
-    network = RouteScores(encoder, route_features, hidden=hidden)
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
+    network = RouteScores(encoding, route_features, hidden=hidden)
     return ProbabilisticTensorDictSequential(
         scene_module(
             network,

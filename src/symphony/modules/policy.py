@@ -14,8 +14,8 @@ from tensordict.nn import (
 from tensordict.nn.probabilistic import interaction_type
 from torch.distributions import Categorical, Distribution
 
-from symphony.keys import ACTION, LOGITS, NOISE, OWN, VALID
-from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+from symphony.keys import ACTION, LOG_PROB, LOGITS, NOISE, OWN, VALID
+from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.pooling import PoolMode
 from symphony.modules.sampling import inverse_cdf
 
@@ -46,7 +46,7 @@ class NoiseSampler(ProbabilisticTensorDictModule):
         distribution_class: type[Distribution] = Categorical,
         distribution_kwargs: dict[str, Any] | None = None,
         return_log_prob: bool = False,
-        log_prob_key: NestedKey = ("agents", "action_log_prob"),
+        log_prob_key: NestedKey = LOG_PROB,
     ) -> None:
         super().__init__(
             in_keys=parameters if isinstance(parameters, dict) else {"logits": parameters},
@@ -94,18 +94,19 @@ def discrete_policy(
     action_key: NestedKey = ACTION,
     noise_key: NestedKey = NOISE,
     return_log_prob: bool = False,
-    log_prob_key: NestedKey = ("agents", "action_log_prob"),
+    log_prob_key: NestedKey = LOG_PROB,
     pool: PoolMode = "auto",
+    encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).
 
     Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys`. Reads each group's keys,
     the own features and the agents' mask; writes logits `[..., N, actions]` and actions `[..., N]` int64, sampled
     according to TorchRL's exploration type (RANDOM unless set; see :class:`NoiseSampler`). It does not depend on
-    the number of agents or elements.
+    the number of agents or elements. Another `encoder` takes the arguments of :class:`SceneEncoder`.
     """
-    encoder = SceneEncoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
-    network = SceneNetwork(encoder, actions, head=head)
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
+    network = SceneNetwork(encoding, actions, head=head)
     return ProbabilisticTensorDictSequential(
         scene_module(network, groups, logits_key, own_keys=own_keys, valid_key=valid_key),
         NoiseSampler(

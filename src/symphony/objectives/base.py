@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Categorical
@@ -22,8 +22,9 @@ class MaskedLoss(LossModule):
 
     Args:
         reduction: `"mean"` (also for None), `"sum"` or `"none"`.
-        use_mask: whether the TensorDict holds a mask under the `valid` key. A mask that is expected but
-            absent is an error: training on padding would go unnoticed.
+        use_mask: of the mask under the `valid` key. None: it counts where there is one, and must be there if the
+            network (or the environment) reads it, too, so that no padding is trained on unnoticed. True: it must be
+            there. False: it is not read, and everything counts.
 
     Attributes:
         share_count: set where processes train together: takes a count of this process to the mean over all, so that
@@ -32,7 +33,7 @@ class MaskedLoss(LossModule):
 
     share_count: Callable[[Tensor], Tensor] | None = None
 
-    def __init__(self, reduction: Reduction | None, use_mask: bool) -> None:
+    def __init__(self, reduction: Reduction | None, use_mask: bool | None) -> None:
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self.reduction: Reduction = "mean" if reduction is None else reduction
@@ -54,10 +55,10 @@ class MaskedLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the loss reads: the network's inputs, the labels and, where used, the mask."""
+        """What the loss reads: the network's inputs, the labels and, where there is one, the mask."""
         if self._in_keys is None:
             keys = self._read_keys()
-            if self.use_mask:
+            if self.use_mask is not False:
                 keys.append(self.tensor_keys.valid)
             self._in_keys = list(dict.fromkeys(keys))
         return self._in_keys
@@ -65,6 +66,16 @@ class MaskedLoss(LossModule):
     @in_keys.setter
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
+
+    def _mask(self, tensordict: TensorDictBase) -> Tensor | None:
+        """What the TensorDict holds under the `valid` key, by the rule of `use_mask`."""
+        if self.use_mask is False:
+            return None
+        key = unravel_key(self.tensor_keys.valid)
+        mask = tensordict.get(key, default=None)
+        if mask is None and (self.use_mask or key in self._read_keys()):
+            raise KeyError(f"no mask under {key!r}; pass use_mask=False to train without one")
+        return mask
 
     def _entries(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Tensor:
         """A tensor with one number per entry. Raises KeyError if it is absent, ValueError for another shape."""
@@ -87,11 +98,7 @@ class MaskedLoss(LossModule):
     def _counted(self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device) -> Tensor:
         """Bool mask of the entries that are valid and that no mask written by TorchRL itself leaves out."""
         counted = torch.ones(shape, dtype=torch.bool, device=device)
-        if self.use_mask:
-            if tensordict.get(self.tensor_keys.valid, default=None) is None:
-                raise KeyError(
-                    f"no mask under {self.tensor_keys.valid!r}; pass use_mask=False to train without one"
-                )
+        if self._mask(tensordict) is not None:
             counted = self._flags(tensordict, self.tensor_keys.valid, "mask", shape)
         for key in self._loss_mask_keys():
             mask = tensordict.get(key, default=None)
@@ -153,7 +160,7 @@ class ActorLoss(MaskedLoss):
         actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
         reduction: Reduction | None,
         label_smoothing: float,
-        use_mask: bool,
+        use_mask: bool | None,
     ) -> None:
         super().__init__(reduction, use_mask)
         if not 0.0 <= label_smoothing < 1.0:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, dispatch
 
+from symphony import keys
 from symphony.objectives.base import ActorLoss, Reduction
 
 
@@ -21,8 +22,7 @@ class BCLoss(ActorLoss):
         reduction: `"mean"` over the valid entries (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[...]` of the log-probability, with zeros at invalid entries.
         label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
-        use_mask: whether the TensorDict holds a mask under the `valid` key. A mask that is expected but
-            absent is an error: training on padding would go unnoticed.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_bc`, and for categorical actors, detached, `entropy` of the actor and `accuracy` of its mode
     (means over the valid entries; without reduction per entry like the loss).
@@ -37,12 +37,12 @@ class BCLoss(ActorLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            action (NestedKey): the expert's action. Defaults to `("agents", "action")`.
-            valid (NestedKey): bool mask, True where an agent counts. Defaults to `("agents", "valid")`.
+            action (NestedKey): the expert's action. Defaults to `symphony.keys.ACTION`.
+            valid (NestedKey): bool mask, True where an agent counts. Defaults to `symphony.keys.VALID`.
         """
 
-        action: NestedKey = ("agents", "action")
-        valid: NestedKey = ("agents", "valid")
+        action: NestedKey = keys.ACTION
+        valid: NestedKey = keys.VALID
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -53,7 +53,7 @@ class BCLoss(ActorLoss):
         *,
         reduction: Reduction | None = None,
         label_smoothing: float = 0.0,
-        use_mask: bool = True,
+        use_mask: bool | None = None,
     ) -> None:
         super().__init__(actor_network, reduction, label_smoothing, use_mask)
         self.out_keys = ["loss_bc", "entropy", "accuracy"] if self.categorical else ["loss_bc"]

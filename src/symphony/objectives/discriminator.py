@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional
 
+from symphony import keys
 from symphony.objectives.base import MaskedLoss, Reduction
 from symphony.objectives.statistics import auc
 
@@ -39,7 +40,7 @@ class DiscriminatorLoss(MaskedLoss):
         label_smoothing: share of the target spread evenly over both kinds, in [0, 1).
         reduction: `"mean"` as above (0 for a kind that is absent); `"sum"` over all entries that count; `"none"`,
             which keeps the shape `[..., N]`, with zeros elsewhere. The penalty is reduced and added alike.
-        use_mask: whether the TensorDict holds a mask under the `valid` key; see :class:`BCLoss`.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_discriminator` and, detached, per kind the share judged right `accuracy_simulated` and
     `accuracy_data`, the mean logits `score_simulated` and `score_data`, and `auc` of the logits (0.5: cannot tell;
@@ -57,15 +58,15 @@ class DiscriminatorLoss(MaskedLoss):
 
         Attributes:
             score (NestedKey): float `[..., N]`, the logit the discriminator writes. Defaults to
-                `("agents", "score")`.
+                `symphony.keys.SCORE`.
             simulated (NestedKey): bool `[..., N]`, True where the state is simulated, False where it is data.
-                Defaults to `("agents", "simulated")`.
-            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `("agents", "valid")`.
+                Defaults to `symphony.keys.SIMULATED`.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `symphony.keys.VALID`.
         """
 
-        score: NestedKey = ("agents", "score")
-        simulated: NestedKey = ("agents", "simulated")
-        valid: NestedKey = ("agents", "valid")
+        score: NestedKey = keys.SCORE
+        simulated: NestedKey = keys.SIMULATED
+        valid: NestedKey = keys.VALID
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -86,7 +87,7 @@ class DiscriminatorLoss(MaskedLoss):
         generator: torch.Generator | None = None,
         label_smoothing: float = 0.0,
         reduction: Reduction | None = None,
-        use_mask: bool = True,
+        use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
         for name, value in (("gradient_penalty", gradient_penalty), ("instance_noise", instance_noise)):
@@ -116,12 +117,12 @@ class DiscriminatorLoss(MaskedLoss):
             *(["gradient_penalty"] if gradient_penalty else []),
         ]
 
-    def _inputs(self, name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
-        keys = [unravel_key(key) for key in keys]
-        strange = [key for key in keys if key not in self.discriminator.in_keys]
+    def _inputs(self, name: str, given: Sequence[NestedKey]) -> list[NestedKey]:
+        wanted = [unravel_key(key) for key in given]
+        strange = [key for key in wanted if key not in self.discriminator.in_keys]
         if strange:
             raise ValueError(f"{name}: the discriminator does not read {strange}")
-        return keys
+        return wanted
 
     def _read_keys(self) -> list[NestedKey]:
         return [*self.discriminator.in_keys, self.tensor_keys.simulated]
@@ -165,11 +166,11 @@ class DiscriminatorLoss(MaskedLoss):
 
     def _leaves(self, inputs: TensorDictBase) -> list[Tensor]:
         """The inputs to differentiate by, put in place as leaves."""
-        keys = self.penalty_keys
-        if keys is None:
-            keys = [key for key in self.discriminator.in_keys if inputs.get(key).is_floating_point()]
-        leaves = [self._floating(inputs, key).detach().requires_grad_() for key in keys]
-        for key, leaf in zip(keys, leaves, strict=True):
+        chosen = self.penalty_keys
+        if chosen is None:
+            chosen = [key for key in self.discriminator.in_keys if inputs.get(key).is_floating_point()]
+        leaves = [self._floating(inputs, key).detach().requires_grad_() for key in chosen]
+        for key, leaf in zip(chosen, leaves, strict=True):
             inputs.set(key, leaf)
         return leaves
 

@@ -9,6 +9,7 @@ from typing import Literal
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, dispatch
 
+from symphony import keys
 from symphony.objectives.base import ActorLoss, Reduction
 
 
@@ -25,7 +26,7 @@ class DistillationLoss(ActorLoss):
         reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
             `[...]` of the log-probability: rollout entries times the weight, zeros where an entry does not count.
         label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
-        use_mask: whether the TensorDict holds a mask under the `valid` key; see :class:`BCLoss`.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted, without label smoothing);
     for categorical actors also `entropy` and `accuracy` on the expert entries, as :class:`BCLoss` does. They are
@@ -41,18 +42,18 @@ class DistillationLoss(ActorLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            action (NestedKey): the action to imitate. Defaults to `("agents", "action")`.
-            valid (NestedKey): bool mask, True where an agent counts. Defaults to `("agents", "valid")`.
+            action (NestedKey): the action to imitate. Defaults to `symphony.keys.ACTION`.
+            valid (NestedKey): bool mask, True where an agent counts. Defaults to `symphony.keys.VALID`.
             rollout (NestedKey): bool, True where the action comes from a rollout, False where from an expert.
-                Defaults to `("agents", "rollout")`.
+                Defaults to `symphony.keys.ROLLOUT`.
             rank (NestedKey): int, place of a rollout among those of its tree, 0 for the best; read with
-                `survivors="best"` only. Defaults to `("agents", "rank")`.
+                `survivors="best"` only. Defaults to `symphony.keys.RANK`.
         """
 
-        action: NestedKey = ("agents", "action")
-        valid: NestedKey = ("agents", "valid")
-        rollout: NestedKey = ("agents", "rollout")
-        rank: NestedKey = ("agents", "rank")
+        action: NestedKey = keys.ACTION
+        valid: NestedKey = keys.VALID
+        rollout: NestedKey = keys.ROLLOUT
+        rank: NestedKey = keys.RANK
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -65,7 +66,7 @@ class DistillationLoss(ActorLoss):
         survivors: Literal["all", "best"] = "all",
         reduction: Reduction | None = None,
         label_smoothing: float = 0.0,
-        use_mask: bool = True,
+        use_mask: bool | None = None,
     ) -> None:
         super().__init__(actor_network, reduction, label_smoothing, use_mask)
         if not (math.isfinite(rollout_weight) and rollout_weight >= 0.0):
@@ -78,8 +79,8 @@ class DistillationLoss(ActorLoss):
         self.out_keys = ["loss_distillation", "nll_expert", "nll_rollout", *statistics]
 
     def _read_keys(self) -> list[NestedKey]:
-        keys = [*super()._read_keys(), self.tensor_keys.rollout]
-        return [*keys, self.tensor_keys.rank] if self.survivors == "best" else keys
+        read = [*super()._read_keys(), self.tensor_keys.rollout]
+        return [*read, self.tensor_keys.rank] if self.survivors == "best" else read
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -11,24 +11,28 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torch.nn import functional
 
+from symphony import keys
 from symphony.objectives.base import MaskedLoss, Reduction
 
 
 class GoalLoss(MaskedLoss):
     """Negative log-likelihood of the goal an expert had, under a softmax over its feasible goals (paper, III-B).
 
-    Entries without a known goal (label -1) or without any feasible one are left out, like invalid ones. What
-    the logits of goals that are not feasible hold has no influence.
+    Where the log does not tell which of several goals it was, the label may be their set: the loss is then minus the
+    logarithm of their summed probability, and any of them is right. A set of one is that label.
+
+    Entries without a known goal (label -1, an empty set) or without any feasible one are left out, like invalid
+    ones. What the logits of goals that are not feasible hold has no influence.
 
     Args:
         goal_network: module that writes logits `[..., N, G]`; of a probabilistic one only the part that computes
             its parameters is run. G may differ from call to call.
         reduction: `"mean"` over the entries that count (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[..., N]`, with zeros at the others.
-        use_mask: whether the TensorDict holds a mask under the `valid` key; see :class:`BCLoss`.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
-    Writes `loss_goal` and, detached, `entropy`, `accuracy` (the likeliest goal is the label) and `accuracy_top3`:
-    means over the entries that count; without reduction per entry like the loss.
+    Writes `loss_goal` and, detached, `entropy`, `accuracy` (the likeliest goal is the label, or in its set) and
+    `accuracy_top3`: means over the entries that count; without reduction per entry like the loss.
 
     Raises:
         KeyError: at the call, if logits, labels or a mask are missing.
@@ -41,17 +45,20 @@ class GoalLoss(MaskedLoss):
 
         Attributes:
             logits (NestedKey): float `[..., N, G]`, as the network writes them. Defaults to
-                `("agents", "goal_logits")`.
+                `symphony.keys.GOAL_LOGITS`.
             mask (NestedKey): bool `[..., N, G]`, True where a goal is feasible. Defaults to
-                `("agents", "routes_mask")`.
-            label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none. Defaults to `("agents", "route")`.
-            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `("agents", "valid")`.
+                `symphony.keys.ROUTES_MASK`.
+            label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none. Defaults to `symphony.keys.GOAL`.
+            label_set (NestedKey): bool `[..., N, G]`, optional: equally right goals; where it is present, the label
+                is not read. Defaults to `symphony.keys.GOAL_SET`.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `symphony.keys.VALID`.
         """
 
-        logits: NestedKey = ("agents", "goal_logits")
-        mask: NestedKey = ("agents", "routes_mask")
-        label: NestedKey = ("agents", "route")
-        valid: NestedKey = ("agents", "valid")
+        logits: NestedKey = keys.GOAL_LOGITS
+        mask: NestedKey = keys.ROUTES_MASK
+        label: NestedKey = keys.GOAL
+        label_set: NestedKey = keys.GOAL_SET
+        valid: NestedKey = keys.VALID
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -65,33 +72,35 @@ class GoalLoss(MaskedLoss):
         goal_network: TensorDictModuleBase,
         *,
         reduction: Reduction | None = None,
-        use_mask: bool = True,
+        use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
         self.convert_to_functional(goal_network, "goal_network")
         self.out_keys = ["loss_goal", "entropy", "accuracy", "accuracy_top3"]
 
     def _read_keys(self) -> list[NestedKey]:
-        return [*self.goal_network.in_keys, self.tensor_keys.mask, self.tensor_keys.label]
+        names = self.tensor_keys
+        return [*self.goal_network.in_keys, names.mask, names.label, names.label_set]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss of a batch that holds :attr:`in_keys`; the input is left as it is."""
         logits = self._logits(tensordict)
         shape = logits.shape[:-1]
-        label = self._entries(tensordict, self.tensor_keys.label, "label", shape)
         feasible = self._flags(tensordict, self.tensor_keys.mask, "mask of goals", logits.shape)
+        right, known = self._right(tensordict, logits.shape)
         if logits.shape[-1] == 0:
-            logits, feasible = functional.pad(logits, (0, 1)), functional.pad(feasible, (0, 1))
-        counted = self._counted(tensordict, shape, logits.device) & (label >= 0) & feasible.any(-1)
-        label = self._checked(label, feasible, counted)
+            logits, feasible, right = (functional.pad(x, (0, 1)) for x in (logits, feasible, right))
+        counted = self._counted(tensordict, shape, logits.device) & known & feasible.any(-1)
+        self._check(right, feasible, counted)
         # Entries that are left out get an even softmax, so that nothing they hold reaches a gradient.
-        used = feasible & counted[..., None]
+        used, right = feasible & counted[..., None], right | ~counted[..., None]
         lowest = torch.finfo(logits.dtype).min
         dist = Categorical(logits=logits.masked_fill(~used, lowest), validate_args=False)
+        nll = -dist.logits.masked_fill(~right, lowest).logsumexp(-1)
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
         with torch.no_grad():
-            best = dist.logits.topk(min(3, logits.shape[-1]), -1).indices == label[..., None]
+            best = right.gather(-1, dist.logits.topk(min(3, logits.shape[-1]), -1).indices)
             statistics = {
                 "entropy": dist.entropy(),
                 "accuracy": best[..., 0].to(logits.dtype),
@@ -99,7 +108,7 @@ class GoalLoss(MaskedLoss):
             }
         result = TensorDict(
             {
-                "loss_goal": self._reduced(-dist.log_prob(label), counted),
+                "loss_goal": self._reduced(nll, counted),
                 **{name: self._reduced(value, counted, reduction) for name, value in statistics.items()},
             }
         )
@@ -116,12 +125,19 @@ class GoalLoss(MaskedLoss):
             raise KeyError(f"the network writes no logits under {self.tensor_keys.logits!r}")
         return logits
 
-    def _checked(self, label: Tensor, feasible: Tensor, counted: Tensor) -> Tensor:
-        """Labels with 0 for what is left out."""
-        label = torch.where(counted, label, 0)
-        number = feasible.shape[-1]
-        known = feasible.gather(-1, label.clamp(max=number - 1)[..., None])[..., 0] & (label < number)
-        if bool((counted & ~known).any()):
-            wrong = (counted & ~known).nonzero()[0].tolist()
-            raise ValueError(f"label {self.tensor_keys.label!r} at {wrong} is not one of the feasible goals")
-        return label
+    def _right(self, tensordict: TensorDictBase, shape: torch.Size) -> tuple[Tensor, Tensor]:
+        """The right goals `[..., N, G]`, and where any is known `[..., N]`."""
+        if tensordict.get(self.tensor_keys.label_set, default=None) is not None:
+            right = self._flags(tensordict, self.tensor_keys.label_set, "set of labels", shape)
+            return right, right.any(-1)
+        label = self._entries(tensordict, self.tensor_keys.label, "label", shape[:-1])
+        return label[..., None] == torch.arange(shape[-1], device=label.device), label >= 0
+
+    def _check(self, right: Tensor, feasible: Tensor, counted: Tensor) -> None:
+        """Raises ValueError for a label that is none of the feasible goals."""
+        wrong = counted & (~right.any(-1) | (right & ~feasible).any(-1))
+        if bool(wrong.any()):
+            key = self.tensor_keys.label
+            raise ValueError(
+                f"label {key!r} at {wrong.nonzero()[0].tolist()} is not one of the feasible goals"
+            )

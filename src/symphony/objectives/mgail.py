@@ -16,6 +16,7 @@ from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from symphony import keys
 from symphony.objectives.base import MaskedLoss, Reduction
 
 Cost = Literal["log_d", "non_saturating", "logit"]
@@ -50,7 +51,7 @@ class MGAILLoss(MaskedLoss):
         checkpoint: steps that are simulated once more in the backward pass instead of being kept; 0: all are
             kept. Changes no result; memory then grows with T / checkpoint + checkpoint instead of T.
         reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
-        use_mask: whether the TensorDict holds a mask under the `valid` key.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_mgail` and, detached, the mean logit `mgail_score`. Steps after the end of an episode do not count.
 
@@ -65,18 +66,18 @@ class MGAILLoss(MaskedLoss):
 
         Attributes:
             score (NestedKey): float `[..., N]`, the logit the discriminator writes. Defaults to
-                `("agents", "score")`.
-            noise (NestedKey): numbers `[..., N, *]` that the actor draws by. Defaults to `("agents", "noise")`.
+                `symphony.keys.SCORE`.
+            noise (NestedKey): numbers `[..., N, *]` that the actor draws by. Defaults to `symphony.keys.NOISE`.
             plan (NestedKey): the same for all steps, `[..., T, N, *]`, optional in the start states. Defaults to
-                `"noise_plan"`.
-            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `("agents", "valid")`.
+                `symphony.keys.NOISE_PLAN`.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `symphony.keys.VALID`.
             done (NestedKey): bool `[..., 1]`, True where the episode has ended. Defaults to `"done"`.
         """
 
-        score: NestedKey = ("agents", "score")
-        noise: NestedKey = ("agents", "noise")
-        plan: NestedKey = "noise_plan"
-        valid: NestedKey = ("agents", "valid")
+        score: NestedKey = keys.SCORE
+        noise: NestedKey = keys.NOISE
+        plan: NestedKey = keys.NOISE_PLAN
+        valid: NestedKey = keys.VALID
         done: NestedKey = "done"
 
     tensor_keys: _AcceptedKeys
@@ -100,7 +101,7 @@ class MGAILLoss(MaskedLoss):
         truncate: int = 0,
         checkpoint: int = 0,
         reduction: Reduction | None = None,
-        use_mask: bool = True,
+        use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
         if cost not in COSTS:
@@ -112,7 +113,7 @@ class MGAILLoss(MaskedLoss):
         # Neither is trained here: in a container they are neither saved nor reset with the loss.
         self._held: dict[str, Any] = {"discriminator": discriminator, "env": env}
         self.horizon, self.cost, self.truncate, self.checkpoint = horizon, cost, truncate, checkpoint
-        self.detach_keys = list(detach_keys)
+        self.detach_keys = [key for key in detach_keys if key in actor_network.in_keys]
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "env":
@@ -195,12 +196,8 @@ class MGAILLoss(MaskedLoss):
         return result
 
     def _shape(self, now: TensorDictBase) -> torch.Size:
-        mask = now.get(self.tensor_keys.valid, default=None)
-        if mask is None:
-            if self.use_mask:
-                raise KeyError(f"no mask under {self.tensor_keys.valid!r}; pass use_mask=False")
-            return torch.Size([*now.shape, 1])
-        return mask.shape
+        mask = self._mask(now)
+        return torch.Size([*now.shape, 1]) if mask is None else mask.shape
 
     def _simulate(
         self, env: EnvBase, now: TensorDictBase, numbers: Tensor | None, first: int, length: int

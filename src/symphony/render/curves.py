@@ -27,28 +27,33 @@ Panel = tuple[str, Mapping[str, str]]
 
 def _quantiles(title: str, name: str) -> Panel:
     labels = {"p90": "90 %", "p50": "median", "p10": "10 %"}
-    return f"shown: {title}", {f"show_{name}_{level}": label for level, label in labels.items()}
+    return f"preview: {title}", {f"preview_{name}_{level}": label for level, label in labels.items()}
 
 
 PANELS: tuple[Panel, ...] = (
-    ("BC loss", {"loss_bc": ""}),
-    ("distillation loss", {"loss_distillation": ""}),
-    ("negative log-likelihood", {"nll_expert": "expert", "nll_rollout": "rollout"}),
-    ("accuracy", {"accuracy": ""}),
-    ("entropy", {"entropy": ""}),
-    ("goal loss", {"loss_goal": ""}),
-    ("goal accuracy", {"goal_accuracy": "most likely", "goal_accuracy_top3": "among the best 3"}),
-    ("goal entropy", {"goal_entropy": ""}),
+    ("policy loss", {"loss_policy": "whole", "loss_mgail": "MGAIL", "loss_regression": "regression"}),
+    ("negative log-likelihood", {"policy_nll_expert": "expert", "policy_nll_rollout": "rollout"}),
+    ("accuracy", {"policy_accuracy": ""}),
+    ("entropy", {"policy_entropy": ""}),
+    ("MGAIL: discriminator logit", {"policy_mgail_score": ""}),
+    ("goal loss", {"loss_goals": ""}),
+    ("goal accuracy", {"goals_accuracy": "most likely", "goals_accuracy_top3": "among the best 3"}),
+    ("goal entropy", {"goals_entropy": ""}),
     ("discriminator loss", {"loss_discriminator": ""}),
-    ("discriminator accuracy", {"accuracy_simulated": "simulated", "accuracy_data": "data"}),
-    ("discriminator logit", {"score_simulated": "simulated", "score_data": "data"}),
-    ("discriminator AUC", {"auc": ""}),
+    (
+        "discriminator accuracy",
+        {"discriminator_accuracy_simulated": "simulated", "discriminator_accuracy_data": "data"},
+    ),
+    (
+        "discriminator logit",
+        {"discriminator_score_simulated": "simulated", "discriminator_score_data": "data"},
+    ),
+    ("discriminator AUC", {"discriminator_auc": ""}),
+    ("discriminator gradient penalty", {"discriminator_gradient_penalty": ""}),
     ("search: AUC of collisions", {"search_auc_collision": ""}),
     ("search: AUC of off-road states", {"search_auc_offroad": ""}),
     ("search: share in collision", {"search_collision_all": "all", "search_collision_kept": "kept"}),
     ("search: share off the road", {"search_offroad_all": "all", "search_offroad_kept": "kept"}),
-    ("MGAIL loss", {"loss_mgail": "MGAIL", "loss_policy": "with regression"}),
-    ("MGAIL: discriminator logit", {"mgail_score": ""}),
     (
         "validation: infractions, %",
         {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from symphony.errors import ConfigError
-from symphony.files import naming
+from symphony.files import replacing
 from symphony.render.video import Clip, frames_of
 
 FILMS = ("mp4",)
@@ -37,10 +37,9 @@ def write_film(clips: Sequence[Clip], path: Path, *, columns: int = 3, size: flo
     # The format wants even sides.
     height, width = (side - side % 2 for side in frames[0].shape[:2])
     repeat = max(1, round(SMOOTH * interval))
-    with naming(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as draft:
         writer = imageio_ffmpeg.write_frames(
-            str(path), (width, height), fps=repeat / interval, macro_block_size=2
+            str(draft), (width, height), fps=repeat / interval, macro_block_size=2
         )
         writer.send(None)
         for frame in frames:

@@ -17,6 +17,7 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
 from symphony.errors import ConfigError
+from symphony.files import replacing
 
 # From Okabe and Ito's and Tol's palettes: apart from each other, from playback and from the road for the
 # common kinds of colour blindness too.
@@ -77,10 +78,10 @@ def picture_path(path: str | Path, formats: Sequence[str] = FORMATS) -> Path:
 
 def save(figure: Any, path: Path) -> None:
     """Write a figure, creating the folder it goes into."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     # Without the date, equal pictures are equal files.
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    figure.savefig(path, metadata=undated.get(path.suffix[1:].lower()))
+    with replacing(path) as draft:
+        figure.savefig(draft, metadata=undated.get(path.suffix[1:].lower()))
 
 
 def view_around(points: NDArray[Any], margin: float = 20.0, least: float = 70.0) -> View:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from symphony.data.segment import RunSegment
+from symphony.files import replacing
 from symphony.render.agents import CORNERS, draw_boxes, pieces, place
 from symphony.render.plots import (
     EVENTS,
@@ -251,13 +252,13 @@ def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> 
     images = [
         Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE) for pixels in frames
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 * interval),
-        loop=0,
-        optimize=True,
-    )
+    with replacing(path) as draft:
+        images[0].save(
+            draft,
+            format="GIF",
+            save_all=True,
+            append_images=images[1:],
+            duration=round(1000 * interval),
+            loop=0,
+            optimize=True,
+        )

@@ -23,6 +23,9 @@ HORIZON = 240.0
 LIMIT = 200
 """Most routes a vehicle gets."""
 
+MAX_LANES = 500
+"""Most lanes of a route."""
+
 _TIE = 1e-3
 
 Path = tuple[float, Route]
@@ -90,14 +93,17 @@ def routes(
 
 
 def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: int) -> list[Route]:
-    """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest."""
+    """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest.
+
+    Lanes of next to no length in a circle would never get there: a path ends after :data:`MAX_LANES`.
+    """
     frontier = sorted(set(seeds))[:limit]
     heapq.heapify(frontier)
     done: list[Route] = []
     while frontier:
         reach, route = heapq.heappop(frontier)
         after = graph.successors[route[-1]]
-        if reach >= horizon or not after:
+        if reach >= horizon or not after or len(route) >= MAX_LANES:
             done.append(route)
             continue
         if len(done) + len(frontier) + len(after) > limit:

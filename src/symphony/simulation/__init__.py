@@ -1,7 +1,9 @@
-"""Demonstrations from logs, and rollouts with and without search."""
+"""Demonstrations from logs, rollouts with and without search, and what is learned from them."""
 
 from __future__ import annotations
 
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.replay import SearchReplay, with_survivors
 from symphony.simulation.rollouts import Rollouts, simulate
 
-__all__ = ["Rollouts", "simulate"]
+__all__ = ["Rollouts", "SceneDataset", "SearchReplay", "simulate", "with_survivors"]

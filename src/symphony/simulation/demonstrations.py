@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -12,98 +11,24 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from symphony import keys
-from symphony.data.segment import AgentType, RunSegment
-from symphony.data.selection import MOVING, travel
+from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
-from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices, route_table
+from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
 from symphony.geometry.frames import forward_speed
-from symphony.roadgraph import LaneGraph, lane_of
-
-IN_LANE = 1.0
-"""Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
-
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.experts import ExpertCache, Experts, fit_experts
 
 KEEP = 5000
-"""Segments held in memory once they are prepared, about 0.3 MB each."""
+"""Segments held in memory once they are prepared: 90 kB each, 170 with routes, in the built-in data."""
 GRAPHS = 64
 """Lane graphs held in memory."""
 
 
-@dataclass(frozen=True)
-class Experts:
-    """Logged vehicles of one segment as demonstrations, after the fit to the action space.
-
-    Attributes:
-        agent: [K] rows of the segment's agents.
-        states: [K, T, 4] fitted x, y, heading, speed.
-        actions: [K, T - 1] or [K, T - 1, 2].
-        valid: [K, T - 1] where the log is valid before and after the action.
-        error: [K] metres between the last valid fitted and logged position.
-        routes: feasible routes of each expert from its first valid state; empty where not asked for.
-    """
-
-    agent: Tensor
-    states: Tensor
-    actions: Tensor
-    valid: Tensor
-    error: Tensor
-    routes: tuple[RouteTable, ...] = ()
-
-
-def experts(
-    segment: RunSegment,
-    dynamics: Bicycle | Displacement,
-    graph: LaneGraph | None = None,
-    *,
-    routes: bool = False,
-) -> Experts:
-    """Fit every vehicle of a segment that moves or stands in a lane (waiting is driving, parking is not), and the
-    ego in any case.
-
-    Args:
-        segment: the run segment.
-        dynamics: the action space.
-        graph: of its lanes, made here if not given.
-        routes: whether to find the experts' routes.
-    """
-    valid = segment.valid
-    graph = LaneGraph(segment.road) if graph is None else graph
-    everyone, first = np.arange(segment.num_agents), valid.argmax(1)
-    lane = lane_of(
-        graph,
-        segment.position[everyone, first, :2],
-        segment.heading[everyone, first],
-        tolerance=IN_LANE,
-    )
-    chosen = (segment.agent_type == AgentType.VEHICLE) & ((travel(segment) > MOVING) | (lane >= 0))
-    chosen[segment.ego] = True
-    chosen &= (valid[:, 1:] & valid[:, :-1]).any(1)
-    rows = np.flatnonzero(chosen)
-
-    def tensor(array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array[rows]))
-
-    position, heading, velocity = (
-        tensor(segment.position[..., :2]),
-        tensor(segment.heading),
-        tensor(segment.velocity),
-    )
-    speed = forward_speed(velocity, heading)
-    mask = tensor(valid)
-    # An agent that appears later is fitted from its first valid state; its rows before that are masked.
-    actions, states = dynamics.fit(position, heading, speed, mask, tensor(segment.size[:, :2]), segment.dt)
-    last = mask.shape[1] - 1 - mask.flip(1).int().argmax(1)
-    which = torch.arange(len(rows))
-    error = (states[which, last, :2] - position[which, last]).norm(dim=-1)
-    tables = tuple(route_table(segment, graph, int(row)) for row in rows) if routes else ()
-    return Experts(torch.from_numpy(rows), states, actions, mask[:, 1:] & mask[:, :-1], error, tables)
-
-
-def spread(total: int, count: int) -> list[int]:
+def evenly_spaced(total: int, count: int) -> list[int]:
     """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
     count = min(count, total)
     return [k * total // count for k in range(count)]
@@ -142,11 +67,37 @@ class SceneDataset:
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration = routes, duration
         self.scene = lru_cache(keep)(self._scene)
-        self.experts = lru_cache(keep)(self._experts)
+        self.experts = ExpertCache(self._experts, keep)
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    @property
+    def dt(self) -> float:
+        """Seconds per step.
+
+        Raises:
+            DataError: if there is no segment, or segments differ in it; names one that does.
+        """
+        if not self.indices:
+            raise DataError("the store holds no run segments", file=self.store.path)
+        steps = self.store.time_steps[self.indices]
+        other = np.flatnonzero(steps != steps[0])
+        if len(other):
+            raise DataError(
+                f"has steps of {steps[other[0]]:g} s, others of {steps[0]:g} s",
+                file=self.store.path,
+                segment=self.store.ids[self.indices[other[0]]],
+                field="dt",
+            )
+        return float(steps[0])
+
+    @property
+    def decisions(self) -> int:
+        """Actions until the last logged step of the longest segment, or up to the duration."""
+        longest = int(self.store.num_steps[self.indices].max()) - 1
+        return min(longest, round(self.duration / self.dt)) if self.duration else longest
 
     def segment(self, i: int) -> RunSegment:
         """The run segment behind item ``i``, up to the duration."""
@@ -177,9 +128,10 @@ class SceneDataset:
         """Several items as one padded batch."""
         return collate([self.scene(i) for i in items])
 
-    def _experts(self, i: int) -> Experts:
-        """The demonstrations of item ``i``."""
-        return experts(self.segment(i), self.dynamics, self.graph(i), routes=self.routes)
+    def _experts(self, items: Sequence[int]) -> list[Experts]:
+        """The demonstrations of several items, fitted together."""
+        segments, graphs = [self.segment(i) for i in items], [self.graph(i) for i in items]
+        return fit_experts(segments, self.dynamics, graphs, routes=self.routes)
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Different items at random (all, if there are fewer)."""
@@ -198,7 +150,7 @@ class SceneDataset:
         Returns:
             TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
         """
-        found = [self.experts(i) for i in items]
+        found = self.experts.many(items)
         places = [expert.valid.nonzero(as_tuple=True) for expert in found]
         sizes = torch.tensor([len(which) for which, _ in places])
         pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
@@ -212,6 +164,7 @@ class SceneDataset:
         state = torch.cat([e.states.flatten(0, 1) for e in found])[begin[row] + when]
         ordinal = torch.arange(len(lengths))
         action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
+        action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
         tables = [table for expert in found for table in expert.routes]
         taken = logged_routes(tables, row) if observation.route else None
@@ -240,7 +193,7 @@ class SceneDataset:
             TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK`` and ``GOAL``
             (-1 for vehicles on no lane).
         """
-        each = [self.experts(item) for item in items]
+        each = self.experts.many(items)
         found = [(i, expert, k) for i, expert in enumerate(each) for k in range(len(expert.agent))]
         pick = torch.randint(len(found), (count,), generator=rng).tolist()
         chosen = [found[k] for k in pick]
@@ -284,8 +237,7 @@ class SceneDataset:
         """
         state, valid = logged(scenes)
         state, valid = state.clone(), valid.clone()
-        for b, i in enumerate(items):
-            expert = self.experts(i)
+        for b, expert in enumerate(self.experts.many(items)):
             steps = expert.states.shape[1]
             hit = expert.agent[:, None].to(scenes.device) == scenes.interactive[b]
             which, place = hit.nonzero(as_tuple=True)

@@ -1,4 +1,4 @@
-"""Closed-loop simulation, with and without search, keeping only what is read afterwards."""
+"""Closed-loop simulation, keeping only what is read afterwards."""
 
 from __future__ import annotations
 
@@ -7,32 +7,17 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
-from symphony.collectors import (
-    BeamSearchResult,
-    KeepBest,
-    KeyScore,
-    PruningRule,
-    Systematic,
-    beam_search,
-)
-from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
-from symphony.modules import SeededNoise, drawn_goals
+from symphony.modules import drawn_goals
 from symphony.streams import fold_in, uniform
 
-ENDED = -100.0
-"""Score past a scene's last logged step, below all others: it decides no maximum, and in a mean or sum it weighs
-equally on all branches.
-"""
 _GOALS = 1 << 40
-_PRUNING = (1 << 40) + 1
-_RETRIES = (1 << 40) + 2
-"""Numbers of the streams that goals, prunings and repeats draw from, far above those of rollouts and agents."""
+"""Number of the stream that goals draw from, far above those of rollouts and agents."""
 
 
 class Rollouts(NamedTuple):
@@ -72,7 +57,7 @@ def simulate(
         start: as returned by :meth:`DrivingEnv.start`, any batch shape.
         steps: decisions; by default up to the last logged step of the longest scene.
     """
-    steps = _steps(env, start) if steps is None else steps
+    steps = decisions_of(env, start) if steps is None else steps
     now, states, collisions, offroads = start, [start.get(keys.STATE)], [], []
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(steps):
@@ -84,7 +69,7 @@ def simulate(
         torch.stack(states, -3),
         torch.stack(collisions, -2),
         torch.stack(offroads, -2),
-        _counted(env, start, steps),
+        counted_steps(env, start, steps),
     )
 
 
@@ -112,7 +97,7 @@ def draw_goals(
     return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
 
 
-def plant(
+def start_states(
     env: DrivingEnv,
     goals: TensorDictModuleBase | None,
     *,
@@ -142,90 +127,6 @@ def plant(
     return env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
 
 
-def pruning_rule(config: SearchConfig) -> PruningRule:
-    """Which branches go on."""
-    return Systematic(config.temperature) if config.rule == "systematic" else KeepBest(config.keep)
-
-
-def flag_score(state: TensorDictBase) -> Tensor:
-    """Score [..., N] of an oracle: 1 where an agent collides or is off the road."""
-    bad = state.get(keys.COLLISION) | state.get(keys.OFFROAD)
-    return (bad.squeeze(-1) & state.get(keys.VALID)).float()
-
-
-def search(
-    env: DrivingEnv,
-    policy: TensorDictModuleBase,
-    discriminator: TensorDictModuleBase | None,
-    start: TensorDictBase,
-    *,
-    seed: int,
-    rule: PruningRule,
-    prune_every: int,
-    leaves: int | None = None,
-    keep_tree: bool = False,
-    retries: int = 0,
-    retry_above: float = 0.0,
-) -> BeamSearchResult:
-    """Beam search from a start state [..., S] to the last logged step (paper, section IV-A).
-
-    Args:
-        env: the environment.
-        policy: writes the action.
-        discriminator: scores the states; None takes the true collision and off-road flags (an oracle).
-        start: all branches of a tree with the same goals.
-        seed: of the actions.
-        rule: which branches go on.
-        prune_every: T_p.
-        leaves: return only so many of each tree, the best of the last period; by default all.
-        keep_tree: also return the pruned branches.
-        retries: how often a period is simulated again, from its start, for branches that end it with a total above
-            ``retry_above``.
-        retry_above: that total.
-    """
-    score: Callable[[TensorDictBase], Tensor] = flag_score
-    if discriminator is not None:
-        score = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID)
-    last = env.scenes.last_step
-
-    def until_the_end(state: TensorDictBase) -> Tensor:
-        going = state.get(keys.STEP) <= last[state.get(keys.SCENE)]
-        return torch.where(going, score(state), ENDED)
-
-    # The random numbers of the pruning are the tree's: those of its first branch, told apart from its actions'.
-    steps, root = _steps(env, start), start.get(keys.STREAM)[..., 0, :]
-    periods = torch.arange(-(-steps // prune_every), device=start.device)
-    following = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
-    return beam_search(
-        env,
-        TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
-        until_the_end,
-        start,
-        steps=steps,
-        prune_every=prune_every,
-        rule=rule,
-        noise=uniform(seed, fold_in(root, _PRUNING), periods),
-        leaves=leaves,
-        # A copy takes the random numbers of the place it lands in, so that forks part.
-        slot_keys=(keys.STREAM,),
-        keep=[keys.STATE, keys.ACTION, keys.NOISE, keys.STEP, *following],
-        keep_tree=keep_tree,
-        retries=retries,
-        retry_above=retry_above if retries else None,
-        reseed=_reseed,
-    )
-
-
-def branched_streams(start: TensorDictBase) -> TensorDictBase:
-    """A start state [*b, S] whose branches each have a stream of random numbers of their own."""
-    slot = torch.arange(start.shape[-1], device=start.device)[:, None]
-    return start.set(keys.STREAM, fold_in(start.get(keys.STREAM), slot))
-
-
-def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:
-    return state.set(keys.STREAM, fold_in(state.get(keys.STREAM), _RETRIES + attempt))
-
-
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
     """What the evaluator reads, from the leaves [..., L, T] of a search that began in ``start`` [..., S], S >= L."""
     start = start[..., : trajectories.shape[-2]]
@@ -233,14 +134,16 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
     collision, offroad = (
         trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)
     )
-    return Rollouts(state, collision, offroad, _counted(env, start, collision.shape[-2]))
+    return Rollouts(state, collision, offroad, counted_steps(env, start, collision.shape[-2]))
 
 
-def _steps(env: DrivingEnv, start: TensorDictBase) -> int:
+def decisions_of(env: DrivingEnv, start: TensorDictBase) -> int:
+    """Actions until the last logged step of the longest scene."""
     return int(env.scenes.last_step[start.get(keys.SCENE)].max())
 
 
-def _counted(env: DrivingEnv, start: TensorDictBase, steps: int) -> Tensor:
+def counted_steps(env: DrivingEnv, start: TensorDictBase, steps: int) -> Tensor:
+    """Where [..., T, N] agents are real and their segment still has logged steps."""
     step = start.get(keys.STEP) + torch.arange(1, steps + 1, device=start.device)
     within = step <= env.scenes.last_step[start.get(keys.SCENE)]
     return within[..., None] & start.get(keys.VALID)[..., None, :]

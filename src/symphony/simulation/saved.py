@@ -77,7 +77,6 @@ class SavedRollouts:
         start: step of the log at which the first state lies.
         drivers: [N] who drove each agent.
         failed: reason why a rollout broke off, by its number; its later steps don't count.
-        group: what the segment belongs to (such as a road network) where errors are taken over groups; its id if "".
         trees: the searches, where they are kept.
     """
 
@@ -92,7 +91,6 @@ class SavedRollouts:
     start: int = 0
     drivers: tuple[str, ...] = ()
     failed: Mapping[int, str] = field(default_factory=dict)
-    group: str = ""
     trees: SavedTrees | None = None
 
     @property
@@ -125,7 +123,6 @@ def saved_rollouts(
     goal: Tensor | None = None,
     search: BeamSearchResult | None = None,
     driver: str | Sequence[str] = "",
-    group: str = "",
     failed: Mapping[int, str] | None = None,
 ) -> SavedRollouts:
     """Rollouts of one run segment, ready to be written.
@@ -138,7 +135,6 @@ def saved_rollouts(
         goal: [B, K, N] number of the route that each agent followed among its feasible ones, -1 for none.
         search: of which the rollouts are the leaves, with leading dimensions [B, R] and its tree kept.
         driver: of all interactive agents, or of each [N].
-        group: see :class:`SavedRollouts`.
         failed: see :class:`SavedRollouts`.
 
     Raises:
@@ -163,7 +159,6 @@ def saved_rollouts(
         routes=routes,
         drivers=tuple(name for name, there in zip(names, real, strict=True) if there),
         failed=dict(failed or {}),
-        group=group,
         trees=None if search is None else _trees(search, row, steps, real, len(counted), segment.segment_id),
     )
 

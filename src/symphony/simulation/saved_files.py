@@ -18,7 +18,7 @@ from safetensors.numpy import save
 
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
-from symphony.files import naming, write_json
+from symphony.files import naming, replacing, write_json
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_tensors import KEY, read_tensors, tensors_of
 
@@ -124,7 +124,8 @@ class RolloutWriter:
         file = f"{SEGMENTS}/{file_stem(name)}.safetensors"
         # What can't be read back must not be written.
         read_tensors(data, self.path / file, name)
-        _write_bytes(self.path / file, data)
+        with replacing(self.path / file) as draft:
+            draft.write_bytes(data)
         digest = hashlib.sha256(data).hexdigest()
         self._record(Entry(name, saved.rollouts, file, digest, saved.segment.dt))
 
@@ -244,19 +245,6 @@ def file_stem(segment_id: str) -> str:
     if len(name) > _LONGEST:
         name = f"{name[: _LONGEST - 17]}-{hashlib.sha256(segment_id.encode()).hexdigest()[:16]}"
     return name
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    new = path.with_name(f".new-{os.getpid()}-{path.name}")
-    with naming(path):
-        try:
-            with new.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            new.replace(path)
-        finally:
-            new.unlink(missing_ok=True)
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

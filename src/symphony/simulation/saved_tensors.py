@@ -21,7 +21,7 @@ KEY = "symphony"
 
 _LINES = ("lanes", "boundary", "marks")
 _ROAD = tuple(item.name for item in fields(RoadMap) if item.name not in _LINES)
-_SCALARS = ("segment_id", "source", "dt", "ego", "current_step", "file")
+_SCALARS = ("segment_id", "source", "dt", "ego", "current_step", "file", "group")
 _LOG = tuple(item.name for item in fields(RunSegment) if item.name not in (*_SCALARS, "road"))
 _TREE = tuple(item.name for item in fields(SavedTrees) if item.name != "prune_every")
 
@@ -56,7 +56,7 @@ def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str,
         arrays |= _split(f"road.{name}", getattr(road, name))
     facts: dict[str, Any] = {name: getattr(segment, name) for name in _SCALARS}
     facts |= {"dt": float(segment.dt), "ego": int(segment.ego), "current_step": int(segment.current_step)}
-    facts |= {"start": saved.start, "drivers": list(saved.drivers), "group": saved.group}
+    facts |= {"start": saved.start, "drivers": list(saved.drivers)}
     facts["failed"] = {str(number): reason for number, reason in saved.failed.items()}
     if saved.trees is not None:
         arrays |= {f"tree.{name}": getattr(saved.trees, name) for name in _TREE}
@@ -129,7 +129,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     parts: dict[str, Any] = {name: reader.lines(f"road.{name}") for name in _LINES}
     road = RoadMap(**parts | {name: reader.array(f"road.{name}") for name in _ROAD})
     parts = {name: reader.array(f"log.{name}") for name in _LOG}
-    parts |= {name: reader.fact(name, str) for name in ("segment_id", "source", "file")}
+    parts |= {name: reader.fact(name, str) for name in ("segment_id", "source", "file", "group")}
     segment = RunSegment(
         **parts,
         road=road,
@@ -151,7 +151,6 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
         start=reader.fact("start", int),
         drivers=tuple(reader.fact("drivers", list)),
         failed={int(number): str(reason) for number, reason in failed.items()},
-        group=reader.fact("group", str),
         trees=trees,
     )
 

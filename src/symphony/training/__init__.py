@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
-from symphony.training.trainer import train
+from symphony.training.phases import Phase, Updates, cosine
+from symphony.training.processes import Processes, processes
+from symphony.training.trainer import Trainer
 
-__all__ = ["train"]
+__all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine", "processes"]

@@ -11,14 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from symphony.agents.checkpoint import CheckpointError
 from symphony.errors import SymphonyError
 
-LOSSES = {
-    "policy": ("loss_policy", "loss_distillation", "loss_bc"),
-    "goals": ("loss_goal",),
-    "discriminator": ("loss_discriminator",),
-}
-"""What each network descends; the first of them that there is."""
 NORM = "gradient_norm_"
 PATIENCE = 20
 """Updates in a row that may be skipped."""
@@ -41,9 +36,17 @@ class TrainingError(SymphonyError):
     """Training that can't go on."""
 
 
-def loss_of(network: str, values: Mapping[str, Any]) -> str | None:
-    """The name of the loss that a network descended in an update; None if it was not updated."""
-    return next((name for name in LOSSES.get(network, ()) if name in values), None)
+def loss_of(network: str) -> str:
+    """The name of the loss that a network descends."""
+    return f"loss_{network}"
+
+
+def _value(found: Any, name: str) -> Any:
+    return found.get(name) if isinstance(found, dict) else None
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 0
 
 
 @dataclass
@@ -57,6 +60,19 @@ class Skips:
 
     total: int = 0
     in_row: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, extra: Mapping[str, Any]) -> Skips:
+        """What the extra values of a checkpoint tell.
+
+        Raises:
+            CheckpointError: they tell something else.
+        """
+        found = extra.get("skips") or {"total": 0, "in_row": {}}
+        total, in_row = _value(found, "total"), _value(found, "in_row")
+        if not isinstance(in_row, dict) or not all(map(_is_count, (total, *in_row.values()))):
+            raise CheckpointError("no counts of updates", field="extra.skips")
+        return cls(total, in_row)
 
     def count(self, values: Mapping[str, Tensor]) -> list[str]:
         """Count those of one update, from its norms of the gradient; returns the networks concerned.
@@ -75,8 +91,8 @@ class Skips:
         self.total += len(bad)
         for name in bad:
             if self.in_row[name] >= PATIENCE:
-                loss = loss_of(name, values)
-                told = "" if loss is None else f" ({loss} is {values[loss].item():g})"
+                loss = loss_of(name)
+                told = f" ({loss} is {values[loss].item():g})" if loss in values else ""
                 raise TrainingError(
                     f"the gradient of the {name} network{told} was not finite in {PATIENCE} updates in a row; "
                     "the last checkpoint is intact: lower the learning rate, or check the data"
@@ -98,7 +114,7 @@ class Alarms:
 
     def check(self, record: Mapping[str, Any]) -> str | None:
         """The alarm (see :data:`ALARMS`) that is on after this record, if any."""
-        value = record.get("auc")
+        value = record.get("discriminator_auc")
         if value is None or math.isnan(value):
             return None
         self._recent.append(value)

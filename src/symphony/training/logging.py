@@ -69,14 +69,14 @@ class Tracker:
         if self._run is not None:
             self._run.log(dict(values), step=step)
 
-    def show(self, step: int, samples: Mapping[str, NDArray[Any]], video: Path) -> None:
+    def preview(self, step: int, samples: Mapping[str, NDArray[Any]], video: Path) -> None:
         """Give Weights & Biases, where it is used, histograms of samples [K] and an animation (gif)."""
         if self._run is None:
             return
         import wandb as tracking  # noqa: PLC0415 - is there by now
 
-        found: dict[str, Any] = {"show/rollout": tracking.Video(str(video), format="gif")}
-        found |= {f"show/{name}": tracking.Histogram(x.tolist()) for name, x in samples.items() if len(x)}
+        found: dict[str, Any] = {"preview/rollout": tracking.Video(str(video), format="gif")}
+        found |= {f"preview/{name}": tracking.Histogram(x.tolist()) for name, x in samples.items() if len(x)}
         self._run.log(found, step=step)
 
     def sync(self) -> None:

@@ -1,4 +1,4 @@
-"""Looking at a run while it trains: what its agent does, in an animation and as distributions."""
+"""Previews of a run while it trains: what its agent does, in an animation and as distributions."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.agents.agent import assemble
-from symphony.config import EvaluateConfig, TrainConfig
-from symphony.data.segment import RunSegment
+from symphony import keys
+from symphony.agents.agent import Agent
+from symphony.config import EvaluateConfig, RunConfig
 from symphony.envs.scene import SceneBatch
-from symphony.evaluation.evaluator import simulated
+from symphony.evaluation.pictures import clip_of
 from symphony.files import naming
 from symphony.geometry.frames import wrap
-from symphony.render import Clip, animate_rollouts
-from symphony.simulation.demonstrations import SceneDataset, logged, spread
+from symphony.render import animate_rollouts
+from symphony.simulation import SearchReplay
+from symphony.simulation.demonstrations import SceneDataset, evenly_spaced, logged
+from symphony.simulation.driving import simulated
 from symphony.simulation.rollouts import Rollouts
-from symphony.training.learner import Learner
 from symphony.training.validation import undisturbed
 
 PANELS = 2
@@ -36,7 +37,7 @@ Samples = dict[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
-class Shown:
+class Preview:
     """What there is to see after an update.
 
     Attributes:
@@ -50,35 +51,43 @@ class Shown:
     samples: Samples
 
     def numbers(self) -> dict[str, float]:
-        """Quantiles for the record, all beginning with ``show_``; those of nothing are NaN."""
+        """Quantiles for the record, all beginning with ``preview_``; those of nothing are NaN."""
         found: dict[str, float] = {}
         for name, values in self.samples.items():
             levels = np.percentile(values, QUANTILES) if len(values) else [np.nan] * len(QUANTILES)
-            found |= {f"show_{name}_p{q}": float(x) for q, x in zip(QUANTILES, levels, strict=True)}
+            found |= {f"preview_{name}_p{q}": float(x) for q, x in zip(QUANTILES, levels, strict=True)}
         return found
 
 
-class Show:
-    """Simulates the agent that a learner's networks make, as it is meant to be simulated.
+class Previewer:
+    """Simulates an agent as it is meant to be simulated.
 
     Args:
         config: of the run.
-        learner: shown as it is at each call.
+        agent: shown as it is at each call.
         dataset: segments to choose from, evenly spaced: the same at each call.
+        device: the networks'.
+        replay: gives the states that the discriminator learns from.
     """
 
-    def __init__(self, config: TrainConfig, learner: Learner, dataset: SceneDataset) -> None:
-        self.items = spread(len(dataset), config.show.segments)
-        self.learner, self.dataset = learner, dataset
+    def __init__(
+        self,
+        config: RunConfig,
+        agent: Agent,
+        dataset: SceneDataset,
+        device: torch.device,
+        replay: SearchReplay | None = None,
+    ) -> None:
+        self.items = evenly_spaced(len(dataset), config.preview.segments)
+        self.agent, self.dataset, self.device, self.replay = agent, dataset, device, replay
         # Before the first update, so that one that can't be used is found then.
         dataset.scenes(self.items)
         self.folder = config.out / "media"
-        self.agent = assemble(str(config.out), config, learner.networks)
-        rollouts = min(ROLLOUTS, config.search.test_branches) if config.searches else ROLLOUTS
-        self.how = EvaluateConfig(rollouts=rollouts, device=str(learner.device))
+        rollouts = min(ROLLOUTS, agent.search.test_branches) if agent.searches else ROLLOUTS
+        self.how = EvaluateConfig(rollouts=rollouts, device=str(device))
 
-    def __call__(self, step: int) -> Shown:
-        """Show the agent as it is after an update; the course of the training does not depend on it.
+    def __call__(self, step: int) -> Preview:
+        """Preview the agent as it is after an update; the course of the training does not depend on it.
 
         Args:
             step: updates made so far.
@@ -86,51 +95,32 @@ class Show:
         Raises:
             DataError: if the disk refuses.
         """
-        device = self.learner.device
         segments, scenes = [self.dataset.segment(i) for i in self.items], self.dataset.scenes(self.items)
-        with undisturbed(self.learner.networks, device):
-            rollouts = simulated(self.agent, scenes.to(device), self.how).cpu()
-            scores = self.learner.scores(step)
+        with undisturbed(self.agent, self.device):
+            rollouts = simulated(self.agent, scenes.to(self.device), self.how).cpu()
+            scores = self._scores(step)
         samples = samples_of(scenes, rollouts, [segment.dt for segment in segments])
         samples |= {f"score_{name}": _finite(values.cpu()) for name, values in scores.items()}
         video = self.folder / f"rollout-{step:06d}.gif"
         clips = [clip_of(segments[b], scenes, rollouts, b, 1) for b in range(min(PANELS, len(segments)))]
         with naming(video):
             animate_rollouts(clips, video)
-        return Shown(video, samples)
+        return Preview(video, samples)
 
-
-def clip_of(
-    segment: RunSegment,
-    scenes: SceneBatch,
-    rollouts: Rollouts,
-    row: int = 0,
-    count: int | None = None,
-    title: str | None = None,
-) -> Clip:
-    """Rollouts of one run segment, to be drawn or animated.
-
-    Args:
-        segment: in row ``row`` of the scenes.
-        scenes: that were simulated, on the CPU.
-        rollouts: [B, K, ...] of them, on the CPU.
-        row: of the batch.
-        count: how many of the K; all by default.
-        title: of the picture; by default the segment's id.
-    """
-    # Past the segment's end there is only the padding of its batch.
-    steps = segment.num_steps - 1
-    state = rollouts.state[row, :count, 1 : steps + 1].transpose(1, 2).numpy()
-    counted, collision, offroad = (
-        part[row, :count, :steps].transpose(1, 2).numpy()
-        for part in (rollouts.counted, rollouts.collision, rollouts.offroad)
-    )
-    agents = torch.where(scenes.interactive_valid[row], scenes.interactive[row], -1).numpy()
-    return Clip(segment, state[..., :2], state[..., 2], agents, 1, counted, collision, offroad, title=title)
+    @torch.no_grad()
+    def _scores(self, step: int) -> dict[str, Tensor]:
+        """The discriminator's logits [K] of simulated and logged states; which, the number of the update says."""
+        if self.agent.discriminator is None:
+            return {}
+        if self.replay is None or not self.replay.searched:
+            return dict.fromkeys(("simulated", "data"), torch.zeros(0))
+        batch = self.agent.discriminator(self.replay.both_kinds(torch.Generator().manual_seed(step)))
+        score, valid, fake = (batch.get(key) for key in (keys.SCORE, keys.VALID, keys.SIMULATED))
+        return {"simulated": score[valid & fake], "data": score[valid & ~fake]}
 
 
 def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> Samples:
-    """What interactive agents do in rollouts and in the log, and how far apart these are: see :class:`Shown`.
+    """What interactive agents do in rollouts and in the log, and how far apart these are: see :class:`Preview`.
 
     Args:
         scenes: B scenes.

@@ -21,7 +21,6 @@ from torch.nn.parallel import DistributedDataParallel
 from symphony.errors import ConfigError
 from symphony.objectives.base import MaskedLoss
 from symphony.streams import stream_of
-from symphony.training.learner import Learner
 
 _SEED_STRIDE = 1 << 20
 _PATIENCE = timedelta(days=1)
@@ -42,13 +41,6 @@ class SharedLoss(DistributedDataParallel):
             if name == "module":
                 raise
             return getattr(self.module, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # The environment of a loss that simulates changes from call to call.
-        if name == "env":
-            self.module.env = value
-        else:
-            super().__setattr__(name, value)
 
 
 @dataclass(frozen=True)
@@ -82,15 +74,12 @@ class Processes:
         if self.count > 1:
             torch.manual_seed(stream_of(f"update {seed} {self.rank} {step}"))
 
-    def share(self, learner: Learner) -> None:
-        """Make the losses of a learner those of the batches of all processes, and their weights the same."""
+    def share(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
+        """A loss that is that of the batches of all processes; itself where there is one process only."""
         if self.count == 1:
-            return
-        for name in ("policy_loss", "goal_loss", "judge_loss", "mgail_loss"):
-            loss: MaskedLoss | None = getattr(learner, name)
-            if loss is not None:
-                loss.share_count = self._mean
-                setattr(learner, name, SharedLoss(loss))
+            return loss
+        loss.share_count = self._mean
+        return SharedLoss(loss)
 
     def mean(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Means over the processes of the numbers each has under the same names; those that are NaN are left out.

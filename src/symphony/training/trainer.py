@@ -1,129 +1,130 @@
-"""The training loop."""
+"""The one trainer: runs what a recipe has built."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import random
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensordict import TensorDictBase
+from torch import Tensor, nn
 
-from symphony.agents.agent import read_config
-from symphony.agents.checkpoint import latest, load_checkpoint, parts_of, prune, save_checkpoint
-from symphony.agents.choice import Best, choose, split_name
-from symphony.agents.networks import Networks, build_networks, dynamics_of
-from symphony.config import TrainConfig, to_json
-from symphony.data.store import SegmentStore
+from symphony.agents.agent import FILE, Agent
+from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoint, prune, save_checkpoint
+from symphony.agents.choice import Best
+from symphony.config import RunConfig, to_json
 from symphony.errors import ConfigError, DataError
-from symphony.files import write_file
-from symphony.simulation.demonstrations import SceneDataset
+from symphony.files import naming, write_file
+from symphony.simulation import SceneDataset, SearchReplay
 from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
-from symphony.training.learner import Learner
 from symphony.training.logging import Tracker
-from symphony.training.previews import Show
-from symphony.training.processes import Processes, processes
+from symphony.training.phases import Phase
+from symphony.training.previews import Previewer
+from symphony.training.processes import Processes
+from symphony.training.resume import checkpoint_to_resume, warm_start
 from symphony.training.validation import Validator
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""
-FREE = ("out", "data", "steps", "resume", "device", "wandb", "show", "checkpoint_every", "log_every")
-"""Settings that may be others when a run goes on."""
+_SEED_STRIDE = 1_000_003
 
 
-def train(config: TrainConfig, dataset: SceneDataset | None = None) -> Path:
-    """Train an agent as configured.
+class Trainer:
+    """Runs the updates of a recipe: records, validation, previews and checkpoints, in that order.
 
-    The data of every update is drawn from (seed, update) alone, and checkpoints hold weights and optimiser, so a
-    run that was stopped and resumed ends with the same weights as one that was not. With a store to validate on, the
-    checkpoint that does best there is the run's agent.
+    All that is random in an update derives from the seed and the number of the update, and checkpoints hold weights
+    and optimizers, so a run that was stopped and resumed ends with the same weights as one that was not. With a store
+    to validate on, the checkpoint that does best there is the run's agent.
 
     Args:
-        config: what to train.
-        dataset: the prepared data, if several runs are to share it; by default made from ``config.data``.
-
-    Returns:
-        The run's folder: ``config.json``, ``metrics.jsonl``, ``checkpoints/`` and ``media/``.
+        config: of the run; the folder gets it whole.
+        agent: what learns, on its device.
+        data: what it learns from.
+        phases: stretches of updates, in their order.
+        optimizers: by name; each is stepped on the losses that come under its name.
+        rng: the generator that the updates draw from; seeded anew before each.
+        processes: those that train together.
+        replay: what is drawn from searches, where there are any.
 
     Raises:
         ConfigError: if the folder holds another run, or settings can't be used.
-        DataError: if a store can't be read or holds nothing to learn from, or the disk refuses.
-        TrainingError: if gradients stay infinite or undefined.
+        DataError: if a store can't be read or holds nothing to learn from.
     """
-    with processes(_device(config.device)) as world:
-        folder = _train(config, dataset, world)
-        world.wait()
-    return folder
-
-
-def _train(config: TrainConfig, dataset: SceneDataset | None, world: Processes) -> Path:
-    if dataset is None:
-        store = SegmentStore(config.data)
-        dataset = SceneDataset(
-            store,
-            config.agent.interactive,
-            dynamics_of(config),
-            routes=config.hierarchical,
-            duration=config.duration,
-        )
-    if len(dataset) == 0:
-        raise DataError("the store holds no run segments", file=config.data)
-    if config.hierarchical and not dataset.routes:
-        raise ConfigError(f"method {config.method} needs a dataset with routes")
-    done = _find(config)
-    torch.manual_seed(config.seed)
-    networks = build_networks(config)
-    if config.warm_start is not None and done is None:
-        _warm_start(networks, config.warm_start)
-    for module in networks.present().values():
-        module.to(world.device)
-    drawing = dataclasses.replace(config, seed=world.seed(config.seed))
-    learner = Learner(drawing, networks, dataset, world.device)
-    validator = None
-    if world.leads and config.validation.data is not None:
-        validator = Validator(config, networks, world.device)
-    show = None
-    if world.leads and 0 < config.show.every <= config.steps:
-        show = Show(config, learner, dataset if validator is None else validator.dataset)
-    # No process writes before all have looked at what there is.
-    world.wait()
-    if world.leads:
-        config.out.mkdir(parents=True, exist_ok=True)
-        write_file(config.out / "config.json", to_json(config))
-    return _Loop(config, learner, validator, show, world).run(done)
-
-
-class _Loop:
-    """One run: updates, records, judgements and checkpoints, in that order."""
 
     def __init__(
         self,
-        config: TrainConfig,
-        learner: Learner,
-        validator: Validator | None,
-        show: Show | None,
-        world: Processes,
+        config: RunConfig,
+        agent: Agent,
+        data: SceneDataset,
+        phases: Sequence[Phase],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        rng: torch.Generator,
+        processes: Processes,
+        replay: SearchReplay | None = None,
     ) -> None:
-        self.config, self.learner, self.world = config, learner, world
-        self.validator, self.show = validator, show
-        self.modules = learner.networks.present()
+        if replay is not None and config.checkpoint_every % replay.every:
+            raise ConfigError(
+                f"checkpoint-every ({config.checkpoint_every}) must be a multiple of search.updates "
+                f"({replay.every}), so that a resumed run repeats no search"
+            )
+        self.config, self.agent, self.data, self.phases = config, agent, data, phases
+        self.optimizers, self.rng, self.world = dict(optimizers), rng, processes
+        self.seed = processes.seed(config.seed)
         self.skips, self.told = Skips(), set[str]()
         self.best: Best | None = None
-        self.progress = _progress(shown=world.leads)
+        self.progress = _progress(shown=processes.leads)
         self.tracker: Tracker | None = None
+        self.checksum = data.store.checksum()
+        self.done = checkpoint_to_resume(config)
+        if config.warm_start is not None and self.done is None:
+            warm_start(agent, config.warm_start)
+        self.validator: Validator | None = None
+        self.previewer: Previewer | None = None
+        if self.world.leads and config.validation.data is not None:
+            self.validator = Validator(config.validation, agent, processes.device)
+        if self.world.leads and 0 < config.preview.every <= config.steps:
+            shown = data if self.validator is None else self.validator.dataset
+            self.previewer = Previewer(config, agent, shown, processes.device, replay)
 
-    def run(self, done: Path | None) -> Path:
-        """Train from a checkpoint, or from the start, to the end."""
+    def run(self) -> Path:
+        """Train to the end.
+
+        Returns:
+            The run's folder: ``config.json``, ``agent.json``, ``metrics.jsonl``, ``checkpoints/`` and ``media/``.
+
+        Raises:
+            DataError: if the disk refuses.
+            TrainingError: if gradients stay infinite or undefined.
+        """
         config, step = self.config, 0
-        if done is not None:
-            loaded = load_checkpoint(done, modules=self.modules, optimizers=self.learner.optimizers)
+        # Kept with checkpoints like torch's, which the recipe has seeded: those of equal runs are equal files.
+        random.seed(config.seed)
+        np.random.seed(config.seed % 2**32)  # noqa: NPY002
+        # No process writes before all have looked at what there is.
+        self.world.wait()
+        if self.world.leads:
+            config.out.mkdir(parents=True, exist_ok=True)
+            # What a process left behind that was killed while it wrote.
+            for unfinished in config.out.glob(".new-*"):
+                with naming(unfinished):
+                    unfinished.unlink()
+            write_file(config.out / "config.json", to_json(config))
+            write_file(config.out / FILE, to_json(self.agent.spec))
+        if self.done is not None:
+            loaded = load_checkpoint(self.done, modules=self.agent.modules, optimizers=self.optimizers)
             step = loaded.step
-            self._restore(loaded.extra)
-        self.world.share(self.learner)
+            try:
+                self._restore(loaded.extra)
+            except CheckpointError as error:
+                raise error.at(file=self.done / MANIFEST) from error
         self.alarms = Alarms()
         if self.world.leads:
             # The process before may have died between a checkpoint and the removal of old ones.
@@ -139,13 +140,13 @@ class _Loop:
         finally:
             if self.tracker is not None:
                 self.tracker.close()
+        self.world.wait()
         return config.out
 
     def _update_from(self, step: int) -> None:
         config, first, began = self.config, step, time.perf_counter()
         while step < config.steps:
-            self.world.reseed(config.seed, step)
-            values = self.learner.update(step)
+            values = self._update(step)
             step += 1
             last = step == config.steps
             for network in self.skips.count(values):
@@ -159,10 +160,11 @@ class _Loop:
             if self.tracker is None:
                 continue
             paused = time.perf_counter()
-            if self.validator is not None and (last or step % _validate_every(config) == 0):
+            every = config.validation.every or config.checkpoint_every
+            if self.validator is not None and (last or step % every == 0):
                 numbers |= self._validate(self.validator, step)
-            if self.show is not None and (last or step % config.show.every == 0):
-                numbers |= self._show(self.show, self.tracker, step)
+            if self.previewer is not None and (last or step % config.preview.every == 0):
+                numbers |= self._preview(self.previewer, self.tracker, step)
             began += time.perf_counter() - paused
             if numbers:
                 self.tracker.log(step, numbers)
@@ -170,12 +172,46 @@ class _Loop:
                 self.tracker.sync()
                 self._save(step)
 
+    def _update(self, step: int) -> dict[str, Tensor]:
+        """One update of every network; what is worth a record, as tensors without gradient."""
+        self.rng.manual_seed(self.seed * _SEED_STRIDE + step)
+        self.world.reseed(self.config.seed, step)
+        phase = next(phase for phase in self.phases if step < phase.until)
+        for name, rate in phase.rates(step).items():
+            for group in self.optimizers[name].param_groups:
+                group["lr"] = rate
+        record: dict[str, Tensor] = {}
+        for name, losses in phase.update(step):
+            record |= self._descend(name, losses)
+        return record
+
+    def _descend(self, name: str, losses: TensorDictBase) -> dict[str, Tensor]:
+        """Step the optimizer of a name; its statistics, with the name before those that are no losses."""
+        named = {
+            key if key.startswith(("loss", name)) else f"{name}_{key}": value.detach()
+            for key, value in losses.items()
+        }
+        if name not in self.optimizers:
+            return named
+        parts = {key: value for key, value in losses.items() if key.startswith("loss")}
+        total = torch.stack(list(parts.values())).sum()
+        if len(parts) == 1:  # recorded as the network's loss
+            named.pop(next(iter(parts)))
+        optimizer = self.optimizers[name]
+        weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norm = nn.utils.clip_grad_norm_(weights, self.config.clip)
+        if bool(norm.isfinite()):  # else the update is skipped; the loop counts them
+            optimizer.step()
+        return {**named, f"loss_{name}": total.detach(), f"{NORM}{name}": norm}
+
     def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
         """What the loop adds to a record, and shows."""
-        rate = self.learner.optimizers["policy"].param_groups[0]["lr"]
+        rate = self.optimizers["policy"].param_groups[0]["lr"]
         added: dict[str, float | str] = {"learning_rate": rate, "skipped_updates": self.skips.total}
-        loss = loss_of("policy", numbers)
-        if loss is not None:
+        loss = loss_of("policy")
+        if loss in numbers:
             self.progress.update(self.task, loss=f"{numbers[loss]:.3f}")
         self.progress.update(self.task, speed=f"{numbers['updates_per_second']:.3g}")
         alarm = self.alarms.check(numbers)
@@ -199,23 +235,27 @@ class _Loop:
         self.progress.update(self.task, description="training")
         return numbers
 
-    def _show(self, show: Show, tracker: Tracker, step: int) -> dict[str, float]:
-        self.progress.update(self.task, description="showing")
-        shown = show(step)
-        tracker.show(step, shown.samples, shown.video)
+    def _preview(self, previewer: Previewer, tracker: Tracker, step: int) -> dict[str, float]:
+        self.progress.update(self.task, description="previewing")
+        preview = previewer(step)
+        tracker.preview(step, preview.samples, preview.video)
         self.progress.update(self.task, description="training")
-        return shown.numbers()
+        return preview.numbers()
 
     def _save(self, step: int) -> None:
         """Write a checkpoint; by now all records up to it are on the disk."""
-        folder = self.config.out / "checkpoints"
         extra = {
-            "best": None if self.best is None else self.best.plain(),
+            "best": None if self.best is None else dataclasses.asdict(self.best),
             "skips": dataclasses.asdict(self.skips),
             "processes": self.world.count,
+            "data": self.checksum,
         }
         save_checkpoint(
-            folder, step=step, modules=self.modules, optimizers=self.learner.optimizers, extra=extra
+            self.config.out / "checkpoints",
+            step=step,
+            modules=self.agent.modules,
+            optimizers=self.optimizers,
+            extra=extra,
         )
         self._prune()
 
@@ -225,61 +265,22 @@ class _Loop:
 
     def _restore(self, extra: Mapping[str, Any]) -> None:
         before = extra.get("processes", 1)
+        if type(before) is not int or before < 1:
+            raise CheckpointError("no number of processes", field="extra.processes")
         if before != self.world.count:
             raise ConfigError(
                 f"{self.config.out}: trained by {before} processes so far, can't be resumed by {self.world.count}"
             )
+        if extra.get("data", self.checksum) != self.checksum:
+            raise DataError(
+                f"not the run segments that {self.config.out} learned from so far: checksum {self.checksum[:12]}, "
+                f"then {str(extra['data'])[:12]}",
+                file=self.data.store.path,
+            )
         self.best = Best.of(extra)
-        self.skips = Skips(**extra.get("skips", {}))
+        self.skips = Skips.of(extra)
         if self.validator is not None:
             self.validator.best = self.best
-
-
-def _validate_every(config: TrainConfig) -> int:
-    return config.validation.every or config.checkpoint_every
-
-
-def _warm_start(networks: Networks, name: Path) -> None:
-    """Take over the networks that another run has too."""
-    source = choose(*split_name(str(name)))
-    there = parts_of(source)
-    shared = {name: module for name, module in networks.present().items() if name in there}
-    load_checkpoint(source, modules=shared, partial=True, restore_rng=False)
-
-
-def _find(config: TrainConfig) -> Path | None:
-    """Find the checkpoint to go on from, if this is a run to go on with."""
-    done = latest(config.out / "checkpoints")
-    if (config.out / "config.json").exists():
-        if not config.resume:
-            raise ConfigError(f"{config.out} holds a run already; choose another folder or --resume")
-        # More updates, another machine or fewer records do not make it another run.
-        free = {name: getattr(config, name) for name in FREE}
-        before = read_config(config.out)
-        judged = before.validation
-        # Judgements of other segments could not be compared with those so far.
-        free["validation"] = config.validation
-        if judged.data is not None:
-            free["validation"] = dataclasses.replace(
-                judged, data=config.validation.data, every=config.validation.every
-            )
-        before = dataclasses.replace(before, **free)
-        changed = [
-            f.name for f in dataclasses.fields(config) if getattr(before, f.name) != getattr(config, f.name)
-        ]
-        if changed:
-            raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
-    return done
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f"unknown device '{name}'") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device '{name}': this PyTorch sees no CUDA device")
-    return device
 
 
 def _progress(*, shown: bool) -> Progress:

@@ -14,6 +14,8 @@ __all__ = ["Reader", "get_reader", "readers"]
 _READERS = {
     "argoverse2": ("symphony.data.sources.argoverse2", "Argoverse2Reader"),
     "commonroad": ("symphony.data.sources.commonroad", "CommonRoadReader"),
+    "interaction": ("symphony.data.sources.interaction", "InteractionReader"),
+    "scenarionet": ("symphony.data.sources.scenarionet", "ScenarioNetReader"),
     "womd": ("symphony.data.sources.womd", "WomdReader"),
 }
 

@@ -3,7 +3,8 @@
 How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 - One file, ``scenario_<ID>.parquet``, is one segment; ``segment_id`` is the scenario id. The map is
-  ``log_map_archive_<ID>.json`` in the same folder.
+  ``log_map_archive_<ID>.json`` in the same folder. The format names no log: scenarios with equal maps are windows
+  of one drive and form a group, named after the map's SHA-256.
 - Steps run from 0 to the last at which any track is present (the test split ends after the history). The time
   step is the span of the timestamps divided by their number less one: the format has no times of single steps.
   ``current_step`` is the last observed step, 49 in the dataset's 5 s of history at 10 Hz.
@@ -20,6 +21,7 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,9 +31,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_STEPS, check_counts
 from symphony.data.segment import AgentType, Bools, RunSegment
 from symphony.data.sources.argoverse2_map import CityMap, read_map, road_map
-from symphony.data.sources.base import Item, Reader, to_float32
+from symphony.data.sources.base import Item, Reader, read_whole, to_float32
 from symphony.data.sources.lines import Doubles
 from symphony.errors import ConfigError, DataError
 
@@ -52,10 +55,12 @@ NOMINAL_SIZES: dict[str, tuple[AgentType, tuple[float, float, float]]] = {
 }
 """Object type of the format -> agent type and (length, width, height) in metres."""
 
-MAX_STEPS = 36_000
-"""An hour at 10 Hz; more than any scenario, few enough to allocate."""
-MAX_STATES = 20_000_000
-"""Agents times steps, likewise."""
+MAX_ROWS = 500_000
+"""States of a scenario; the dataset's have some thousand."""
+MAX_TEXT = 64
+"""Characters of an id."""
+MAX_BYTES = 256 << 20
+"""Of the columns, decompressed."""
 
 _TEXT, _FLAG, _INTEGER, _NUMBER = "text", "true or false", "an integer", "a number"
 _COLUMNS = {
@@ -94,7 +99,7 @@ class Argoverse2Reader(Reader):
     def __init__(self) -> None:
         if importlib.util.find_spec("pyarrow") is None:
             raise ConfigError(
-                "pyarrow is not installed; it comes with the extra: pip install 'symphony[argoverse2]'"
+                "pyarrow is not installed; it comes with the extra: pip install 'symphony-traffic[argoverse2]'"
             )
 
     def companions(self, path: Path) -> tuple[Path, ...]:
@@ -102,7 +107,7 @@ class Argoverse2Reader(Reader):
         return (map_path(path),)
 
     def _read(self, path: Path) -> Iterator[Item]:
-        columns = read_columns(path.read_bytes())
+        columns = read_columns(read_whole(path))
         name = _constant(columns, "scenario_id")
         try:
             yield self._segment(columns, name, path)
@@ -117,7 +122,8 @@ class Argoverse2Reader(Reader):
         city = read_map(map_path(path))
         # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
         with np.errstate(over="ignore", invalid="ignore"):
-            return _assemble(columns, tracks, city, name, path.name)
+            segment = _assemble(columns, tracks, city, name, path.name)
+        return segment.replace(group=hashlib.sha256(map_path(path).read_bytes()).hexdigest()[:16])
 
 
 def map_path(path: Path) -> Path:
@@ -129,7 +135,7 @@ def read_columns(data: bytes) -> Columns:
     """The columns the reader needs, as arrays [N].
 
     Raises:
-        DataError: the file is no Parquet, a column is missing, of another type, or has gaps.
+        DataError: the file is no Parquet, too large, a column is missing, of another type, or has gaps.
     """
     import pyarrow as pa  # noqa: PLC0415 - an optional extra
     from pyarrow import parquet  # noqa: PLC0415
@@ -137,10 +143,18 @@ def read_columns(data: bytes) -> Columns:
     if not data:
         raise DataError("the file is empty")
     try:
-        file = parquet.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
-        missing = [name for name in _COLUMNS if name not in file.schema_arrow.names]
+        schema = parquet.read_schema(pa.BufferReader(data))
+        missing = [name for name in _COLUMNS if name not in schema.names]
         if missing:
             raise DataError("the column is missing", field=missing[0])
+        for name, kind in _COLUMNS.items():
+            if pa.types.is_nested(schema.field(name).type):
+                raise DataError(f"expected {kind}, is {schema.field(name).type}", field=name)
+        # Text stays a dictionary: a long one that all rows share must not become a copy for each.
+        texts = [name for name, kind in _COLUMNS.items() if kind == _TEXT]
+        source = pa.BufferReader(data)
+        file = parquet.ParquetFile(source, read_dictionary=texts, page_checksum_verification=True)
+        _check_size(file.metadata)
         table = file.read(columns=list(_COLUMNS), use_threads=False)
         table.validate(full=True)
         return {name: _column(pa, table[name], name, kind) for name, kind in _COLUMNS.items()}
@@ -149,25 +163,59 @@ def read_columns(data: bytes) -> Columns:
         raise DataError(f"not a readable Parquet file: {str(error)[:200]}") from error
 
 
+def _check_size(metadata: Any) -> None:
+    """Refuse what would take gigabytes once it is read."""
+    if metadata.num_rows > MAX_ROWS:
+        raise DataError(f"{metadata.num_rows} rows, at most {MAX_ROWS} are read")
+    size = 0
+    for k in range(metadata.num_row_groups):
+        group = metadata.row_group(k)
+        chunks = [group.column(j) for j in range(group.num_columns)]
+        size += sum(chunk.total_uncompressed_size for chunk in chunks if chunk.path_in_schema in _COLUMNS)
+    if size > MAX_BYTES:
+        raise DataError(f"{size} bytes in its columns, at most {MAX_BYTES} are read")
+
+
 def _column(pa: Any, column: Any, name: str, kind: str) -> NDArray[Any]:
     types = pa.types
+    if kind == _TEXT:
+        return _text(pa, column, name)
     if types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     fits = {
-        _TEXT: types.is_string(column.type) or types.is_large_string(column.type),
         _FLAG: types.is_boolean(column.type),
         _INTEGER: types.is_integer(column.type),
         _NUMBER: types.is_floating(column.type) or types.is_integer(column.type),
     }
     if not fits[kind]:
         raise DataError(f"expected {kind}, is {column.type}", field=name)
+    _check_full(column, name)
+    return column.cast({_FLAG: pa.bool_(), _INTEGER: pa.int64(), _NUMBER: pa.float64()}[kind]).to_numpy()
+
+
+def _check_full(column: Any, name: str) -> None:
     if column.null_count:
         raise DataError(f"{column.null_count} of {len(column)} values are missing", field=name)
     if not len(column):
         raise DataError("the file has no rows", field=name)
-    if kind == _TEXT:
-        return np.array(column.to_pylist(), np.str_)
-    return column.cast({_FLAG: pa.bool_(), _INTEGER: pa.int64(), _NUMBER: pa.float64()}[kind]).to_numpy()
+
+
+def _text(pa: Any, column: Any, name: str) -> NDArray[np.str_]:
+    """Text of at most :data:`MAX_TEXT` characters, by way of the few that differ."""
+    if not pa.types.is_dictionary(column.type):
+        column = column.dictionary_encode()
+    kind = column.type.value_type
+    if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        raise DataError(f"expected {_TEXT}, is {kind}", field=name)
+    _check_full(column, name)
+    whole = column.unify_dictionaries().combine_chunks()
+    whole = whole.chunk(0) if isinstance(whole, pa.ChunkedArray) else whole
+    values = whole.dictionary.to_pylist()
+    if None in values:
+        raise DataError("values are missing", field=name)
+    if max(map(len, values)) > MAX_TEXT:
+        raise DataError(f"a text of more than {MAX_TEXT} characters", field=name)
+    return np.array(values, np.str_)[whole.indices.to_numpy()]
 
 
 def _constant(columns: Columns, name: str) -> Any:
@@ -247,8 +295,7 @@ def _steps(columns: Columns, agents: int) -> tuple[NDArray[np.int64], int]:
     if len(outside):
         raise DataError(f"{outside[0]} is outside the {count} steps", field="timestep")
     steps = int(step.max()) + 1
-    if agents * steps > MAX_STATES:
-        raise DataError(f"{agents} tracks of {steps} steps, too many to read", field="track_id")
+    check_counts(agents, steps, "track_id")
     return step, steps
 
 

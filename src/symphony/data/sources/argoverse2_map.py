@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_POINTS
 from symphony.data.segment import LaneType, MarkType, RoadMap
-from symphony.data.sources.base import pairs, to_float32
+from symphony.data.sources.base import pairs, read_whole, to_float32
 from symphony.data.sources.lines import Doubles, drivable_rings, evenly, polylines, stretches
 from symphony.errors import DataError
 
@@ -24,6 +25,8 @@ CUT_TOLERANCE = 0.011
 
 MAX_COORDINATE = 1e8
 """Larger magnitudes are no metres of a city."""
+MAX_BOUND = 5_000.0
+"""Metres of one bound of a lane; scenarios are some 100 m wide."""
 
 _LANE_TYPES = {
     "VEHICLE": LaneType.SURFACE_STREET,
@@ -90,7 +93,7 @@ def read_map(path: Path) -> CityMap:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    data = path.read_bytes()
+    data = read_whole(path)
     if not data.strip():
         raise DataError("the file is empty")
     try:
@@ -105,7 +108,12 @@ def _city_map(root: dict[str, Any]) -> CityMap:
         name: _table(_get(root, name, ""), name)
         for name in ("lane_segments", "drivable_areas", "pedestrian_crossings")
     }
-    lanes = [_lane(key, node) for key, node in found["lane_segments"].items()]
+    lanes, points = [], 0
+    for key, node in found["lane_segments"].items():
+        lanes.append(_lane(key, node))
+        points += len(lanes[-1].center) + len(lanes[-1].left) + len(lanes[-1].right)
+        if points > MAX_POINTS:
+            raise DataError(f"more than {MAX_POINTS} points", field="lane_segments")
     areas = [_outline(key, node) for key, node in found["drivable_areas"].items()]
     if not areas:
         raise DataError("has no drivable areas", field="drivable_areas")
@@ -124,10 +132,10 @@ def _lane(key: str, node: Any) -> Lane:
     node = _table(node, field)
     lane_id = _integer(_get(node, "id", field), f"{field}: id")
     if str(lane_id) != key:
-        raise DataError(f"is {lane_id} under the key {key!r}", field=f"{field}: id")
+        raise DataError(f"is {lane_id} under the key {key[:40]!r}", field=f"{field}: id")
     kind = _get(node, "lane_type", field)
-    if kind not in _LANE_TYPES:
-        raise DataError(f"unknown value {kind!r}", field=f"{field}: lane_type")
+    if not isinstance(kind, str) or kind not in _LANE_TYPES:
+        raise DataError(f"unknown value {str(kind)[:40]!r}", field=f"{field}: lane_type")
     left, right = (
         _points(_get(node, f"{side}_lane_boundary", field), f"{field}: {side}_lane_boundary")
         for side in ("left", "right")
@@ -159,13 +167,15 @@ def _is_painted(node: dict[str, Any], side: str, field: str) -> bool:
     name = f"{side}_lane_mark_type"
     mark = _get(node, name, field)
     if not isinstance(mark, str):
-        raise DataError(f"{mark!r} is no text", field=f"{field}: {name}")
+        raise DataError(f"{str(mark)[:40]!r} is no text", field=f"{field}: {name}")
     return mark not in _UNPAINTED
 
 
 def _matched(left: Doubles, right: Doubles) -> tuple[Doubles, Doubles]:
     """Both bounds with as many points, evenly spaced."""
     longest = max(np.hypot(*np.diff(line, axis=0).T).sum() for line in (left, right))
+    if not longest <= MAX_BOUND:
+        raise DataError(f"a lane of {longest:.4g} m, at most {MAX_BOUND:g}", field="lane_segments")
     count = int(np.ceil(longest / _SPACING)) + 1
     return evenly(left, max(count, 2)), evenly(right, max(count, 2))
 

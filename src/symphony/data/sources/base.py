@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_FILE
 from symphony.data.segment import Floats, RunSegment, validate
 from symphony.errors import DataError
 
@@ -17,8 +19,14 @@ Item = RunSegment | DataError
 """One record of a file: a valid run segment, or why there is none."""
 
 
+class UnexpectedError(DataError):
+    """A record that made a reader, or a library below it, fail in a way the reader did not foresee."""
+
+
 class Reader(ABC):
     """Turns the files of one format into run segments at the log's own rate.
+
+    A segment whose ``group`` a reader leaves empty is a group of its own.
 
     Attributes:
         name: name of the format, also :attr:`RunSegment.source`.
@@ -29,25 +37,33 @@ class Reader(ABC):
     patterns: ClassVar[tuple[str, ...]]
 
     def read(self, path: str | Path) -> Iterator[Item]:
-        """Yield one item per record of a file, in file order; never raises :class:`DataError`.
+        """Yield one item per record of a file, in file order; no file makes it raise.
 
         A record that can't be used is yielded as an error naming file, segment (where known) and field, so
         that the caller can count it and go on. Where the rest of the file can't be read, such an error comes
-        last.
+        last. That holds for whatever a reader or a library raises on content it did not expect.
         """
         path = Path(path)
         try:
             if path.is_dir():
                 raise DataError("is a folder, expected a file", file=path)
+            if path.exists() and not path.is_file():
+                raise DataError("is no ordinary file", file=path)  # a pipe may never end
             for item in self._read(path):
                 yield self._checked(item, path)
         except DataError as error:
             yield error.at(file=path)
         except OSError as error:
             yield DataError(f"can't be read: {error.strerror or error}", file=path)
+        except Exception as error:  # one bad file must not end a conversion
+            yield unexpected(error, file=path)
 
     def companions(self, path: Path) -> tuple[Path, ...]:
         """Further files that a file of this format is read together with, such as its map; none by default."""
+        return ()
+
+    def optional(self, path: Path) -> tuple[Path, ...]:
+        """Those of the :meth:`companions` without which a file can be read, since many have none; none by default."""
         return ()
 
     @staticmethod
@@ -55,13 +71,39 @@ class Reader(ABC):
         if isinstance(item, DataError):
             return item.at(file=path)
         try:
-            return validate(item)
+            return validate(item if item.group else item.replace(group=item.segment_id))
         except DataError as error:
             return DataError(error.message, file=path, segment=error.segment, field=error.field)
+        except Exception as error:  # arrays of other kinds than a segment has
+            return unexpected(error, file=path, segment=item.segment_id)
 
     @abstractmethod
     def _read(self, path: Path) -> Iterator[Item]:
         """Yield the records, not validated yet; may raise :class:`DataError` where it can't read on."""
+
+
+def unexpected(error: Exception, *, file: object = None, segment: str | None = None) -> UnexpectedError:
+    """What a record is reported as that a reader fails on."""
+    message = f"can't be read: {type(error).__name__}: {str(error)[:200]}"
+    return UnexpectedError(message, file=file, segment=segment)
+
+
+def read_whole(path: Path) -> bytes:
+    """The content of a file of at most :data:`MAX_FILE` bytes.
+
+    Raises:
+        DataError: there are more.
+        OSError: it can't be read.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > MAX_FILE:
+            message = f"{size} bytes, at most {MAX_FILE}: too large for a file of this format"
+            raise DataError(message, file=path)
+        data = file.read(size + 1)
+    if len(data) > size:
+        raise DataError("grew while it was read", file=path)
+    return data
 
 
 def to_float32(array: NDArray[np.float64]) -> Floats:

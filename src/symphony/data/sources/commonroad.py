@@ -5,15 +5,18 @@ can live with, and the last that installs (2022.1) brings scipy and does not ref
 
 How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
-- ``segment_id`` is the benchmark id. Steps run from the first to the last at which any dynamic obstacle exists.
-- Coordinates are taken relative to the ego's first position, rounded to metres; z is 0 throughout.
+- ``segment_id`` and ``group`` are the benchmark id. Steps run from the first to the last at which any dynamic
+  obstacle exists.
+- Coordinates are taken relative to the first position, rounded to metres, of the ego that ``egos="one"`` picks; z is
+  0 throughout.
 - A state variable given as an interval, or a position given as a region, becomes its middle. The velocity is the
   logged speed along the logged orientation, or a finite difference of positions where no speed is logged. A box
   bounds the obstacle's shape (the rectangle itself, usually). Static obstacles are at rest at every step.
 - Types: bicycles are cyclists; cars, trucks, buses, taxis, trains and motorcycles are vehicles; whatever is
   neither that nor a pedestrian is OTHER; scenery (buildings, pillars, road boundaries, median strips) is left out.
 - A lane is halfway between a lanelet's bounds; neighbours are adjacent lanelets of the same direction. The
-  boundary encloses the union of the lanelets. Sidewalks are left out, crosswalks are marks.
+  boundary encloses the union of the lanelets, and is open where the network is cut, at lanelets without successor or
+  predecessor. Sidewalks are left out, crosswalks are marks.
 - Nobody in these files is the ego, so the reader picks one (:class:`CommonRoadReader`).
 """
 
@@ -25,20 +28,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from symphony.data.segment import AgentType, RunSegment
+from symphony.data.segment import RunSegment
 from symphony.data.sources.base import Item, Reader, to_float32
 from symphony.data.sources.commonroad_map import Network, read_network, read_signals, road_map
 from symphony.data.sources.commonroad_tracks import Tracks, read_tracks
 from symphony.data.sources.commonroad_xml import load_xml, number
+from symphony.data.sources.egos import busiest_first
 from symphony.errors import ConfigError, DataError
 
 VERSIONS = ("2018b", "2020a")
-NEAR = 50.0
-"""Metres within which another agent counts as a neighbour of an ego candidate."""
-MOVING = 2.0
-"""Metres an agent must cover during the segment to count as moving."""
 
 
 class CommonRoadReader(Reader):
@@ -47,7 +46,8 @@ class CommonRoadReader(Reader):
     Args:
         egos: ``"one"`` picks, among the dynamic vehicles that move and are observed at every step, the one with
             the most moving neighbours (within 50 m, summed over the steps; the lowest id on ties). ``"all"``
-            yields a segment for each of those vehicles, in order of id, with ``_ego<ID>`` added to its name.
+            yields a segment for each of those vehicles, in order of id, with ``_ego<ID>`` added to its name; all
+            in one frame, on one map.
 
     Raises:
         ConfigError: ``egos`` is neither.
@@ -84,29 +84,18 @@ class CommonRoadReader(Reader):
             raise DataError(f"must be positive, is {dt:g}", field="timeStepSize")
         tracks = read_tracks(root, dt)
         network = read_network(root)
-        candidates = ego_candidates(tracks)
+        candidates = busiest_first(
+            tracks.agent_id, tracks.agent_type, tracks.position, tracks.valid, tracks.dynamic
+        )
         if not len(candidates):
             raise DataError("no moving vehicle is observed at every step", field="dynamicObstacle")
+        first = _segment(root, network, tracks, int(candidates[0]), name, dt, path.name)
         if self.egos == "one":
-            yield _segment(root, network, tracks, int(candidates[0]), name, dt, path.name)
+            yield first
             return
+        # All in the frame of the first, so that a store keeps one map for them.
         for ego in sorted(candidates.tolist(), key=lambda row: int(tracks.agent_id[row])):
-            suffixed = f"{name}_ego{tracks.agent_id[ego]}"
-            yield _segment(root, network, tracks, ego, suffixed, dt, path.name)
-
-
-def ego_candidates(tracks: Tracks) -> NDArray[np.int64]:
-    """Rows of the dynamic vehicles that move and are valid at every step, most moving neighbours first."""
-    strides = np.hypot(*np.moveaxis(np.diff(tracks.position, axis=1), -1, 0))
-    both = tracks.valid[:, 1:] & tracks.valid[:, :-1]
-    moving = np.where(both, strides, 0).sum(axis=1) > MOVING
-    vehicle = tracks.agent_type == AgentType.VEHICLE
-    rows = np.flatnonzero(tracks.dynamic & vehicle & moving & tracks.valid.all(axis=1))
-    scores = []
-    for row in rows:
-        distance = np.hypot(*np.moveaxis(tracks.position[moving] - tracks.position[row], -1, 0))
-        scores.append(int(((distance < NEAR) & tracks.valid[moving]).sum()))
-    return rows[np.lexsort((tracks.agent_id[rows], -np.array(scores, np.int64)))]
+            yield first.replace(ego=ego, segment_id=f"{name}_ego{tracks.agent_id[ego]}")
 
 
 def _segment(
@@ -134,4 +123,5 @@ def _segment(
         signal_state=signal_state,
         origin=np.array([*origin, 0.0]),
         file=file,
+        group=name,
     )

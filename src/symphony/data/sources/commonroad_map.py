@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import check_signals
 from symphony.data.segment import Floats, LaneType, MarkType, RoadMap, SignalState
 from symphony.data.sources.base import pairs, to_float32
 from symphony.data.sources.commonroad_xml import (
@@ -18,7 +19,7 @@ from symphony.data.sources.commonroad_xml import (
     points,
     references,
 )
-from symphony.data.sources.lines import drivable_rings, evenly, polylines
+from symphony.data.sources.lines import cut_ends, drivable_rings, evenly, opened, polylines
 from symphony.errors import DataError
 
 MAX_CYCLE = 10**8
@@ -75,16 +76,18 @@ class Network:
     Attributes:
         lanes: those that carry vehicles or cyclists; a road's lane k is ``lanes[k]``.
         crosswalks: those for crossing on foot.
-        rings: outlines of the drivable area, drivable side on the left.
+        boundary: edge of the drivable area, drivable side on the left, open where the network was cut.
         kind: lane type where a lanelet does not say.
         index: lanelet id -> lane index.
+        links: [E, 2] successors, lane indices (from, to).
     """
 
     lanes: tuple[Lanelet, ...]
     crosswalks: tuple[Lanelet, ...]
-    rings: tuple[Doubles, ...]
+    boundary: tuple[Doubles, ...]
     kind: LaneType
     index: dict[int, int]
+    links: NDArray[np.int32]
 
 
 def read_network(root: ET.Element) -> Network:
@@ -102,12 +105,18 @@ def read_network(root: ET.Element) -> Network:
     if not lanes:
         raise DataError("has no lanes", field="lanelet")
     tags = set((root.get("tags") or "").split()) | {child.tag for child in root.findall("scenarioTags/*")}
+    index = {lanelet.lanelet_id: k for k, lanelet in enumerate(lanes)}
+    flow = [(k, index[ref]) for k, lane in enumerate(lanes) for ref in lane.successors if ref in index]
+    flow += [(index[ref], k) for k, lane in enumerate(lanes) for ref in lane.predecessors if ref in index]
+    links = pairs(flow)
+    rings = drivable_rings([lanelet.ring for lanelet in lanes])
     return Network(
         lanes=lanes,
         crosswalks=tuple(lanelet for lanelet in lanelets if "crosswalk" in lanelet.kinds),
-        rings=drivable_rings([lanelet.ring for lanelet in lanes]),
+        boundary=opened(rings, cut_ends([(lane.left, lane.right) for lane in lanes], links)),
         kind=_lane_type(tags, LaneType.UNDEFINED),
-        index={lanelet.lanelet_id: k for k, lanelet in enumerate(lanes)},
+        index=index,
+        links=links,
     )
 
 
@@ -176,8 +185,6 @@ def _lane_type(kinds: set[str] | frozenset[str], default: LaneType) -> LaneType:
 def road_map(network: Network, origin: Doubles) -> RoadMap:
     """The network relative to an origin [2]; z is 0, as trajectories have none."""
     lanes, index = network.lanes, network.index
-    flow = [(k, index[ref]) for k, lane in enumerate(lanes) for ref in lane.successors if ref in index]
-    flow += [(index[ref], k) for k, lane in enumerate(lanes) for ref in lane.predecessors if ref in index]
     left = [(k, index[ref]) for k, lane in enumerate(lanes) for ref in lane.left_neighbors if ref in index]
     right = [(k, index[ref]) for k, lane in enumerate(lanes) for ref in lane.right_neighbors if ref in index]
     widths = np.array([np.median(np.hypot(*(lane.left - lane.right).T)) for lane in lanes])
@@ -189,10 +196,10 @@ def road_map(network: Network, origin: Doubles) -> RoadMap:
         lane_type=np.array(types, np.uint8),
         speed_limit=to_float32(np.array([lane.speed_limit for lane in lanes])),
         lane_width=to_float32(np.where(widths > 0, widths, np.nan)),
-        successors=pairs(flow),
+        successors=network.links,
         left_neighbors=pairs(left),
         right_neighbors=pairs(right),
-        boundary=polylines(network.rings, origin),
+        boundary=polylines(network.boundary, origin),
         marks=polylines(marks + [lanelet.ring for lanelet in network.crosswalks], origin),
         mark_type=np.array(
             [MarkType.ROAD_LINE] * len(marks) + [MarkType.CROSSWALK] * len(network.crosswalks), np.uint8
@@ -223,6 +230,8 @@ def read_signals(
     turns = _turns(root)
     lights = {integer(node.get("id"), "trafficLight id"): node for node in root.findall("trafficLight")}
     found: dict[int, tuple[Doubles, NDArray[np.uint8]]] = {}
+    when = np.arange(first_step, first_step + steps)
+    cycles: dict[int, NDArray[np.uint8]] = {}
     for k, lane in enumerate(network.lanes):
         after = [network.index[ref] for ref in lane.successors if ref in network.index]
         stop = lane.center[-1] if lane.stop is None else lane.stop
@@ -232,11 +241,15 @@ def read_signals(
                 continue
             field = f"trafficLight {ref}"
             direction = (node.findtext("direction") or "all").strip().lower()
-            states = _cycle(node, np.arange(first_step, first_step + steps), field)
+            if ref not in cycles:
+                cycles[ref] = _cycle(node, when, field)
+            states = cycles[ref]
             for target in after or [k]:
                 turn = turns.get(network.lanes[target].lanelet_id)
                 if direction == "all" or turn is None or turn in direction:
                     found.setdefault(target, (stop, states))
+        check_signals(len(cycles), steps, "trafficLight")
+        check_signals(len(found), steps, "trafficLight")
     stops = np.array([stop - origin for stop, _ in found.values()]).reshape(-1, 2)
     return (
         np.array(list(found), np.int32),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import check_counts
 from symphony.data.segment import AgentType, Bools
 from symphony.data.sources.commonroad_xml import (
     Doubles,
@@ -20,9 +21,6 @@ from symphony.data.sources.commonroad_xml import (
     rotate,
 )
 from symphony.errors import DataError
-
-MAX_STEPS = 36_000
-"""An hour at 10 Hz; more than any scenario, few enough to allocate."""
 
 _TYPES = {
     **dict.fromkeys(
@@ -72,10 +70,9 @@ def read_tracks(root: ET.Element, dt: float) -> Tracks:
     logs = [_states(node) for node in dynamic]
     first = min(int(log[:, 0].min()) for log in logs)
     steps = max(int(log[:, 0].max()) for log in logs) - first + 1
-    if steps > MAX_STEPS:
-        raise DataError(f"{steps} time steps, at most {MAX_STEPS} can be read", field="time")
     nodes = dynamic + static
     agents = len(nodes)
+    check_counts(agents, steps, "time")
     table = np.full((agents, steps, 6), np.nan)
     valid = np.zeros((agents, steps), np.bool_)
     size = np.zeros((agents, 3))

@@ -10,29 +10,34 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.sources.base import read_whole
 from symphony.errors import DataError
 
 Doubles = NDArray[np.float64]
 
+MAX_REFERENCES = 200
+"""References of one kind in a lanelet; junctions have a handful."""
 MAX_NUMBER = 1e8
 """Larger magnitudes are no metres, seconds or radians of a road."""
 
 
-def load_xml(path: Path) -> ET.Element:
+def load_xml(path: Path, what: str = "CommonRoad") -> ET.Element:
     """Parse a file that declares no document type, which rules out every kind of entity attack.
 
+    Args:
+        path: the file.
+        what: name of the format, for the error.
+
     Raises:
-        DataError: the file is empty, is not well-formed XML, or declares a document type.
+        DataError: the file is empty, too large, is not well-formed XML, or declares a document type.
         OSError: the file can't be read.
     """
-    data = path.read_bytes()
+    data = read_whole(path)
     if not data.strip():
         raise DataError("the file is empty", file=path)
 
     def refuse(*declaration: Any) -> None:
-        raise DataError(
-            "declares a document type, which CommonRoad files never do", file=path, field="DOCTYPE"
-        )
+        raise DataError(f"declares a document type, which {what} files never do", file=path, field="DOCTYPE")
 
     # ElementTree's fast parser has no hook for document types; a pass without any other handler costs little.
     guard = expat.ParserCreate()
@@ -49,7 +54,7 @@ def number(text: str | None, field: str) -> float:
     try:
         value = float(text or "")
     except ValueError:
-        raise DataError(f"{(text or '').strip()!r} is not a number", field=field) from None
+        raise DataError(f"{(text or '').strip()[:40]!r} is not a number", field=field) from None
     if not abs(value) <= MAX_NUMBER:
         raise DataError(f"{value:g} is not finite or absurdly large", field=field)
     return value
@@ -103,8 +108,11 @@ def center(node: ET.Element, field: str) -> tuple[float, float]:
 
 
 def references(node: ET.Element, tag: str, field: str) -> list[int]:
-    """The ``ref`` attributes of all children of that tag."""
-    return [integer(child.get("ref"), field) for child in node.findall(tag)]
+    """The ``ref`` attributes of all children of that tag, at most :data:`MAX_REFERENCES`."""
+    children = node.findall(tag)
+    if len(children) > MAX_REFERENCES:
+        raise DataError(f"{len(children)} references, at most {MAX_REFERENCES}", field=field)
+    return [integer(child.get("ref"), field) for child in children]
 
 
 def rotate(vectors: Doubles, angle: Doubles | float) -> Doubles:

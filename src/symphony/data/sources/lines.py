@@ -15,6 +15,10 @@ from symphony.errors import DataError
 
 Doubles = NDArray[np.float64]
 
+MAX_EDGES = 500_000
+MAX_MEETINGS = 2_000_000
+"""Edges of outlines, and pairs of them that may cross: a union's time and memory grow with both."""
+PROBES = 200
 SLIT = 0.1
 """Metres by which neighbouring areas may miss each other on either side and still bound no slit."""
 
@@ -26,19 +30,28 @@ def evenly(line: Doubles, count: int) -> Doubles:
     return np.stack([np.interp(where, along, line[:, k]) for k in range(2)], axis=-1)
 
 
-def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple[Doubles, ...]:
-    """Closed rings [P, 2] around the union of outlines, the inside on the left; holes run the other way.
+def drivable_rings(
+    outlines: Sequence[Doubles | shapely.Polygon], field: str = "lanelet"
+) -> tuple[Doubles, ...]:
+    """Closed rings [P, 2] around the union of outlines or polygons, inside on the left; holes run the other way.
 
     Slits and holes up to 2 * :data:`SLIT` wide are closed.
 
     Raises:
-        DataError: the union can't be formed; ``field`` says where the outlines come from.
+        DataError: the union can't be formed, or would be beyond all measure; ``field`` says where the outlines
+            come from.
     """
+    _check_effort(outlines, field)
     try:
-        polygons = shapely.make_valid(np.array([shapely.Polygon(outline) for outline in outlines]))
-        union = shapely.union_all(polygons)
-        closed = union.buffer(SLIT, join_style="mitre").buffer(-SLIT, join_style="mitre").simplify(0.01)
-    except shapely.errors.ShapelyError as error:
+        # Shapely takes NaN on its way through outlines of no width for something to warn of.
+        with np.errstate(invalid="ignore"):
+            polygons = shapely.make_valid(
+                np.array([shapely.Polygon(outline) for outline in outlines], object)
+            )
+            union = shapely.union_all(polygons)
+            wider = union.buffer(SLIT, join_style="mitre")
+            closed = wider.buffer(-SLIT, join_style="mitre").simplify(0.01)
+    except (shapely.errors.ShapelyError, ValueError) as error:
         raise DataError(f"the union of the areas can't be formed: {error}", field=field) from error
     rings = []
     for part in shapely.get_parts(closed):
@@ -46,6 +59,23 @@ def drivable_rings(outlines: Sequence[Doubles], field: str = "lanelet") -> tuple
             polygon = orient(part, 1.0)
             rings += [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
     return tuple(rings)
+
+
+def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
+    """Refuse outlines whose edges cross each other without end: pairs whose boxes overlap are counted for a few."""
+    count = sum(map(len, outlines))
+    if count > MAX_EDGES:
+        raise DataError(f"outlines of {count} points, at most {MAX_EDGES}", field=field)
+    if count * count <= MAX_MEETINGS:
+        return
+    first = np.concatenate([outline[:-1] for outline in outlines])
+    second = np.concatenate([outline[1:] for outline in outlines])
+    boxes = shapely.box(*np.minimum(first, second).T, *np.maximum(first, second).T)
+    tree = shapely.STRtree(boxes)
+    probes = boxes[np.linspace(0, len(boxes) - 1, PROBES).astype(np.int64)]
+    meetings = np.mean([len(tree.query(probe)) for probe in probes]) * len(boxes)
+    if meetings > MAX_MEETINGS:
+        raise DataError(f"outlines that cross about {meetings:.2g} times", field=field)
 
 
 def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
@@ -66,3 +96,54 @@ def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
 def polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
     """Lines [P, 2 or 3] relative to an origin [2 or 3]; z is 0 where they have none."""
     return Polylines.of([to_float32(line - origin) for line in lines])
+
+
+CUT = 0.3
+"""Metres by which a ring may miss the cut it was closed along."""
+
+
+def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: NDArray[np.int32]) -> Doubles:
+    """[N, 2, 2] the line across each lane's end or start where no other lane goes on: there a map was cut.
+
+    Args:
+        bounds: left and right bound [P, 2] of each lane, in the direction of travel.
+        links: [E, 2] successors, lane indices (from, to).
+    """
+    goes, comes = set(links[:, 0].tolist()), set(links[:, 1].tolist())
+    found = [(left[-1], right[-1]) for k, (left, right) in enumerate(bounds) if k not in goes]
+    found += [(left[0], right[0]) for k, (left, right) in enumerate(bounds) if k not in comes]
+    return np.array(found, np.float64).reshape(-1, 2, 2)
+
+
+def opened(rings: Sequence[Doubles], cuts: Doubles) -> tuple[Doubles, ...]:
+    """Closed rings [P, 2] without their edges along cuts [N, 2, 2], in the same direction.
+
+    Traffic goes on beyond a cut, so that as road boundary it would put all of it off the road.
+    """
+    lines = shapely.linestrings(cuts) if len(cuts) else np.zeros(0, object)
+    tree = shapely.STRtree(lines)
+    found: list[Doubles] = []
+    for ring in rings:
+        near = tree.query(shapely.LineString(ring), predicate="dwithin", distance=CUT)
+        found += stretches(*_marked(ring, cuts[near], lines[near])) if len(near) else [ring]
+    return tuple(found)
+
+
+def _marked(ring: Doubles, cuts: Doubles, lines: NDArray[np.object_]) -> tuple[Doubles, NDArray[np.bool_]]:
+    """The ring with a vertex where each cut begins and ends, and which of its edges lie along none."""
+    shape = shapely.LineString(ring)
+    corners = shapely.points(cuts.reshape(-1, 2))
+    corners = corners[shapely.distance(shape, corners) <= CUT]
+    own = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ring, axis=0).T))])
+    spots = np.sort(shapely.line_locate_point(shape, corners))
+    spots = spots[np.diff(spots, prepend=-np.inf) > 1e-6]  # neighbouring cuts share their corners
+    new = spots[np.abs(spots[:, None] - own).min(axis=1, initial=np.inf) > 1e-6]
+    along = np.unique(np.concatenate([own, new]))
+    points = np.stack([np.interp(along, own, ring[:, k]) for k in range(2)], axis=-1)
+    step = np.diff(points, axis=0)
+    middle = shapely.points(points[:-1] + step / 2)
+    across = cuts[:, 1] - cuts[:, 0]
+    close = shapely.distance(middle[:, None], lines) <= CUT
+    lengths = np.hypot(*step.T)[:, None] * np.hypot(*across.T)
+    close &= np.abs(step @ across.T) >= 0.7 * lengths
+    return points, ~close.any(axis=1)

@@ -17,6 +17,8 @@ from symphony.errors import DataError
 
 _HEADER = struct.Struct("<QI")
 _CHECK = struct.Struct("<I")
+MAX_RECORD = 32 << 20
+"""Bytes of a record; a scenario has about one million, and takes many times as much once it is parsed."""
 _MASK_DELTA = 0xA282EAD8
 
 
@@ -29,8 +31,8 @@ def masked_crc32c(data: bytes) -> int:
 def read_records(path: Path) -> Iterator[bytes | DataError]:
     """Yield the payload of each record; both checksums are verified.
 
-    A payload with a wrong checksum is yielded as a :class:`DataError`, and reading goes on with the next
-    record.
+    A payload with a wrong checksum, or of more than :data:`MAX_RECORD` bytes, is yielded as a
+    :class:`DataError`, and reading goes on with the next record.
 
     Raises:
         DataError: the file is empty or cut short, or a length has a wrong checksum, so that there is no
@@ -60,6 +62,12 @@ def read_records(path: Path) -> Iterator[bytes | DataError]:
                 raise DataError(
                     f"cut short: {left} of {length + _CHECK.size} payload bytes", file=path, field=where
                 )
+            if length > MAX_RECORD:
+                file.seek(length + _CHECK.size, os.SEEK_CUR)
+                left -= length + _CHECK.size
+                yield DataError(f"{length} bytes, at most {MAX_RECORD} are read", file=path, field=where)
+                index += 1
+                continue
             payload = file.read(length)
             tail = file.read(_CHECK.size)
             left -= length + _CHECK.size

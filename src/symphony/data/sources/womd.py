@@ -27,9 +27,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from symphony.data.bounds import check_counts, check_signals
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.base import Item, Reader, codes, pairs, to_float32
+from symphony.data.sources.base import Item, Reader, codes, pairs, to_float32, unexpected
 from symphony.data.sources.tfrecord import read_records
 from symphony.errors import DataError
 
@@ -83,6 +84,8 @@ class WomdReader(Reader):
         except DataError as error:
             field = f"{record}, {error.field}" if error.field else record
             return DataError(error.message, file=path, segment=name, field=field)
+        except Exception as error:  # the other records of the file are still to be read
+            return unexpected(error, file=path, segment=name)
 
 
 def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
@@ -161,6 +164,7 @@ def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict
     tracks = scenario.tracks
     if not tracks:
         raise DataError("has no agents", field="tracks")
+    check_counts(len(tracks), steps, "tracks")
     for track in tracks:
         if len(track.states) != steps:
             raise DataError(
@@ -270,6 +274,7 @@ def _signals(
                 stop = _points([light.stop_point])[0] - origin if light.HasField("stop_point") else None
                 points.append(road.lanes[lane][0] if stop is None else to_float32(stop))
             entries.append((rows[lane], step, light.state))
+    check_signals(len(rows), steps, "dynamic_map_states")
     table = np.array(entries, np.int64).reshape(-1, 3)
     state = np.full((len(rows), steps), SignalState.UNKNOWN, np.uint8)
     state[table[:, 0], table[:, 1]] = codes(table[:, 2], len(SignalState), "dynamic_map_states.state")

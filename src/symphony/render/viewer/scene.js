@@ -17,7 +17,7 @@ class Scene {
     const { routes, rollouts, trails, log, lights } = view.layers, one = routes ? view.agent : null;
     this.map.draw(context, camera, [view.rollout, one, routes, rollouts, trails, log].join(), onMap => {
       if (routes) this.routes(onMap, view);
-      if (rollouts) this.otherWays(onMap, view);
+      if (rollouts) this.waysOfOthers(onMap, view);
       if (trails) this.ways(onMap, view);
       if (log) this.logWays(onMap);
     });
@@ -112,7 +112,7 @@ class Scene {
     context.globalAlpha = 1;
   }
 
-  otherWays(context, view) {
+  waysOfOthers(context, view) {
     const r = this.replay, n = r.agents.length;
     context.globalAlpha = this.faint(); context.lineWidth = 1.2 * this.px;
     for (let k = 0; k < r.rollouts; k++) for (let i = 0; i < n && k !== view.rollout; i++) {

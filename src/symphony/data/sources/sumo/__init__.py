@@ -1,14 +1,12 @@
 """Simulated driving from SUMO: random networks and traffic, cut into run segments.
 
-SUMO's programs come with the optional extra ``symphony[sumo]`` and run as subprocesses in a temporary folder.
+SUMO's programs come with the optional extra ``symphony-traffic[sumo]`` and run as subprocesses in a temporary folder.
 """
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.demand import write_demand
 from symphony.data.sources.sumo.extract import DT, STATES, CropRule, crop_rule, cut_segments
 from symphony.data.sources.sumo.networks import NETWORKS, RAMP_RADIUS, ramp
-from symphony.data.sources.sumo.process import sumo_home, sumo_version
+from symphony.data.sources.sumo.process import scratch, sumo_home, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.simulate import simulate_traffic
 from symphony.errors import ConfigError
@@ -103,8 +101,7 @@ def generate_run(
     roads_rng, demand_rng, drive_rng, cut_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence([seed, KINDS.index(kind)]).spawn(4)
     )
-    with tempfile.TemporaryDirectory(prefix="symphony-sumo-") as name:
-        folder = Path(name)
+    with scratch() as folder:
         # A freeway must be longer than the map: what its ends do to traffic is not for a segment to show.
         longer = max(0.0, rule.radius - RAMP_RADIUS) if kind == "ramp" else 0.0
         file = ramp(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)

@@ -2,16 +2,47 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import importlib.util
 import os
+import shutil
+import stat
 import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from symphony.data import store_format
 from symphony.errors import DataError
 
 TIMEOUT_SECONDS = 600.0
+SCRATCH = "symphony-sumo-"
+SETTLED = 60.0
+"""Seconds after which a folder without an owner is not one that is just being made."""
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A temporary folder; those that processes left which were killed are removed first."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*"):
+        _remove_left(folder)
+    with tempfile.TemporaryDirectory(prefix=SCRATCH) as name, store_format.lock(Path(name)):
+        yield Path(name)
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove a folder whose lock nobody holds: its owner is dead, on whichever machine or in which container."""
+    if store_format.fcntl is None:
+        return
+    with contextlib.suppress(OSError, DataError):
+        state = folder.lstat()
+        mine = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid()
+        if mine and time.time() - state.st_mtime > SETTLED:
+            with store_format.lock(folder):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 @cache
@@ -26,7 +57,7 @@ def sumo_home() -> Path:
     for folder in folders:
         if (folder / "bin").is_dir():
             return folder
-    raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony[sumo]'")
+    raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony-traffic[sumo]'")
 
 
 @cache

@@ -1,0 +1,281 @@
+"""Write the tables of the pages from the records in `results/`, between their markers.
+
+    python scripts/results_page.py            # rewrites README.md, docs/results.md and docs/appendix.md
+    python scripts/results_page.py --check    # says what differs, and fails if anything does
+
+A block is `<!-- table NAME -->`, the table, `<!-- end table -->`. What a name stands for is in TABLES below.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from symphony.evaluation.paper import paper_figures
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORDS = ROOT / "results"
+PAGES = ("README.md", "docs/results.md", "docs/appendix.md")
+BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
+
+Record = dict[str, Any]
+Grid = list[list[str]]
+
+COLUMNS = {
+    "collision_rate": ("collisions %", 1),
+    "offroad_time": ("off-road %", 2),
+    "ade": ("ADE m", 2),
+    "min_sade": ("minSADE m", 2),
+    "curvature_jsd": ("curvature JSD", 3),
+}
+"""Figures of a table: their headings, and the digits after their points."""
+
+BC = (
+    ("BC", "bc/bc-*-none"),
+    ("BC+H", "bc/bc_h-*-none"),
+    ("BC+TS", "bc/bc_ts-*-often"),
+    ("BC+TS+H", "bc/bc_ts_h-*-often"),
+)
+MGAIL = (
+    ("MGAIL", "mgail/mgail-*-none"),
+    ("MGAIL+H", "mgail/mgail_h-*-none"),
+    ("MGAIL+TS", "mgail/mgail_ts-*-often"),
+    ("MGAIL+TS+H", "mgail/mgail_ts_h-*-often"),
+)
+FEATURES = (
+    ("`paper`: positions, headings, speeds, sizes, map points", "features/paper/bc_ts_h-0-often"),
+    (
+        "`clearance`: also gaps between boxes, distance to the road's edge",
+        "features/clearance/bc_ts_h-0-often",
+    ),
+    ("`foresight`: also the gaps of the next 2 s", "bc/bc_ts_h-0-often"),
+)
+HALVING = (
+    ("BC+TS, halved every 2 s", "bc/bc_ts-*-tree"),
+    ("BC+TS, resampled every 2 s", "bc/bc_ts-*-systematic"),
+    ("BC+TS, resampled every 0.4 s", "bc/bc_ts-*-often"),
+    ("BC+TS+H, halved every 2 s", "bc/bc_ts_h-*-tree"),
+    ("BC+TS+H, resampled every 2 s", "bc/bc_ts_h-*-systematic"),
+    ("BC+TS+H, resampled every 0.4 s", "bc/bc_ts_h-*-often"),
+    ("MGAIL+TS, halved every 2 s", "mgail/mgail_ts-*-tree"),
+    ("MGAIL+TS, resampled every 0.4 s", "mgail/mgail_ts-*-often"),
+    ("MGAIL+TS+H, halved every 2 s", "mgail/mgail_ts_h-*-tree"),
+    ("MGAIL+TS+H, resampled every 0.4 s", "mgail/mgail_ts_h-*-often"),
+)
+WAYS = (
+    ("one tree of 16, halved every 2 s", "bc/bc_ts_h-0-tree"),
+    ("the same, pruned by the true flags", "bc/bc_ts_h-0-oracle"),
+    ("one tree of 16, resampled every 0.4 s", "bc/bc_ts_h-0-often"),
+    ("a leaf each of 16 trees of 4, resampled every 0.4 s", "bc/bc_ts_h-0-forest"),
+    ("the leaves of 4 trees of 4, resampled every 2 s", "bc/bc_ts_h-0-small"),
+    ("the best of 16 independent rollouts", "bc/bc_ts_h-0-best"),
+    ("learned with resampling too: independent rollouts", "bc-resampled/bc_ts_h-0-none"),
+    ("learned with resampling too: one tree, every 0.4 s", "bc-resampled/bc_ts_h-0-often"),
+)
+PLAYBACK = "log playback"
+NGSIM = (
+    (PLAYBACK, "ngsim/{}/playback"),
+    ("constant velocity", "ngsim/{}/constant_velocity"),
+    ("BC", "ngsim/{}/bc-0-none"),
+    ("BC+H", "ngsim/{}/bc_h-0-none"),
+    ("BC+TS", "ngsim/{}/bc_ts-0-often"),
+    ("BC+TS+H", "ngsim/{}/bc_ts_h-0-often"),
+    ("BC+TS+H, freeways among the simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
+)
+MIXED = (
+    ("BC, simulated data", "ngsim-mixed/{}/mixed-bc"),
+    ("BC+H, simulated data", "ngsim-mixed/{}/mixed-bc_h"),
+    ("BC, then the other place (2 seeds)", "ngsim-mixed/{}/other-bc-*"),
+    ("BC+H, then the other place (2 seeds)", "ngsim-mixed/{}/other-bc_h-*"),
+    ("BC+TS+H, simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
+)
+NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
+RELATIONS = (
+    ("BC to BC+TS", "bc", "bc_ts"),
+    ("BC to BC+TS+H", "bc", "bc_ts_h"),
+    ("MGAIL to MGAIL+TS", "mgail", "mgail_ts"),
+    ("MGAIL+H to MGAIL+TS+H", "mgail_h", "mgail_ts_h"),
+    ("MGAIL to MGAIL+TS+H", "mgail", "mgail_ts_h"),
+)
+
+
+def records(pattern: str) -> list[Record]:
+    """Those whose path below ``results/`` fits, by name.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    found = [json.loads(path.read_text()) for path in sorted(RECORDS.glob(f"{pattern}.json"))]
+    if not found:
+        raise FileNotFoundError(f"no record fits results/{pattern}.json")
+    return found
+
+
+def means(rows: Sequence[tuple[str, str]], columns: Sequence[str] = tuple(COLUMNS)) -> Grid:
+    """A line per row: means over seeds, with standard errors if there are several; the lowest simulated in bold."""
+    values = [[[row[name] for row in records(pattern)] for name in columns] for _, pattern in rows]
+    average = np.array([[np.mean(cell) for cell in line] for line in values])
+    digits = [COLUMNS[name][1] for name in columns]
+    simulated = average[[label != PLAYBACK for label, _ in rows]]
+    lowest = [np.round(simulated[:, k], digits[k]).min() for k in range(len(columns))]
+    grid = [["", *(COLUMNS[name][0] for name in columns)]]
+    for (label, _), line in zip(rows, values, strict=True):
+        cells = [_mean(cell, number) for cell, number in zip(line, digits, strict=True)]
+        bold = [
+            label != PLAYBACK and round(float(np.mean(cell)), digits[k]) == lowest[k]
+            for k, cell in enumerate(line)
+        ]
+        grid.append([label, *(f"**{text}**" if b else text for text, b in zip(cells, bold, strict=True))])
+    return grid
+
+
+def beside(rows: Sequence[tuple[str, str]], groups: dict[str, str], columns: Sequence[str]) -> Grid:
+    """The same rows for several folders (their names stand for ``{}``), side by side under headings of their own."""
+    parts = {
+        title: means([(label, pattern.format(folder)) for label, pattern in rows], columns)
+        for folder, title in groups.items()
+    }
+    for title, part in parts.items():
+        part[0][1] = f"{title}: {part[0][1]}"
+    labels = ["", *(label for label, _ in rows)]
+    lines = zip(*parts.values(), strict=True)
+    return [
+        [label, *(cell for part in line for cell in part[1:])]
+        for label, line in zip(labels, lines, strict=True)
+    ]
+
+
+def setting(folder: str) -> Grid:
+    """The eight methods in one of the paper's other settings."""
+    rows = [(label, f"{folder}/{Path(pattern).name.replace('*', '0')}") for label, pattern in (*BC, *MGAIL)]
+    return means(rows)
+
+
+def relations() -> Grid:
+    """How many times fewer collisions: the paper's two data sets, and ours by halving and by resampling."""
+    grid = [["", "paper, WOMD", "paper, own data", "here, halved", "here, resampled", "difference, points"]]
+    for label, before, after in RELATIONS:
+        cells = []
+        for dataset in ("womd", "proprietary"):
+            figures = paper_figures("main", dataset) or {}
+            cells.append(figures[before]["collision_rate"][0] / figures[after]["collision_rate"][0])
+        folder = before.split("_")[0]
+        first = records(f"{folder}/{before}-*-none")
+        for kind in ("tree", "often"):
+            second = records(f"{folder}/{after}-*-{kind}")
+            rates = [np.mean([row["collision_rate"] for row in rows]) for rows in (first, second)]
+            cells.append(rates[0] / rates[1])
+        grid.append([label, *(f"{cell:.1f}" for cell in cells), paired(first, second, "collision_rate", 1)])
+    return grid
+
+
+def against_paper() -> Grid:
+    """Collisions, time off the road and ADE beside the paper's on WOMD."""
+    columns = ("collision_rate", "offroad_time", "ade")
+    figures = paper_figures("main", "womd") or {}
+    grid = [["", *(head for name in columns for head in (COLUMNS[name][0], "paper"))]]
+    for label, pattern in (*BC, *MGAIL):
+        line = [label]
+        for name in columns:
+            line.append(_mean([row[name] for row in records(pattern)], COLUMNS[name][1]))
+            mean, error = figures[Path(pattern).name.split("-")[0]][name]
+            line.append(f"{mean:.2f} ± {error:.2f}")
+        grid.append(line)
+    return grid
+
+
+def sweep() -> Grid:
+    """What every change of the adversarial settings did, paired over segments with the base."""
+    grid = [["", "change", *(heading for heading, _ in COLUMNS.values()), "collisions against base", "AUC"]]
+    for method, title in NAMES.items():
+        rows = {row["name"]: row for row in records(f"sweep/{method}-*")}
+        for name in sorted(rows, key=lambda name: (name != "start", name != "base", name)):
+            row = rows[name]
+            cells = [_mean([row[key]], digits) for key, (_, digits) in COLUMNS.items()]
+            apart = "–" if name == "base" else paired([rows["base"]], [row], "collision_rate", 1)
+            what = "the regression alone" if name == "start" else name
+            grid.append([title, what, *cells, apart, f"{row['auc']:.2f}" if "auc" in row else "–"])
+    return grid
+
+
+def paired(before: Sequence[Record], after: Sequence[Record], name: str, digits: int) -> str:
+    """By how much the second are above the first: mean over seeds and segments, standard error over segments."""
+    rows = [
+        np.array(json.loads(b["per_segment"][name])) - np.array(json.loads(a["per_segment"][name]))
+        for a, b in zip(before, after, strict=True)
+    ]
+    each = np.mean(rows, 0)
+    return f"{each.mean():+.{digits}f} ± {each.std(ddof=1) / len(each) ** 0.5:.{digits}f}"
+
+
+def _mean(values: Sequence[float], digits: int) -> str:
+    if len(values) == 1:
+        return f"{values[0]:.{digits}f}"
+    error = np.std(values, ddof=1) / len(values) ** 0.5
+    return f"{np.mean(values):.{digits}f} ± {error:.{digits}f}"
+
+
+PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
+THREE = ("collision_rate", "ade", "min_sade")
+TABLES: dict[str, Callable[[], Grid]] = {
+    "short": lambda: means(BC),
+    "methods": lambda: means((*BC, *MGAIL)),
+    "relations": relations,
+    "features": lambda: means(FEATURES),
+    "ngsim": lambda: beside(NGSIM, PLACES, THREE),
+    "ngsim-mixed": lambda: beside(MIXED, PLACES, THREE),
+    "halving": lambda: means(HALVING),
+    "ways": lambda: means(WAYS),
+    "long": lambda: setting("long"),
+    "many": lambda: setting("many"),
+    "paper": against_paper,
+    "sweep": sweep,
+}
+
+
+def markdown(grid: Grid) -> str:
+    """A table, its first line the heading."""
+    lines = [f"| {' | '.join(line)} |" for line in grid]
+    return "\n".join([lines[0], "| --- " * len(grid[0]) + "|", *lines[1:]]) + "\n"
+
+
+def rewritten(text: str) -> str:
+    """A page with every table made anew.
+
+    Raises:
+        KeyError: if a block names no table.
+    """
+    return BLOCK.sub(lambda found: found[1] + markdown(TABLES[found[2]]()) + found[4], text)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Rewrite the pages, or compare them with the records."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true")
+    check = parser.parse_args(args).check
+    differing = []
+    for name in PAGES:
+        page = ROOT / name
+        before = page.read_text(encoding="utf-8")
+        after = rewritten(before)
+        if after != before:
+            differing.append(name)
+            if not check:
+                page.write_text(after, encoding="utf-8")
+    for name in differing:
+        verb = "differs from the records: run scripts/results_page.py" if check else "rewritten"
+        print(f"{name}: {verb}", file=sys.stderr)
+    return 1 if check and differing else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,12 @@
+"""Score rollouts as the Waymo Open Sim Agents Challenge does, check a submission to it."""
+
+from __future__ import annotations
+
+import tyro
+
+from symphony.cli.wosac_score import Score
+from symphony.cli.wosac_validate import Validate
+
+app = tyro.extras.SubcommandApp()
+app.command(name="score")(Score)
+app.command(name="validate")(Validate)

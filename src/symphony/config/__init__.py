@@ -1,0 +1,46 @@
+"""Every setting in one typed place; field docstrings are the command line's help.
+
+Imports nothing heavy, so that ``--help`` answers at once. Only recipes and the command line read the configuration
+of a training; what an agent is and how it is simulated travels with the agent.
+"""
+
+from __future__ import annotations
+
+from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
+from symphony.config.evaluation import EvaluateConfig, PaperData, Search, Setting, TableFormat
+from symphony.config.files import FORMAT, from_dict, read_json, to_json
+from symphony.config.profiles import PROFILES, Profile
+from symphony.config.training import (
+    METHODS,
+    Method,
+    MGAILConfig,
+    PreviewConfig,
+    RunConfig,
+    TrainConfig,
+    ValidationConfig,
+)
+
+__all__ = [
+    "FORMAT",
+    "METHODS",
+    "PROFILES",
+    "AgentConfig",
+    "AgentSpec",
+    "DiscriminatorConfig",
+    "EvaluateConfig",
+    "MGAILConfig",
+    "Method",
+    "PaperData",
+    "PreviewConfig",
+    "Profile",
+    "RunConfig",
+    "Search",
+    "SearchConfig",
+    "Setting",
+    "TableFormat",
+    "TrainConfig",
+    "ValidationConfig",
+    "from_dict",
+    "read_json",
+    "to_json",
+]

@@ -1,0 +1,160 @@
+"""What an agent is: what it sees, how large its networks are, how it is simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, get_args
+
+from tyro.conf import arg
+
+from symphony.config.checks import not_negative, one_of, positive
+from symphony.errors import ConfigError
+from symphony.keys import OBJECTS, OWN
+
+ActionSpace = Literal["bicycle", "displacement"]
+Features = Literal["clearance", "paper", "foresight"]
+Survivors = Literal["all", "best"]
+RULES = ("best", "systematic")
+AGGREGATES = ("max_then_sum", "mean_then_sum")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentConfig:
+    """What an agent sees and how large its networks are."""
+
+    interactive: Annotated[int, arg(aliases=("--interactive",))] = 2
+    """Interactive agents per run segment (the paper uses 2 and 8)."""
+    num_objects: int = 16
+    """Nearest other agents it sees."""
+    num_points: int = 200
+    """Nearest map and light points it sees (the paper: 1 000)."""
+    hidden: int = 64
+    """Width of the element encoders."""
+    head: int = 128
+    """Width of the action head."""
+    encoder: str = "paper"
+    """`paper`: element MLPs and max-pool; or the import path of your own, with the signature of
+    `symphony.modules.SceneEncoder`, for policy and goal policy."""
+    policy: str = "paper"
+    """`paper`; or the import path of a function from an `AgentSpec` to a policy module."""
+
+    def __post_init__(self) -> None:
+        positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
+        one_of(self, "encoder", ["paper"], path=True)
+        one_of(self, "policy", ["paper"], path=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscriminatorConfig:
+    """The network that judges realism, and how it learns."""
+
+    features: Features = "clearance"
+    """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge;
+    `foresight`: also the gaps within the next 2 s, were everyone to keep speed and course."""
+    radius: float = 20.0
+    """Metres around an agent that it sees."""
+    hidden: int = 32
+    """Width of its encoders."""
+    head: int = 64
+    """Width of its head."""
+    network: str = "paper"
+    """`paper`; or the import path of a function from an `AgentSpec` to a module that writes one logit per agent."""
+    states: int = 256
+    """States of either kind (simulated, logged) per update, each with all its interactive agents."""
+    learning_rate: float = 1e-3
+    """Of its Adam."""
+    gradient_penalty: float = 0.0
+    """Weight of the squared gradient at logged states (0: none)."""
+    instance_noise: float = 0.0
+    """Standard deviation of noise on what it sees in training (0: none)."""
+
+    def __post_init__(self) -> None:
+        one_of(self, "features", get_args(Features))
+        one_of(self, "network", ["paper"], path=True)
+        positive(self, "radius", "hidden", "head", "states", "learning_rate")
+        not_negative(self, "gradient_penalty", "instance_noise")
+
+    @property
+    def regularisation(self) -> dict[str, Any]:
+        """As :class:`symphony.objectives.DiscriminatorLoss` takes it."""
+        return {
+            "gradient_penalty": self.gradient_penalty,
+            "instance_noise": self.instance_noise,
+            # Of a network of the user's own, it is unknown what it reads.
+            "noise_keys": (OWN, OBJECTS) if self.instance_noise else (),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """The beam search and what is learned from it."""
+
+    branches: int = 4
+    """Branches per run segment in training (S)."""
+    test_branches: int = 16
+    """Branches per run segment in evaluation."""
+    prune_every: int = 2
+    """Steps between prunings (T_p; 10 in the paper)."""
+    rule: str = "systematic"
+    """`best`: the better share of the branches survives (the paper); `systematic`: every branch gets copies in
+    proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings; or the
+    import path of a pruning rule of your own."""
+    keep: float = 0.5
+    """Share of the branches that survives a pruning with rule `best`."""
+    temperature: float = 0.6
+    """Of rule `systematic`: the lower, the stricter."""
+    aggregate: str = "max_then_sum"
+    """From scores of steps and agents to one per branch: `max_then_sum` (the paper), `mean_then_sum`, or the import
+    path of a function of your own."""
+    segments: int = 16
+    """Run segments searched at a time."""
+    updates: int = 10
+    """Updates made from the results of one search before the next."""
+    states: int = 256
+    """States of surviving rollouts per update, each with all its interactive agents."""
+    weight: float = 1.0
+    """Of the surviving rollouts beside the expert data in the policy's loss."""
+    survivors: Survivors = "all"
+    """Learn from every surviving branch or only from the best of each tree."""
+
+    def __post_init__(self) -> None:
+        positive(self, "branches", "test_branches", "prune_every", "keep", "temperature")
+        positive(self, "segments", "updates", "states")
+        one_of(self, "survivors", get_args(Survivors))
+        one_of(self, "rule", RULES, path=True)
+        one_of(self, "aggregate", AGGREGATES, path=True)
+        if self.keep > 1:
+            raise ConfigError(f"keep must not exceed 1, is {self.keep}")
+        not_negative(self, "weight")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSpec:
+    """All that it takes to build an agent's networks anew and to simulate it as it was trained; kept in its folder.
+
+    Attributes:
+        action_space: `bicycle`, discrete actions; `displacement`, continuous ones that gradients pass (section V-A).
+        dt: seconds per step it learned.
+        duration: seconds of a segment it learned from; 0 for all.
+        goals: whether it follows routes.
+        agent: what it sees and how large it is.
+        discriminator: of its judge; None without one.
+        searches: whether it is meant to be simulated with search.
+        search: how.
+    """
+
+    action_space: ActionSpace
+    dt: float
+    duration: int = 0
+    goals: bool = False
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    discriminator: DiscriminatorConfig | None = None
+    searches: bool = False
+    search: SearchConfig = field(default_factory=SearchConfig)
+
+    def __post_init__(self) -> None:
+        one_of(self, "action_space", get_args(ActionSpace))
+        positive(self, "dt")
+        not_negative(self, "duration")
+        if self.searches and self.discriminator is None:
+            raise ConfigError("an agent that searches needs a discriminator")

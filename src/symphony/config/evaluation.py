@@ -1,0 +1,78 @@
+"""How agents are evaluated."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from symphony.config.agent import RULES, SearchConfig
+from symphony.config.checks import not_negative, one_of, positive
+from symphony.errors import ConfigError
+
+Search = Literal["agent", "none", "tree", "oracle", "best"]
+Setting = Literal["main", "long", "many"]
+"""Of the paper's tables: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
+PaperData = Literal["proprietary", "womd"]
+"""Data sets whose figures the paper gives."""
+TableFormat = Literal["text", "markdown", "latex", "json"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """How agents are evaluated."""
+
+    rollouts: int = 16
+    """Simulations per run segment that count."""
+    search: Search = "agent"
+    """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `oracle`: by the true collision
+    and off-road flags; `best`: independent rollouts, of which the one with the best score counts."""
+    trees: int = 1
+    """Search trees per run segment, each with goals of its own; each gives its share of the rollouts."""
+    branches: int = 0
+    """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
+    rule: str = "agent"
+    """How trees are pruned: `agent` as it was trained, else see `search.rule` of training."""
+    prune_every: int = 0
+    """Steps between prunings; 0: as the agent was trained."""
+    temperature: float = 0.0
+    """Of rule `systematic`; 0: as the agent was trained."""
+    retries: int = 0
+    """How often the steps between two prunings are simulated again for branches that end them with a score above
+    `retry-above` (each time costs as much as the whole search)."""
+    retry_above: float = 0.0
+    """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
+    logged_goals: bool = False
+    """Give agents the routes of the log instead of sampled ones."""
+    seed: int = 0
+    """Of everything drawn at random in them."""
+    duration: int = 0
+    """Seconds of each run segment that are simulated; 0 takes what the agent was trained with."""
+    interactive: int = 0
+    """Interactive agents per run segment; 0 takes what the agent was trained with (2 for the baselines)."""
+    metric: tuple[str, ...] = ()
+    """Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout."""
+    batch: int = 16
+    """Run segments simulated at a time (changes memory and speed, not results)."""
+    device: str = "cpu"
+    """`cpu`, `cuda` or `cuda:N`."""
+
+    def __post_init__(self) -> None:
+        one_of(self, "search", get_args(Search))
+        one_of(self, "rule", ["agent", *RULES], path=True)
+        positive(self, "rollouts", "batch", "trees")
+        if self.rollouts % self.trees:
+            raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
+        not_negative(self, "interactive", "branches", "duration", "prune_every", "temperature", "retries")
+        for path in self.metric:
+            if ":" not in path:
+                raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")
+
+    def pruning(self, trained: SearchConfig) -> SearchConfig:
+        """How branches are pruned: as in training, but for what is set here."""
+        return dataclasses.replace(
+            trained,
+            rule=trained.rule if self.rule == "agent" else self.rule,
+            prune_every=self.prune_every or trained.prune_every,
+            temperature=self.temperature or trained.temperature,
+        )

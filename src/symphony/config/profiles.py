@@ -1,0 +1,74 @@
+"""Settings that go together, as functions from a configuration to another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+from symphony.config.training import TrainConfig
+
+Profile = Literal["default", "paper", "laptop", "smoke"]
+
+
+def paper(config: TrainConfig) -> TrainConfig:
+    """Section V-A: 70 000 updates of 16 segments, S 4 and 16, a checkpoint every 2 000 chosen on 200 segments."""
+    return replace(
+        config,
+        steps=70_000,
+        segments=16,
+        checkpoint_every=2000,
+        agent=replace(config.agent, num_objects=16, num_points=1000),
+        discriminator=replace(config.discriminator, features="paper"),
+        search=replace(
+            config.search,
+            branches=4,
+            test_branches=16,
+            prune_every=10,
+            rule="best",
+            keep=0.5,
+            segments=16,
+            updates=1,
+        ),
+        mgail=replace(config.mgail, cost="log_d", regression=0, head_start=0, rollouts=64, react=True),
+        validation=replace(config.validation, segments=200, rollouts=16),
+    )
+
+
+def laptop(config: TrainConfig) -> TrainConfig:
+    """Meant for two cores and about an hour."""
+    return replace(
+        config,
+        steps=3000,
+        checkpoint_every=500,
+        agent=replace(config.agent, num_points=128),
+        discriminator=replace(config.discriminator, features="foresight"),
+        search=replace(config.search, survivors="best"),
+        validation=replace(config.validation, every=1000, segments=48, rollouts=4),
+    )
+
+
+def smoke(config: TrainConfig) -> TrainConfig:
+    """Seconds, to see that all runs."""
+    return replace(
+        config,
+        steps=4,
+        segments=2,
+        states=16,
+        goals=8,
+        checkpoint_every=2,
+        agent=replace(config.agent, num_points=16, hidden=8, head=8),
+        search=replace(config.search, segments=2, branches=2, test_branches=2, updates=2, states=8),
+        discriminator=replace(config.discriminator, hidden=8, head=8, states=8),
+        mgail=replace(config.mgail, regression=2, head_start=0, rollouts=2),
+        validation=replace(config.validation, segments=2, rollouts=2),
+        wandb="disabled",
+    )
+
+
+PROFILES: dict[Profile, Callable[[TrainConfig], TrainConfig]] = {
+    "default": lambda config: config,
+    "paper": paper,
+    "laptop": laptop,
+    "smoke": smoke,
+}

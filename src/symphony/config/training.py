@@ -1,0 +1,205 @@
+"""How agents are trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from tyro.conf import Positional
+
+from symphony.config.agent import ActionSpace, AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
+from symphony.config.checks import not_negative, one_of, positive
+from symphony.errors import ConfigError
+from symphony.keys import SEEN
+
+Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h"]
+"""Rows of the paper's tables, each with a recipe of its name: behavioural cloning or adversarial imitation through
+the model (MGAIL), with goals (H: hierarchy), with tree search (TS), with both.
+"""
+METHODS: tuple[str, ...] = get_args(Method)
+Cost = Literal["log_d", "non_saturating", "logit"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MGAILConfig:
+    """How a policy learns from the gradient of the discriminator (methods mgail*)."""
+
+    regression: int = 2000
+    """Updates of plain regression to the log before the adversarial ones (0: none, as in the paper)."""
+    head_start: int = 50
+    """Updates of the discriminator alone after them."""
+    rollouts: int = 16
+    """Rollouts per update that the gradient goes through, drawn from those of the last search."""
+    learning_rate: float = 2e-4
+    """Of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
+    cost: Cost = "non_saturating"
+    """What the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient vanishes
+    in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
+    expert_weight: float = 0.0
+    """Weight of the regression to the log beside it."""
+    discriminator_updates: int = 1
+    """Updates of the discriminator per update of the policy."""
+    react: bool = False
+    """Let the gradient also pass through the policy's reactions to what earlier actions changed."""
+    truncate: int = 0
+    """Steps after which the gradient is cut (0: never)."""
+    checkpoint: int = 0
+    """Steps simulated twice instead of being kept in memory for the gradient (0: all are kept)."""
+
+    def __post_init__(self) -> None:
+        one_of(self, "cost", get_args(Cost))
+        positive(self, "rollouts", "learning_rate", "discriminator_updates")
+        not_negative(self, "regression", "head_start", "expert_weight", "truncate", "checkpoint")
+
+    @property
+    def gradient(self) -> dict[str, Any]:
+        """How the gradient reaches the policy, as :class:`symphony.objectives.MGAILLoss` takes it."""
+        return {
+            "cost": self.cost,
+            "detach_keys": () if self.react else SEEN,
+            "truncate": self.truncate,
+            "checkpoint": self.checkpoint,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidationConfig:
+    """How checkpoints are evaluated while training; the best of them is the agent."""
+
+    data: Path | None = None
+    """Store of run segments to evaluate them on; without one the last checkpoint is the agent."""
+    every: int = 0
+    """Updates between evaluations, a multiple of `checkpoint-every` (0: at every checkpoint)."""
+    segments: int = 200
+    """Run segments of it, evenly spaced (all, if there are fewer)."""
+    rollouts: int = 4
+    """Simulations of each."""
+
+    def __post_init__(self) -> None:
+        positive(self, "segments", "rollouts")
+        not_negative(self, "every")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreviewConfig:
+    """What a run lets see of its agent while it trains: animated rollouts, and distributions of what it does."""
+
+    every: int = 2000
+    """Updates between previews, and one at the end of a run that has so many (0: never); by default this takes about
+    a hundredth of the time on a CPU, or less."""
+    segments: int = 8
+    """Run segments simulated for it, evenly spaced over those that are validated on, or else learned from; the
+    animation has the first two."""
+
+    def __post_init__(self) -> None:
+        positive(self, "segments")
+        not_negative(self, "every")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """What the trainer needs to know of a run, whatever is trained."""
+
+    data: Path
+    """Store of run segments to learn from (see `symphony data convert`)."""
+    out: Path
+    """Folder of the run: configuration, metrics, checkpoints."""
+    steps: int = 3000
+    """Updates (the paper: 70 000)."""
+    seed: int = 0
+    """Of the weights and of the order of the data."""
+    clip: float = 1.0
+    """Largest norm of the gradient."""
+    warm_start: Path | None = None
+    """Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its last
+    (`RUN@last` or `RUN@3000` names another), or `pretrained:NAME`; new ones where that run has none."""
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    """Choice of the best checkpoint: that with the lowest collision rate plus off-road time (the paper)."""
+    preview: PreviewConfig = field(default_factory=PreviewConfig)
+    """Rollouts to look at, in `media` of the run's folder."""
+    checkpoint_every: int = 1000
+    """Updates between checkpoints."""
+    log_every: int = 20
+    """Updates between records of the metrics."""
+    resume: bool = False
+    """Go on from the last checkpoint in `out`; without it a folder that holds a run is refused."""
+    wandb: Literal["offline", "online", "disabled"] = "offline"
+    """Where Weights & Biases keeps the curves; a plain file has them in any case."""
+    device: str = "cpu"
+    """`cpu`, `cuda` or `cuda:N`."""
+
+    def __post_init__(self) -> None:
+        positive(self, "steps", "clip", "checkpoint_every", "log_every")
+        if self.validation.every % self.checkpoint_every:
+            raise ConfigError(
+                f"validation.every ({self.validation.every}) must be a multiple of checkpoint-every "
+                f"({self.checkpoint_every}): only checkpoints are evaluated"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(RunConfig):
+    """Train agents."""
+
+    method: Positional[Method]
+    """What to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both."""
+    duration: int = 0
+    """Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are)."""
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    """The agent."""
+    segments: int = 16
+    """Run segments per update."""
+    states: int = 1024
+    """Expert states per update, drawn from those segments."""
+    goals: int = 128
+    """Expert routes per update of the goal policy (methods with H)."""
+    learning_rate: float = 1e-3
+    """Of Adam, falling to a tenth along a cosine."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """The beam search (methods with TS; MGAIL without TS simulates as many rollouts and keeps all)."""
+    discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
+    """The discriminator (methods with TS, and MGAIL)."""
+    mgail: MGAILConfig = field(default_factory=MGAILConfig)
+    """Adversarial learning (methods mgail*)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one_of(self, "method", METHODS)
+        positive(self, "segments", "states", "goals", "learning_rate")
+        not_negative(self, "duration")
+
+    def spec(
+        self,
+        action_space: ActionSpace,
+        dt: float,
+        *,
+        goals: bool = False,
+        judged: bool = False,
+        searches: bool = False,
+    ) -> AgentSpec:
+        """What the agent is that a recipe trains.
+
+        Args:
+            action_space: its own.
+            dt: seconds per step of what it learns from.
+            goals: whether it follows routes.
+            judged: whether it has a discriminator.
+            searches: whether it is simulated with search.
+        """
+        return AgentSpec(
+            action_space=action_space,
+            dt=dt,
+            duration=self.duration,
+            goals=goals,
+            agent=self.agent,
+            discriminator=self.discriminator if judged else None,
+            searches=searches,
+            search=self.search,
+        )
+
+    def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
+        """Learning rates by network, before they fall."""
+        own = {"discriminator": self.discriminator.learning_rate}
+        return {name: own.get(name, self.learning_rate) for name in optimizers}

@@ -1,0 +1,107 @@
+"""Cutting a run segment down to what is near its ego: some sources give a whole district with every scene."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from symphony.data.segment import Polylines, RoadMap, RunSegment, validate
+from symphony.errors import ConfigError
+
+MARGIN = 10.0
+"""Metres beside the lanes that are kept within which the boundary is kept, too."""
+
+
+def crop(segment: RunSegment, radius: float) -> RunSegment:
+    """What comes within a distance of the ego's logged path.
+
+    Lanes are kept whole, with their links and lights; of the boundary and the marks the pieces that are near enough,
+    or beside a lane that is kept. Where lanes go on beyond, the boundary stays open. Agents are kept whole if they
+    are near enough at some step.
+
+    Args:
+        segment: a valid segment.
+        radius: metres.
+
+    Raises:
+        ConfigError: the radius is not positive.
+        DataError: no lane is near enough.
+    """
+    if not (np.isfinite(radius) and radius > 0):
+        raise ConfigError(f"radius must be positive, is {radius}")
+    path = segment.position[segment.ego, segment.valid[segment.ego], :2].astype(np.float64)
+    near = _geometry(path).buffer(radius)
+    shapely.prepare(near)
+    spots = segment.position[..., :2].astype(np.float64)
+    close = shapely.contains_xy(near, spots[..., 0], spots[..., 1]) & segment.valid
+    agents = close.any(axis=1)
+    agents[segment.ego] = True
+    road, lanes = _road(segment.road, near)
+    lights = lanes[segment.signal_lane]
+    return validate(
+        segment.replace(
+            ego=int(agents[: segment.ego].sum()),
+            **{
+                name: getattr(segment, name)[agents]
+                for name in ("agent_id", "agent_type", "size", "position", "heading", "velocity", "valid")
+            },
+            road=road,
+            signal_lane=_renumbered(segment.signal_lane[lights], lanes),
+            signal_point=segment.signal_point[lights],
+            signal_state=segment.signal_state[lights],
+            interest=_renumbered(segment.interest[agents[segment.interest]], agents),
+            predict=_renumbered(segment.predict[agents[segment.predict]], agents),
+        )
+    )
+
+
+def _geometry(points: NDArray[Any]) -> Any:
+    return shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
+
+
+def _renumbered(index: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Indices into what is kept, all of which are."""
+    return (np.cumsum(kept) - 1).astype(np.int32)[index]
+
+
+def _road(road: RoadMap, near: Any) -> tuple[RoadMap, NDArray[np.bool_]]:
+    """(the map, which lanes [L] are kept)."""
+    shapes = [_geometry(road.lanes[k][:, :2].astype(np.float64)) for k in range(len(road.lanes))]
+    kept = shapely.intersects(near, np.array(shapes, object))
+    lanes = [shape.buffer(MARGIN) for shape, keep in zip(shapes, kept, strict=True) if keep]
+    beside = shapely.union_all([near, *lanes])
+    shapely.prepare(beside)
+
+    def links(pairs: NDArray[Any]) -> NDArray[np.int32]:
+        return _renumbered(pairs[kept[pairs].all(axis=1)], kept)
+
+    marks = [_pieces(road.marks[k], beside) for k in range(len(road.marks))]
+    return RoadMap(
+        lanes=Polylines.of([road.lanes[k] for k in np.flatnonzero(kept).tolist()]),
+        lane_id=road.lane_id[kept],
+        lane_type=road.lane_type[kept],
+        speed_limit=road.speed_limit[kept],
+        lane_width=road.lane_width[kept],
+        successors=links(road.successors),
+        left_neighbors=links(road.left_neighbors),
+        right_neighbors=links(road.right_neighbors),
+        boundary=Polylines.of(
+            [p for k in range(len(road.boundary)) for p in _pieces(road.boundary[k], beside)]
+        ),
+        marks=Polylines.of([piece for pieces in marks for piece in pieces]),
+        mark_type=np.repeat(road.mark_type, [len(pieces) for pieces in marks]),
+    ), kept
+
+
+def _pieces(line: NDArray[np.float32], area: Any) -> list[NDArray[np.float32]]:
+    """Stretches of a line [P, 3] of edges that touch an area, each uncut, in their order."""
+    points = line[:, :2].astype(np.float64)
+    if len(line) == 1:
+        return [line] if shapely.intersects_xy(area, *points[0]) else []
+    keep = shapely.intersects(area, shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1)))
+    change = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
+    return [line[a : b + 1] for a, b in pairwise(change.tolist()) if keep[a]]

@@ -1,0 +1,52 @@
+"""Vehicles that drive through each other in the log: errors of the tracking, but collisions to every metric."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from symphony.data.segment import AgentType, RunSegment
+from symphony.data.selection import MOVING, travel
+from symphony.geometry import boxes_overlap
+
+MANY = 0.05
+"""Share of a store's segments with overlaps above which a conversion warns."""
+TAG = "overlaps"
+"""Tag of a stored segment that has some: how many pairs of agents."""
+
+
+def overlapping(segment: RunSegment) -> NDArray[np.int64]:
+    """[P, 2] pairs of agents, rows in order, whose oriented boxes overlap at some step.
+
+    At least one of the two is a vehicle that moves (more than :data:`~symphony.data.selection.MOVING` metres).
+    Touching does not count.
+    """
+    drivers = np.flatnonzero((segment.agent_type == AgentType.VEHICLE) & (travel(segment) > MOVING))
+    position = segment.position[..., :2].astype(np.float64)
+    size = segment.size[:, :2].astype(np.float64)
+    radius = np.hypot(*size.T) / 2
+    away = position[drivers, None] - position[None]
+    reach = radius[drivers, None] + radius
+    # Boxes can only overlap where the circles around them do. [drivers, A, T]
+    near = (away**2).sum(-1) < (reach**2)[..., None]
+    near &= segment.valid[drivers, None] & segment.valid
+    near[np.arange(len(drivers)), drivers] = False
+    driver, other, step = near.nonzero()
+    one = drivers[driver]
+
+    def boxes(rows: NDArray[np.integer[Any]]) -> tuple[torch.Tensor, ...]:
+        heading = segment.heading[rows, step].astype(np.float64)
+        return tuple(map(torch.from_numpy, (position[rows, step], heading, size[rows])))
+
+    hit = boxes_overlap(*boxes(one), *boxes(other)).numpy()
+    pairs = np.sort(np.stack([one[hit], other[hit]], axis=-1), axis=1)
+    return np.unique(pairs, axis=0)
+
+
+def tags(segment: RunSegment) -> dict[str, int] | None:
+    """What a store notes of a segment with overlaps; None for one without."""
+    found = len(overlapping(segment))
+    return {TAG: found} if found else None

@@ -1,0 +1,268 @@
+"""Reader of recordings in the format of the INTERACTION dataset: tracks in CSV with a Lanelet2 map.
+
+Three layouts are known, SCENE being the place:
+
+- ``recorded_trackfiles/SCENE/vehicle_tracks_<N>.csv`` with ``pedestrian_tracks_<N>.csv`` where there are any
+  (INTERACTION 1.0 and 1.1), and ``maps/SCENE.osm_xy`` or ``maps/SCENE.osm`` beside ``recorded_trackfiles``;
+- the same with ``meta_data.csv``, ``signal_phases_<N>.csv`` and ``*_map.kml`` in the folder of the tracks (Test Area
+  Autonomous Driving Baden-Württemberg);
+- ``train/SCENE_train.csv`` and ``val/SCENE_val.csv`` with many cases each (INTERACTION 1.2), maps as before.
+
+Everything may also lie in one folder, if it has a single map.
+
+How the format maps onto :class:`~symphony.data.segment.RunSegment`:
+
+- A recording is cut into windows; a case is one segment, whose ``current_step`` is the tenth (its first second is
+  history). ``segment_id`` is the map's name, the file's number or split, the case or the window's first second, and
+  the ego. ``group`` is the file.
+- Nobody is the ego: it is picked as in the CommonRoad reader. Agents are in order of id.
+- Coordinates are relative to the middle of the map, so that all windows share one map; z is 0, height unknown.
+- A map in degrees is projected: by a spherical Mercator, true to length at the origin that ``meta_data.csv`` names,
+  where there is one; else by UTM relative to latitude and longitude 0, as INTERACTION's own scripts do.
+- ``pedestrian/bicycle`` is one type in the format: see :data:`.interaction_tracks.CYCLING`. Sizes that are not given
+  are :data:`.interaction_tracks.NOMINAL`, headings not given are the direction of motion.
+- Lights: see :mod:`.interaction_signals`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import Bools, RoadMap, RunSegment
+from symphony.data.sources.base import Item, Reader, to_float32
+from symphony.data.sources.egos import busiest_first
+from symphony.data.sources.geodesy import mercator, utm
+from symphony.data.sources.interaction_files import Files, find_files, read_meta
+from symphony.data.sources.interaction_motion import from_positions, headings
+from symphony.data.sources.interaction_signals import NO_LIGHTS, Lights, read_lights
+from symphony.data.sources.interaction_tracks import (
+    NOMINAL,
+    Rows,
+    check_motion,
+    joined,
+    merged,
+    read_rows,
+    resolved,
+    time_step,
+)
+from symphony.data.sources.lanelet2 import Projection, read_lanelet2
+from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, successors
+from symphony.data.sources.lines import Doubles
+from symphony.errors import ConfigError, DataError
+
+FAR = 200.0
+"""Metres between a recording and the box around its map beyond which the two don't belong together."""
+HISTORY = 9
+"""The last step of a case's first second."""
+MAX_STEPS, MAX_STATES = 360_000, 20_000_000
+"""Steps of a recording, and agents times steps of a segment: few enough to allocate."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the windows of one file share."""
+
+    name: str
+    file: str
+    dt_ms: int
+    road: RoadMap
+    lights: Lights
+    origin: Doubles
+
+
+class InteractionReader(Reader):
+    """Reads INTERACTION-format recordings.
+
+    Args:
+        egos: ``"one"`` picks an ego per window, ``"all"`` gives a segment for each vehicle that moves and is seen at
+            every step, as in :class:`~symphony.data.sources.commonroad.CommonRoadReader`.
+        window: seconds of a segment. The rest of a recording counts if it is at least half as long.
+        stride: seconds between the starts of windows; by default ``window``, so that they don't overlap.
+        motion: ``"logged"`` takes velocities and headings as they are, and refuses a file where they are not those of
+            its positions; ``"positions"`` computes both, and takes the mean of states logged twice.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    name = "interaction"
+    patterns = ("vehicle_tracks_*.csv", "*_train.csv", "*_val.csv")
+
+    def __init__(
+        self,
+        egos: Literal["one", "all"] = "one",
+        window: float = 10.0,
+        stride: float | None = None,
+        motion: Literal["logged", "positions"] = "logged",
+    ) -> None:
+        if egos not in {"one", "all"}:
+            raise ConfigError(f"egos must be 'one' or 'all', is {egos!r}")
+        if motion not in {"logged", "positions"}:
+            raise ConfigError(f"motion must be 'logged' or 'positions', is {motion!r}")
+        if not 0 < window <= 600:
+            raise ConfigError(f"window must be above 0 and at most 600 s, is {window}")
+        if stride is not None and not 0 < stride <= 600:
+            raise ConfigError(f"stride must be above 0 and at most 600 s, is {stride}")
+        self.egos, self.motion, self.window = egos, motion, window
+        self.stride = window if stride is None else stride
+
+    def companions(self, path: Path) -> tuple[Path, ...]:
+        """The map, and whatever else the recording has."""
+        try:
+            found = find_files(path)
+        except DataError:
+            return ()
+        more = (found.map, found.walkers, found.meta, found.phases, found.topology)
+        return tuple(file for file in more if file is not None)
+
+    def optional(self, path: Path) -> tuple[Path, ...]:
+        """The file of pedestrians, which many recordings don't have."""
+        return tuple(file for file in self.companions(path) if file.name.startswith("pedestrian_tracks_"))
+
+    def _read(self, path: Path) -> Iterator[Item]:
+        rows = read_rows(path)
+        files = find_files(path)
+        if files.walkers is not None:
+            rows = joined(rows, read_rows(files.walkers))
+        dt_ms = time_step(rows)
+        if self.motion == "positions":
+            rows = merged(rows)
+        else:
+            check_motion(rows, dt_ms)
+        # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield from self._segments(resolved(rows), _scene(files, rows, dt_ms), files)
+
+    def _segments(self, rows: Rows, scene: Scene, files: Files) -> Iterator[Item]:
+        cases = np.unique(rows.case)
+        for case in cases:
+            mine = rows.take(slice(*np.searchsorted(rows.case, [case, case + 1])))
+            first = int(mine.time[0])
+            steps = int(mine.time[-1] - first) // scene.dt_ms + 1
+            if steps > MAX_STEPS:
+                raise DataError(f"{steps} steps, at most {MAX_STEPS} can be read", field="timestamp_ms")
+            single = files.tracks.name.startswith("vehicle_tracks_")
+            for start, stop in self._windows(steps, scene.dt_ms) if single else [(0, steps)]:
+                begin, end = (first + step * scene.dt_ms for step in (start, stop))
+                part = mine.take(slice(*np.searchsorted(mine.time, [begin, end])))
+                what = f"t{start * scene.dt_ms / 1000:g}" if single else f"case{case}"
+                name = f"{scene.name}_{files.part}_{what}"
+                try:
+                    yield from self._window(part, scene, name, begin, stop - start, 0 if single else HISTORY)
+                except DataError as error:
+                    yield error.at(segment=name)
+
+    def _windows(self, steps: int, dt_ms: int) -> list[tuple[int, int]]:
+        """First step and the one after the last of each window."""
+        length, stride = (max(round(1000 * s / dt_ms), 1) for s in (self.window, self.stride))
+        found = []
+        for start in range(0, max(steps - 1, 1), stride):
+            stop = min(start + length + 1, steps)
+            if start == 0 or 2 * (stop - start - 1) >= length:
+                found.append((start, stop))
+        return found
+
+    def _window(
+        self, rows: Rows, scene: Scene, name: str, begin: int, steps: int, current: int
+    ) -> Iterator[RunSegment]:
+        if not len(rows):
+            raise DataError("nobody is there", field="track_id")
+        ids, row = np.unique(rows.track, return_inverse=True)
+        if len(ids) * steps > MAX_STATES:
+            raise DataError(f"{len(ids)} tracks of {steps} steps, too many to read", field="track_id")
+        first = np.unique(row, return_index=True)[1]
+        kind = rows.kind[first]
+        if (rows.kind != kind[row]).any():
+            wrong = rows.track[np.argmax(rows.kind != kind[row])]
+            raise DataError(f"track {wrong} has more than one", field="agent_type")
+        state = np.zeros((len(ids), steps, 5))
+        valid = np.zeros((len(ids), steps), np.bool_)
+        step = (rows.time - begin) // scene.dt_ms
+        state[row, step], valid[row, step] = rows.state[:, :5], True
+        state[valid, :2] -= scene.origin
+        if self.motion == "positions":
+            state = from_positions(state, valid, scene.dt_ms / 1000)
+        state = headings(state, valid)
+        candidates = busiest_first(ids, kind.astype(np.uint8), state[..., :2], valid)
+        if not len(candidates):
+            raise DataError("no moving vehicle is observed at every step", field="track_id")
+        times = begin + np.arange(steps) * scene.dt_ms
+        segment = RunSegment(
+            segment_id=name,
+            source=self.name,
+            dt=scene.dt_ms / 1000,
+            ego=int(candidates[0]),
+            agent_id=ids,
+            agent_type=kind.astype(np.uint8),
+            size=_sizes(rows, row, kind),
+            position=to_float32(np.pad(state[..., :2], ((0, 0), (0, 0), (0, 1)))),
+            heading=to_float32(state[..., 4]),
+            velocity=to_float32(state[..., 2:4]),
+            valid=valid,
+            road=scene.road,
+            signal_lane=scene.lights.lane,
+            signal_point=to_float32(np.pad(scene.lights.point - scene.origin, ((0, 0), (0, 1)))),
+            signal_state=scene.lights.at(times),
+            origin=np.array([*scene.origin, 0.0]),
+            current_step=min(current, steps - 1),
+            predict=_marked(rows.marks[:, 0], row),
+            interest=_marked(rows.marks[:, 1], row),
+            file=scene.file,
+            group=name.rpartition("_")[0],
+        )
+        if self.egos == "one":
+            yield segment
+            return
+        for ego in sorted(candidates.tolist()):
+            yield segment.replace(ego=ego, segment_id=f"{name}_ego{ids[ego]}")
+
+
+def _marked(mark: Bools, row: NDArray[np.int64]) -> NDArray[np.int32]:
+    return np.unique(row[mark]).astype(np.int32)
+
+
+def _sizes(rows: Rows, row: NDArray[np.int64], kind: NDArray[np.int64]) -> NDArray[np.float32]:
+    """[A, 3] the first size given of each agent, else the nominal one; height 0."""
+    size = np.zeros((len(kind), 3))
+    for k, (length, width) in NOMINAL.items():
+        size[kind == k, :2] = length, width
+    given = np.flatnonzero((rows.state[:, 5:7] > 0).all(axis=1))[::-1]
+    size[row[given], :2] = rows.state[given, 5:7]  # the first one is written last
+    return to_float32(size)
+
+
+def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
+    projection: Projection = partial(utm, origin=np.zeros(2))
+    has_phases = files.phases is not None
+    if files.meta is not None:
+        origin, has_phases = read_meta(files.meta, files.part)
+        projection = partial(mercator, origin=origin)
+    source = read_lanelet2(files.map, projection)
+    try:
+        lanes = lane_lanelets(source)
+        origin, links = middle(source), successors(lanes)
+        road = road_map(source, origin)
+    except DataError as error:
+        raise error.at(file=files.map) from error
+    lights = NO_LIGHTS
+    if has_phases:
+        if files.phases is None or files.topology is None:
+            raise DataError("its signal phases, or the one *_map.kml that goes with them, are missing")
+        lines = [center(lane) for lane in lanes]
+        until = int(rows.time.max())
+        lights = read_lights(
+            files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection, until
+        )
+    reach = np.abs(np.concatenate([lane.ring for lane in lanes]) - origin).max(axis=0)
+    away = np.hypot(*np.maximum(np.abs(rows.state[:, :2] - origin) - reach, 0).T)
+    if float(np.median(away)) > FAR:
+        message = f"the tracks are {np.median(away):.0f} m away from the map: another origin or projection"
+        raise DataError(message, field="x, y")
+    return Scene(files.scene, files.tracks.name, dt_ms, road, lights, origin)

@@ -1,0 +1,296 @@
+"""Track files of the INTERACTION format: comma-separated values, one row per track and time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.resample import wrap
+from symphony.data.segment import AgentType, Bools
+from symphony.data.sources.lines import Doubles
+from symphony.errors import DataError
+
+MAX_BYTES = 1 << 29
+"""Of one file; the largest published ones have a fourth of it."""
+CHUNK = 50_000
+"""Lines that are parsed at a time."""
+
+_NUMBERS = ("x", "y", "vx", "vy", "psi_rad", "length", "width")
+_NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
+_TYPES = {
+    **dict.fromkeys(("car", "truck", "bus", "van", "motorcycle"), AgentType.VEHICLE),
+    **dict.fromkeys(("bike", "bicycle", "cyclist"), AgentType.CYCLIST),
+    "pedestrian": AgentType.PEDESTRIAN,
+    "pedestrian/bicycle": AgentType.UNSET,
+}
+NOMINAL = {AgentType.PEDESTRIAN: (0.7, 0.7), AgentType.CYCLIST: (1.8, 0.7)}
+"""Length and width in metres of those whose box the format does not give."""
+CYCLING = 2.5
+"""m/s: of the type ``pedestrian/bicycle``, tracks whose fastest tenth is faster are cyclists."""
+MAX_GAP_MS = 1000
+"""Longest time step that is taken for one."""
+_MOVING = 3.0
+_ENOUGH = 20
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of one or two files, ordered by case, time and track.
+
+    Attributes:
+        case: [N] number of the case the row belongs to; 0 throughout where the file is one recording.
+        time: [N] milliseconds.
+        track: [N] id; that of a track named ``P7`` is -8, that of track 7 is 7.
+        kind: [N] :class:`AgentType`, UNSET for ``pedestrian/bicycle``.
+        state: [N, 7] x, y, vx, vy, heading, length, width; NaN where not given.
+        marks: [N, 2] whether the track is one to predict, and an interacting one.
+    """
+
+    case: NDArray[np.int64]
+    time: NDArray[np.int64]
+    track: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    state: Doubles
+    marks: Bools
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def take(self, where: NDArray[np.integer] | slice) -> Rows:
+        """Some of the rows."""
+        return Rows(
+            self.case[where],
+            self.time[where],
+            self.track[where],
+            self.kind[where],
+            self.state[where],
+            self.marks[where],
+        )
+
+
+def read_rows(path: Path) -> Rows:
+    """Read a track file.
+
+    Raises:
+        DataError: too large, empty, cut short, a column is missing, or a field can't be read; names file and line.
+        OSError: the file can't be read.
+    """
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise DataError(f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
+    try:
+        with path.open("rb") as file:
+            return _parsed(file)
+    except DataError as error:
+        raise error.at(file=path) from error
+
+
+def _parsed(file: BinaryIO) -> Rows:
+    head = file.readline()
+    if not head.strip():
+        raise DataError("the file is empty")
+    names = [name.strip() for name in _text(head, 1).split(",")]
+    for name in _NEEDED:
+        if names.count(name) != 1:
+            raise DataError(f"{names.count(name)} columns of that name, expected one", field=name)
+    parts = [_rows(names, lines, first) for first, lines in _chunks(file)]
+    if not parts:
+        raise DataError("the file has no rows")
+    joined = [np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts), strict=True)]
+    return ordered(Rows(*joined))
+
+
+def ordered(rows: Rows) -> Rows:
+    """By case, time and track."""
+    return rows.take(np.lexsort((rows.track, rows.time, rows.case)))
+
+
+def joined(one: Rows, two: Rows) -> Rows:
+    """The rows of both."""
+    arrays = zip(vars(one).values(), vars(two).values(), strict=True)
+    return ordered(Rows(*(np.concatenate(pair) for pair in arrays)))
+
+
+def _chunks(file: BinaryIO) -> Iterator[tuple[int, list[list[str]]]]:
+    """(number of the first line, fields of each line) of so many lines at a time."""
+    first = 2
+    while lines := list(itertools.islice(file, CHUNK)):
+        if not lines[-1].endswith(b"\n"):
+            raise DataError("the last line is not complete: the file was cut short", field=f"line {first}")
+        yield first, [_text(line, first + k).split(",") for k, line in enumerate(lines)]
+        first += len(lines)
+
+
+def _text(line: bytes, number: int) -> str:
+    try:
+        return line.decode("ascii").rstrip("\r\n")
+    except UnicodeDecodeError as error:
+        raise DataError("not ASCII text", field=f"line {number}") from error
+
+
+def _rows(names: list[str], lines: list[list[str]], first: int) -> Rows:
+    for k, line in enumerate(lines):
+        if len(line) != len(names):
+            raise DataError(f"{len(line)} fields, expected {len(names)}", field=f"line {first + k}")
+    columns = dict(zip(names, zip(*lines, strict=True), strict=True))
+    count = len(lines)
+    missing = ("nan",) * count
+    state = [_numbers(columns.get(name, missing), name, first) for name in _NUMBERS]
+    flags = [
+        _flags(columns.get(name), count, name, first) for name in ("track_to_predict", "interesting_agent")
+    ]
+    case = columns.get("case_id")
+    return Rows(
+        case=np.zeros(count, np.int64) if case is None else _whole(case, "case_id", first),
+        time=_whole(columns["timestamp_ms"], "timestamp_ms", first),
+        track=_mapped(columns["track_id"], _track_id, "track_id", first),
+        kind=_mapped(columns["agent_type"], lambda t: _TYPES[t.strip().lower()], "agent_type", first),
+        state=np.stack(state, axis=-1),
+        marks=np.stack(flags, axis=-1),
+    )
+
+
+def _numbers(texts: tuple[str, ...], name: str, first: int) -> Doubles:
+    """NaN where a field is empty; only the optional ones may be."""
+    try:
+        values = np.array([text if text.strip() else "nan" for text in texts]).astype(np.float64)
+    except ValueError:
+        values = np.array([_number(text, name, first + k) for k, text in enumerate(texts)])
+    wrong = ~(np.abs(values) <= 1e8)
+    if name not in _NEEDED:
+        wrong &= ~np.isnan(values)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise DataError(f"{texts[k][:40]!r} is not a number of metres", field=f"line {first + k}: {name}")
+    return values
+
+
+def _number(text: str, name: str, line: int) -> float:
+    try:
+        return float(text) if text.strip() else np.nan
+    except ValueError:
+        raise DataError(f"{text[:40]!r} is not a number", field=f"line {line}: {name}") from None
+
+
+def _whole(texts: tuple[str, ...], name: str, first: int) -> NDArray[np.int64]:
+    values = np.array([_number(text, name, first + k) for k, text in enumerate(texts)])
+    wrong = ~((np.abs(values) < 2**53) & (values == np.round(values)))
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise DataError(f"{texts[k][:40]!r} is not a whole number", field=f"line {first + k}: {name}")
+    return values.astype(np.int64)
+
+
+def _flags(texts: tuple[str, ...] | None, count: int, name: str, first: int) -> Bools:
+    return np.zeros(count, np.bool_) if texts is None else _whole(texts, name, first) != 0
+
+
+def _mapped(texts: tuple[str, ...], value: object, name: str, first: int) -> NDArray[np.int64]:
+    """Each distinct text is looked at once."""
+    known: dict[str, int] = {}
+    for k, text in enumerate(texts):
+        if text not in known:
+            try:
+                known[text] = value(text)  # type: ignore[operator]
+            except (KeyError, ValueError):
+                raise DataError(f"unknown value {text[:40]!r}", field=f"line {first + k}: {name}") from None
+    return np.array([known[text] for text in texts], np.int64)
+
+
+def _track_id(text: str) -> int:
+    text = text.strip()
+    digits = text.removeprefix("P")
+    if not (digits.isdecimal() and len(digits) <= 15):
+        raise ValueError(text)
+    return -1 - int(digits) if text.startswith("P") else int(digits)
+
+
+def time_step(rows: Rows) -> int:
+    """Milliseconds between the steps of a recording, which all times must be whole multiples of.
+
+    Raises:
+        DataError: there are fewer than two times, or they are uneven.
+    """
+    times = np.unique(rows.time)
+    if len(times) < 2:
+        raise DataError("fewer than two steps", field="timestamp_ms")
+    step = int(np.median(np.diff(times)))
+    off = (times - times[0]) % step if step else times
+    if not 0 < step <= MAX_GAP_MS or off.any():
+        raise DataError(f"times are no multiples of their usual step of {step} ms", field="timestamp_ms")
+    return step
+
+
+def check_motion(rows: Rows, dt_ms: int) -> None:
+    """See that velocities and headings of vehicles that move are those of their positions.
+
+    Compared over a second: medians over all vehicles, so that single wild tracks do not count.
+
+    Raises:
+        DataError: they are not, or a track has two states at one time.
+    """
+    twice = _twice(rows)
+    if len(twice):
+        at = f"track {rows.track[twice[0]]} has two states at {rows.time[twice[0]]} ms"
+        raise DataError(f"{at}, and {len(twice)} times so in all{_HINT}", field="timestamp_ms")
+    by_track = rows.take(np.lexsort((rows.time, rows.track, rows.case)))
+    lag = max(1, round(1000 / dt_ms))
+    one, two = by_track.take(slice(None, -lag)), by_track.take(slice(lag, None))
+    both = (one.track == two.track) & (one.case == two.case) & (two.time - one.time == lag * dt_ms)
+    both &= (one.kind == AgentType.VEHICLE) & (two.kind == AgentType.VEHICLE)
+    one, two = one.take(np.flatnonzero(both)), two.take(np.flatnonzero(both))
+    covered = (two.state[:, :2] - one.state[:, :2]) / (lag * dt_ms / 1000)
+    logged = (one.state[:, 2:4] + two.state[:, 2:4]) / 2
+    fast = np.hypot(*covered.T) > _MOVING
+    if fast.sum() < _ENOUGH:
+        return
+    covered, logged = covered[fast], logged[fast]
+    course = np.arctan2(*covered.T[::-1])
+    ratio = float(np.median(np.hypot(*logged.T) / np.hypot(*covered.T)))
+    if not 0.8 <= ratio <= 1.25:
+        raise DataError(f"velocities are {ratio:.2f} times the speed of the positions{_HINT}", field="vx, vy")
+    for name, angle in (("vx, vy", np.arctan2(*logged.T[::-1])), ("psi_rad", one.state[fast, 4])):
+        error = float(np.nanmedian(np.abs(wrap(angle - course)))) if not np.isnan(angle).all() else 0.0
+        if error > 0.5:
+            raise DataError(f"points {np.degrees(error):.0f} degrees off the motion{_HINT}", field=name)
+
+
+_HINT = " (motion='positions' computes both from the positions)"
+
+
+def _twice(rows: Rows) -> NDArray[np.int64]:
+    keys = np.stack([rows.case, rows.time, rows.track])
+    return np.flatnonzero((keys[:, 1:] == keys[:, :-1]).all(axis=0)) + 1
+
+
+def merged(rows: Rows) -> Rows:
+    """Positions and velocities that a track has twice at one time become their mean."""
+    twice = _twice(rows)
+    if not len(twice):
+        return rows
+    first = np.setdiff1d(np.arange(len(rows)), twice)
+    number = np.searchsorted(first, np.arange(len(rows)), side="right") - 1
+    total = np.zeros((len(first), 4))
+    np.add.at(total, number, rows.state[:, :4])
+    found = rows.take(first)
+    mean = total / np.bincount(number)[:, None]
+    return replace(found, state=np.concatenate([mean, found.state[:, 4:]], axis=1))
+
+
+def resolved(rows: Rows) -> Rows:
+    """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists."""
+    kind = rows.kind.copy()
+    unknown = np.flatnonzero(kind == AgentType.UNSET)
+    speed = np.hypot(rows.state[:, 2], rows.state[:, 3])
+    keys = np.stack([rows.case[unknown], rows.track[unknown]])
+    for case, track in np.unique(keys, axis=1).T:
+        mine = unknown[(keys[0] == case) & (keys[1] == track)]
+        fast = np.percentile(speed[mine], 90) > CYCLING
+        kind[mine] = AgentType.CYCLIST if fast else AgentType.PEDESTRIAN
+    return replace(rows, kind=kind)

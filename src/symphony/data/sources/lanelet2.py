@@ -1,0 +1,234 @@
+"""Lanelet2 maps: OpenStreetMap XML whose relations are lanelets and regulatory elements.
+
+What is read, and what is not:
+
+- Every relation of type ``lanelet`` with one way on its left and one on its right, and every relation of type
+  ``regulatory_element`` with its lines. Areas (``multipolygon``) are not read. Elements that an editor marked as
+  deleted do not count.
+- Ways may be drawn in either direction: here both bounds of a lanelet run in its direction of travel, the left one
+  on its left.
+- A node lies where its file says in metres (attributes ``x``, ``y`` as in INTERACTION's ``.osm_xy`` files, else tags
+  ``local_x``, ``local_y``), if that holds for every node; else its latitude and longitude are projected.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from symphony.data.sources.commonroad_xml import integer, load_xml, number
+from symphony.data.sources.lines import Doubles
+from symphony.errors import DataError
+
+MAX_NODES = 2_000_000
+"""More than any map of a city district."""
+
+Projection = Callable[[Doubles], Doubles]
+"""[N, 2] latitude and longitude in degrees to metres."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A line: ids of its nodes, its points [P, 2] in metres, and its tags."""
+
+    way_id: int
+    nodes: tuple[int, ...]
+    line: Doubles
+    tags: dict[str, str]
+
+    def turned(self) -> Way:
+        """The same in the other direction."""
+        return Way(self.way_id, self.nodes[::-1], self.line[::-1], self.tags)
+
+
+@dataclass(frozen=True)
+class Lanelet:
+    """A stretch of lane between two bounds that run in its direction of travel.
+
+    Attributes:
+        lanelet_id: of the relation.
+        left, right: bounds.
+        turned: whether left and right run against their way's own direction.
+        tags: of the relation.
+        rules: ids of its regulatory elements.
+    """
+
+    lanelet_id: int
+    left: Way
+    right: Way
+    turned: tuple[bool, bool]
+    tags: dict[str, str]
+    rules: tuple[int, ...]
+
+    @property
+    def subtype(self) -> str:
+        """``road`` where the map does not say."""
+        return self.tags.get("subtype", "road")
+
+    @property
+    def ring(self) -> Doubles:
+        """[P, 2] closed outline."""
+        return np.concatenate([self.left.line, self.right.line[::-1], self.left.line[:1]])
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A regulatory element.
+
+    Attributes:
+        rule_id: of the relation.
+        tags: its ``subtype`` says what it is: traffic_light, traffic_sign, speed_limit, right_of_way …
+        lines: role (``refers``, ``ref_line`` …) -> its ways.
+        lanelets: role (``yield``, ``right_of_way`` …) -> ids of lanelets.
+    """
+
+    rule_id: int
+    tags: dict[str, str]
+    lines: dict[str, tuple[Way, ...]]
+    lanelets: dict[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class LaneletMap:
+    """Everything read from a file, in metres; lanelets and ways in file order."""
+
+    lanelets: tuple[Lanelet, ...]
+    ways: dict[int, Way]
+    rules: dict[int, Rule]
+
+
+def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
+    """Read a map.
+
+    Args:
+        path: an ``.osm`` or ``.osm_xy`` file.
+        projection: for files without metres, such as ``partial(utm, origin=...)``.
+
+    Raises:
+        DataError: it is no OSM XML, declares a document type, has no lanelets, or one can't be read; names the
+            file and the element.
+    """
+    try:
+        root = load_xml(path, "OSM")
+        if root.tag != "osm":
+            raise DataError(f"not an OSM file: its root is <{root.tag[:40]}>", field="osm")
+        ways = _ways(root, projection)
+        relations = [(node, _tags(node)) for node in _living(root, "relation")]
+        rules = [_rule(n, tags, ways) for n, tags in relations if tags.get("type") == "regulatory_element"]
+        lanelets = tuple(_lanelet(n, tags, ways) for n, tags in relations if tags.get("type") == "lanelet")
+        if not lanelets:
+            raise DataError("has no lanelets", field="relation")
+        return LaneletMap(lanelets, ways, {rule.rule_id: rule for rule in rules})
+    except DataError as error:
+        raise error.at(file=path) from error
+    except OSError as error:
+        raise DataError(f"can't be read: {error.strerror or error}", file=path) from error
+
+
+def _living(root: ET.Element, tag: str) -> Iterator[ET.Element]:
+    return (node for node in root.iter(tag) if node.get("action") != "delete")
+
+
+def _tags(node: ET.Element) -> dict[str, str]:
+    return {child.get("k", ""): child.get("v", "").strip() for child in node.findall("tag")}
+
+
+def _ways(root: ET.Element, projection: Projection) -> dict[int, Way]:
+    places = _places(root, projection)
+    ways = {}
+    for node in _living(root, "way"):
+        way_id = integer(node.get("id"), "way id")
+        refs = [integer(child.get("ref"), f"way {way_id}: nd") for child in node.findall("nd")]
+        missing = [ref for ref in refs if ref not in places]
+        if missing:
+            raise DataError(f"there is no node {missing[0]}", field=f"way {way_id}: nd")
+        # The same node twice in a row is a slip of the editor.
+        refs = [ref for k, ref in enumerate(refs) if k == 0 or ref != refs[k - 1]]
+        line = np.array([places[ref] for ref in refs], np.float64).reshape(-1, 2)
+        ways[way_id] = Way(way_id, tuple(refs), line, _tags(node))
+    return ways
+
+
+def _places(root: ET.Element, projection: Projection) -> dict[int, Doubles]:
+    """Node id -> [2] metres."""
+    nodes = list(_living(root, "node"))
+    if len(nodes) > MAX_NODES:
+        raise DataError(f"{len(nodes)} nodes, at most {MAX_NODES} can be read", field="node")
+    ids = [integer(node.get("id"), "node id") for node in nodes]
+    local = [(node.get("x"), node.get("y")) for node in nodes]
+    if not all(x is not None and y is not None for x, y in local):
+        tags = [_tags(node) for node in nodes]
+        local = [(tag.get("local_x"), tag.get("local_y")) for tag in tags]
+    if all(x is not None and y is not None for x, y in local):
+        metres = _pairs(ids, local, "x, y")
+    else:
+        degrees = _pairs(ids, [(node.get("lat"), node.get("lon")) for node in nodes], "lat, lon")
+        metres = projection(degrees)
+    return dict(zip(ids, metres, strict=True))
+
+
+def _pairs(ids: list[int], texts: list[tuple[str | None, str | None]], what: str) -> Doubles:
+    found = [
+        [number(text, f"node {name}: {what}") for text in pair] for name, pair in zip(ids, texts, strict=True)
+    ]
+    return np.array(found, np.float64).reshape(-1, 2)
+
+
+def _members(node: ET.Element, kind: str, field: str) -> dict[str, list[int]]:
+    """Role -> references of a relation's members of a kind."""
+    found: dict[str, list[int]] = {}
+    for child in node.findall("member"):
+        if child.get("type") == kind:
+            found.setdefault(child.get("role", ""), []).append(integer(child.get("ref"), field))
+    return found
+
+
+def _lanelet(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Lanelet:
+    lanelet_id = integer(node.get("id"), "relation id")
+    field = f"lanelet {lanelet_id}"
+    members = _members(node, "way", field)
+    bounds = []
+    for side in ("left", "right"):
+        refs = members.get(side, [])
+        if len(refs) != 1:
+            raise DataError(f"{len(refs)} ways, expected one", field=f"{field}: {side}")
+        if refs[0] not in ways:
+            raise DataError(f"there is no way {refs[0]}", field=f"{field}: {side}")
+        if len(ways[refs[0]].line) < 2:
+            raise DataError("a bound of fewer than 2 points", field=f"{field}: {side}")
+        bounds.append(ways[refs[0]])
+    left, right, turned = _aligned(*bounds)
+    rules = _members(node, "relation", field).get("regulatory_element", [])
+    return Lanelet(lanelet_id, left, right, turned, tags, tuple(rules))
+
+
+def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
+    """Both bounds in the direction in which the left one is on the left."""
+    ends = left.line[[0, -1]]
+    apart, crossed = (np.hypot(*(ends - right.line[rows]).T).sum() for rows in ([0, -1], [-1, 0]))
+    twist = bool(crossed < apart)
+    along = right.turned() if twist else right
+    ring = np.concatenate([left.line, along.line[::-1]])
+    ring = ring - ring[0]
+    x, y = ring.T
+    # Forth on the left and back on the right goes round clockwise.
+    backwards = bool((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() > 0)
+    if backwards:
+        return left.turned(), along.turned(), (True, not twist)
+    return left, along, (False, twist)
+
+
+def _rule(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Rule:
+    rule_id = integer(node.get("id"), "relation id")
+    field = f"regulatory element {rule_id}"
+    lines = {
+        # Lines outside the map's section are missing in it.
+        role: tuple(ways[ref] for ref in refs if ref in ways and len(ways[ref].line))
+        for role, refs in _members(node, "way", field).items()
+    }
+    lanelets = {role: tuple(refs) for role, refs in _members(node, "relation", field).items()}
+    return Rule(rule_id, tags, lines, lanelets)

@@ -1,0 +1,134 @@
+"""What can be said of a batch of scenes once, so that a step only looks it up.
+
+Shapes: B scenes, P points, A agents, E boundary segments.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from symphony.data.segment import AgentType, SignalState
+from symphony.envs.grids import Arrays, GridSource
+from symphony.envs.scene import PointType, SceneBatch
+from symphony.geometry.cells import Edges
+from symphony.geometry.polylines import has_length
+
+if TYPE_CHECKING:
+    from symphony.envs.observation import ObservationConfig
+
+LIGHTS = len(SignalState)
+POINT_FEATURES = 6 + len(PointType) + LIGHTS
+AGENT_FEATURES = 2 + len(AgentType)
+LIGHT_COLUMN = 6 + len(PointType)
+
+
+class Tables:
+    """Rows of features, flat indices and grids of the scenes of a batch, each made when first used.
+
+    Args:
+        scenes: the static part; must not change afterwards.
+        config: of the observation.
+    """
+
+    def __init__(self, scenes: SceneBatch, config: ObservationConfig) -> None:
+        self.scenes, self.config = scenes, config
+
+    @cached_property
+    def points(self) -> Tensor:
+        """[B * P, 23] a point's features, with its position and direction in the frame of the world, in metres, in
+        the first four columns and zeros where they depend on the agent or the time.
+        """
+        scenes = self.scenes
+        point = scenes.point.flatten(0, 1)
+        rows = point.new_zeros(len(point), POINT_FEATURES)
+        rows[:, :2] = point
+        rows[:, 2:4] = scenes.point_direction.flatten(0, 1)
+        rows[:, 4] = scenes.point_speed.flatten() / self.config.speed_scale
+        rows.scatter_(1, 6 + scenes.point_type.flatten().long()[:, None], 1.0)
+        return rows
+
+    @cached_property
+    def light(self) -> Tensor | None:
+        """[B * P] int16 row of the lights, -1 for other points; None if there are no lights."""
+        return self.scenes.point_light.flatten() if self.scenes.light.shape[2] else None
+
+    @cached_property
+    def position(self) -> tuple[Tensor, Tensor]:
+        """x and y [B, P] of the points; infinity where there is none."""
+        nowhere = ~self.scenes.point_valid
+        x, y = self.scenes.point.masked_fill(nowhere[..., None], torch.inf).unbind(-1)
+        return x.contiguous(), y.contiguous()
+
+    @cached_property
+    def enough_points(self) -> bool:
+        """Whether every scene has as many points as are seen (CPU)."""
+        return bool((self.scenes.point_valid.sum(1) >= self.config.num_points).all())
+
+    @cached_property
+    def agents(self) -> Tensor:
+        """[B * A, 7] size and kind of agents as they are seen."""
+        scenes = self.scenes
+        size = scenes.box_size.flatten(0, 1) / self.config.size_scale
+        rows = size.new_zeros(len(size), AGENT_FEATURES)
+        rows[:, :2] = size
+        return rows.scatter_(1, 2 + scenes.agent_type.flatten().long()[:, None], 1.0)
+
+    @cached_property
+    def edges(self) -> dict[str, Tensor]:
+        """The boundary as one scene of B * E segments: start, end, valid, previous, following."""
+        scenes = self.scenes
+        scene_count, per_scene = scenes.edge_valid.shape
+        base = torch.arange(scene_count, device=scenes.edge_valid.device)[:, None] * per_scene
+
+        def flat(index: Tensor) -> Tensor:
+            return torch.where(index >= 0, index + base, -1).flatten()[None]
+
+        start, end = scenes.edge_start, scenes.edge_end
+        return {
+            "start": start.flatten(0, 1)[None],
+            "end": end.flatten(0, 1)[None],
+            "valid": (scenes.edge_valid & has_length(start, end)).flatten()[None],
+            "previous": flat(scenes.edge_previous),
+            "following": flat(scenes.edge_following),
+        }
+
+    @cached_property
+    def bounded(self) -> Tensor:
+        """[B] whether a scene has a boundary at all."""
+        return self.edges["valid"].view(self.scenes.edge_valid.shape).any(1)
+
+    @cached_property
+    def segments(self) -> Edges:
+        """The boundary component by component (CPU)."""
+        names = ("start", "end", "valid", "previous", "following")
+        return Edges.of(*(self.edges[name][0].numpy() for name in names))
+
+    @cached_property
+    def point_grids(self) -> GridSource:
+        """Grids for the nearest points (CPU)."""
+        scenes = self.scenes
+        maps = [_leading(valid, point) for valid, point in _arrays(scenes.point_valid, scenes.point)]
+        return GridSource.points(maps, self.config.num_points, scenes.point.shape[1])
+
+    @cached_property
+    def edge_grids(self) -> GridSource:
+        """Grids for the nearest edge of the road (CPU)."""
+        scenes = self.scenes
+        fields = scenes.edge_start, scenes.edge_end, scenes.edge_previous, scenes.edge_following
+        maps = [_leading(valid, *parts) for valid, *parts in _arrays(scenes.edge_valid, *fields)]
+        return GridSource.edges(maps, scenes.edge_start.shape[1])
+
+
+def _arrays(*fields: Tensor) -> list[Arrays]:
+    return list(zip(*(field.numpy() for field in fields), strict=True))
+
+
+def _leading(valid: np.ndarray, *fields: np.ndarray) -> Arrays | None:
+    """The valid elements of one scene if they come first, else None."""
+    count = int(valid.sum())
+    return tuple(field[:count] for field in fields) if count and valid[:count].all() else None

@@ -1,0 +1,172 @@
+"""Pictures of the very rollouts that were evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from symphony import keys
+from symphony.agents import Agent
+from symphony.config import EvaluateConfig
+from symphony.data.segment import RunSegment
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.scene import SceneBatch
+from symphony.errors import ConfigError
+from symphony.evaluation.evaluator import EvaluatedBatch
+from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
+from symphony.render.style import ANIMATIONS, FORMATS, picture_path
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import Rollouts, start_states
+from symphony.simulation.search import aggregate_of, pruning_rule, search
+
+PANELS = 6
+"""Run segments in one picture."""
+SHOWN = 8
+"""Rollouts drawn per run segment."""
+
+
+class ClipKeeper:
+    """Keeps rollouts of some run segments while they are evaluated; see the evaluator's ``observe``.
+
+    Args:
+        items: numbers of the segments in their dataset.
+        rollouts: of each, at most.
+        title: before the name of the segment.
+
+    Attributes:
+        clips: what was kept so far.
+    """
+
+    def __init__(self, items: Sequence[int], rollouts: int = SHOWN, title: str = "") -> None:
+        self.items, self.rollouts, self.title = set(items), rollouts, title
+        self.clips: list[Clip] = []
+
+    def __call__(self, batch: EvaluatedBatch) -> None:
+        """Keep what is wanted of a batch."""
+        for row, (item, segment) in enumerate(zip(batch.items, batch.segments, strict=True)):
+            if item in self.items:
+                title = f"{self.title}{segment.segment_id}"
+                clip = clip_of(segment, batch.scenes, batch.rollouts, row, self.rollouts, title)
+                self.clips.append(clip)
+
+
+def clip_of(
+    segment: RunSegment,
+    scenes: SceneBatch,
+    rollouts: Rollouts,
+    row: int = 0,
+    count: int | None = None,
+    title: str | None = None,
+) -> Clip:
+    """Rollouts of one run segment, to be drawn or animated.
+
+    Args:
+        segment: in row ``row`` of the scenes.
+        scenes: that were simulated, on the CPU.
+        rollouts: [B, K, ...] of them, on the CPU.
+        row: of the batch.
+        count: how many of the K; all by default.
+        title: of the picture; by default the segment's id.
+    """
+    # Past the segment's end there is only the padding of its batch.
+    steps = segment.num_steps - 1
+    state = rollouts.state[row, :count, 1 : steps + 1].transpose(1, 2).numpy()
+    counted, collision, offroad = (
+        part[row, :count, :steps].transpose(1, 2).numpy()
+        for part in (rollouts.counted, rollouts.collision, rollouts.offroad)
+    )
+    agents = torch.where(scenes.interactive_valid[row], scenes.interactive[row], -1).numpy()
+    return Clip(segment, state[..., :2], state[..., 2], agents, 1, counted, collision, offroad, title=title)
+
+
+def check_picture(path: Path) -> None:
+    """Raise ConfigError if a file is no picture or animation by its name."""
+    picture_path(path, (*FORMATS, *ANIMATIONS))
+
+
+def draw_clips(clips: Sequence[Clip], path: Path, columns: int | None = None) -> None:
+    """Draw, or animate, rollouts beside the log.
+
+    Args:
+        clips: of one segment each.
+        path: picture to write, an animation if it ends in .gif.
+        columns: of the picture.
+    """
+    if picture_path(path, (*FORMATS, *ANIMATIONS)).suffix[1:].lower() in ANIMATIONS:
+        animate_rollouts(clips, path)
+    else:
+        more: Mapping[str, Any] = {} if columns is None else {"columns": columns}
+        plot_grid([_panel(clip) for clip in clips], path, **more)
+
+
+def _panel(clip: Clip) -> Callable[[Any], Any]:
+    """What draws rollouts on axes."""
+    return lambda axes: plot_rollout(target=axes, **vars(clip))
+
+
+def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: EvaluateConfig) -> SearchTree:
+    """The first tree that the evaluator grows of a run segment, pruned branches included.
+
+    Args:
+        agent: with a discriminator.
+        dataset: of the segment.
+        item: its number there.
+        config: how it is simulated.
+
+    Raises:
+        ConfigError: if the agent has no discriminator to search by.
+    """
+    if agent.policy is None or agent.discriminator is None:
+        raise ConfigError(f"{agent.name} has no discriminator to search by: it was not trained with one")
+    agent.check_step(dataset.dt)
+    scene = dataset.scene(item).to(torch.device(config.device))
+    env = DrivingEnv(scene, agent.dynamics, agent.observation)
+    settings = config.pruning(agent.search)
+    start = start_states(
+        env,
+        agent.goals,
+        trees=1,
+        branches=config.branches or settings.test_branches,
+        seed=config.seed,
+        logged_goals=config.logged_goals,
+    )[:, 0]
+    with torch.no_grad():
+        result = search(
+            env,
+            agent.policy,
+            agent.discriminator,
+            start,
+            seed=config.seed,
+            rule=pruning_rule(settings),
+            prune_every=settings.prune_every,
+            aggregate=aggregate_of(settings),
+            keep_tree=True,
+        )
+    if result.tree is None:
+        raise RuntimeError("the search kept no tree")
+    state, collision, offroad = (
+        result.tree.get(("next", *key))[0].cpu().numpy() for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)
+    )
+    agents = torch.where(scene.interactive_valid, scene.interactive, -1)[0]
+    return SearchTree(
+        position=state[..., :2],
+        score=result.simulated_scores[0].cpu().numpy(),
+        parents=result.parents[0].cpu().numpy(),
+        reaches_leaf=result.reaches_leaf[0].cpu().numpy(),
+        prune_every=settings.prune_every,
+        agents=agents.cpu().numpy(),
+        collision=collision[..., 0],
+        offroad=offroad[..., 0],
+        routes=_routes(scene, start.get(keys.GOAL)[0, 0].tolist()) if agent.goals is not None else [],
+    )
+
+
+def _routes(scene: SceneBatch, goals: Sequence[int]) -> list[Any]:
+    """Points of the route of each agent; None where it follows none."""
+    return [
+        scene.route[0, n, route, : scene.route_count[0, n, route]].cpu().numpy() if route >= 0 else None
+        for n, route in enumerate(goals)
+    ]

@@ -1,0 +1,66 @@
+"""The smallest of each row: on the CPU by NumPy's vectorised selection, elsewhere by one ``topk``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import pad
+
+
+def on_host(tensor: Tensor) -> bool:
+    """Whether values may steer the computation: on the CPU, outside of ``torch.compile``.
+
+    There a step may look at a few numbers to leave out work; elsewhere that would wait for the device.
+    """
+    return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
+
+
+def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
+    """Places, in the flattened array, of the ``count`` smallest elements of each row [R, W], ascending.
+
+    Of equal elements the first ones are taken, so what else is in a row decides nothing. NaN comes last.
+    """
+    width = values.shape[1]
+    if width <= count:
+        return np.arange(values.size)
+    ordered = values.copy()
+    ordered.partition(count - 1, axis=-1)
+    cut = ordered[:, count - 1 : count]
+    chosen = values <= cut
+    number = np.count_nonzero(chosen, axis=1)
+    odd = np.flatnonzero(number != count)
+    if len(odd):
+        if np.isnan(cut[odd]).any():
+            order = np.argsort(values[odd], axis=-1, kind="stable")[:, :count]
+            chosen[odd] = False
+            chosen[odd[:, None], order] = True
+        else:
+            less, equal = values[odd] < cut[odd], values[odd] == cut[odd]
+            room = count - np.count_nonzero(less, axis=1)[:, None]
+            chosen[odd] = less | (equal & (equal.cumsum(1) <= room))
+    return np.flatnonzero(chosen)
+
+
+def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Tensor, Tensor]:
+    """Index [..., count] of the smallest elements and which of them are finite; the rest is padded with index 0.
+
+    On the CPU in ascending order of the index, ties going to the elements that come first.
+    """
+    width = squared.shape[-1]
+    available = min(count, width)
+    if width <= count:
+        index = torch.arange(width, device=squared.device).expand(squared.shape)
+    elif on_host(squared):
+        flat = squared.detach().reshape(-1, width).numpy()
+        index = torch.from_numpy(smallest(flat, count) % width).view(*squared.shape[:-1], count)
+    else:
+        index = squared.topk(available, dim=-1, largest=False, sorted=False).indices
+    found = squared.gather(-1, index).isfinite()
+    if available < count:
+        index, found = (pad(value, (0, count - available)) for value in (index, found))
+    return index, found

@@ -1,0 +1,99 @@
+"""Who goes first: pass and yield between agents whose paths merge or cross, in rollouts and in the log.
+
+Which pairs interact is for the caller to say (see :func:`symphony.data.context.relations`). Metres and seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+REACH = 1.5
+"""Metres within which two paths are at the same place, about half a lane."""
+_FINER = 4
+"""Parts of a step at which paths are looked at: at the log's rate a vehicle may jump over the place."""
+
+
+def passing_gap(
+    first: Float[Tensor, "*batch T 2"],
+    second: Float[Tensor, "*batch T 2"],
+    first_valid: Bool[Tensor, "*batch T"],
+    second_valid: Bool[Tensor, "*batch T"],
+    dt: float,
+    reach: float = REACH,
+) -> Float[Tensor, "*batch"]:
+    """Seconds by which the first of two agents is ahead of the second where their paths first meet.
+
+    Negative where the second passes first; NaN where the paths don't come within ``reach`` of each other. Of all
+    pairs of times at which the two are that close, the earliest counts, by the sum of the two.
+    """
+    paths = [_finer(first, first_valid), _finer(second, second_valid)]
+    (a, a_valid), (b, b_valid) = paths
+    near = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1) <= reach**2
+    near &= a_valid[..., :, None] & b_valid[..., None, :]
+    step = torch.arange(near.shape[-1], device=near.device)
+    ahead = step - step[:, None]
+    # One number for both: the sum of the times first, then how far they are apart.
+    key = (step[:, None] + step) * len(step) + ahead.abs()
+    never = torch.iinfo(key.dtype).max
+    key = torch.where(near, key, never)
+    least = key.amin((-2, -1))
+    # Either may have been there first by as much: then neither was.
+    tied = near & (key == least[..., None, None])
+    gap = (tied * ahead).sum((-2, -1)) / tied.sum((-2, -1)) * (dt / _FINER)
+    return torch.where(least < never, gap.to(first.dtype), torch.nan)
+
+
+def _finer(path: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """The path at parts of a step, straight in between, and where both neighbours are valid."""
+    steps = path.shape[-2]
+    where = torch.arange((steps - 1) * _FINER + 1, device=path.device)
+    before = torch.div(where, _FINER, rounding_mode="floor")
+    after = torch.div(where + _FINER - 1, _FINER, rounding_mode="floor")
+    share = (where % _FINER / _FINER).to(path.dtype)[:, None]
+    both = valid[..., before] & valid[..., after]
+    # Padding may hold anything.
+    clean = torch.where(valid[..., None], path, 0.0)
+    return clean[..., before, :] + share * (clean[..., after, :] - clean[..., before, :]), both
+
+
+@dataclass(frozen=True)
+class OrderStatistics:
+    """How rollouts keep the order in which K pairs of agents pass, NaN where there is nothing to count.
+
+    Attributes:
+        pairs: that meet in the log, one after the other.
+        kept: share of their rollouts in which the same one goes first.
+        reversed: share in which the other one does.
+        apart: share in which the paths don't meet, or both are there at once.
+        gap_error: mean absolute difference of the seconds between the two from the log's, where they meet.
+    """
+
+    pairs: int
+    kept: float
+    reversed: float
+    apart: float
+    gap_error: float
+
+
+def order_statistics(simulated: Float[Tensor, "R K"], log: Float[Tensor, " K"]) -> OrderStatistics:
+    """Compare who goes first.
+
+    Args:
+        simulated: :func:`passing_gap` of each rollout and pair.
+        log: that of each pair in the log.
+    """
+    known = ~log.isnan() & (log != 0)
+    simulated, log = simulated[:, known], log[known]
+    same = (simulated.sign() == log.sign()).float().mean().item()
+    other = (simulated.sign() == -log.sign()).float().mean().item()
+    return OrderStatistics(
+        pairs=int(known.sum()),
+        kept=same,
+        reversed=other,
+        apart=1 - same - other,
+        gap_error=(simulated - log).abs().nanmean().item(),
+    )

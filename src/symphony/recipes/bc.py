@@ -1,0 +1,40 @@
+"""Behavioural cloning: the row "BC" of the paper's tables (section II-B)."""
+
+from __future__ import annotations
+
+import torch
+from torch.optim import Adam
+
+from symphony.agents import Agent, observation_of, policy_network
+from symphony.config import TrainConfig
+from symphony.data.store import SegmentStore
+from symphony.envs import Bicycle
+from symphony.objectives import BCLoss
+from symphony.simulation import SceneDataset
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
+
+
+def bc(config: TrainConfig, processes: Processes) -> Trainer:
+    """Imitate the logged actions of every vehicle that moves or waits."""
+    torch.manual_seed(config.seed)
+    rng, device = torch.Generator(), processes.device
+    store, dynamics = SegmentStore(config.data), Bicycle()
+    data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
+
+    # Networks.
+    spec = config.spec("bicycle", data.dt)
+    policy = policy_network(spec)
+    agent = Agent(str(config.out), policy, spec).to(device)
+
+    # Losses and optimizers.
+    policy_loss = processes.share(BCLoss(policy))
+    optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+
+    # The order of updates.
+    def update(step: int) -> Updates:
+        items, sees = data.draw(config.segments, rng), observation_of(spec)
+        yield "policy", policy_loss(data.sample_states(items, config.states, sees, rng, device))
+
+    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes)

@@ -1,0 +1,42 @@
+"""Behavioural cloning with goals: the row "BC+H" of the paper's tables (sections III-B and IV-B)."""
+
+from __future__ import annotations
+
+import torch
+from torch.optim import Adam
+
+from symphony.agents import Agent, goal_network, observation_of, policy_network
+from symphony.config import TrainConfig
+from symphony.data.store import SegmentStore
+from symphony.envs import Bicycle
+from symphony.objectives import BCLoss, GoalLoss
+from symphony.simulation import SceneDataset
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
+
+
+def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
+    """Imitate the logged actions given the route that was taken, and learn which routes are taken."""
+    torch.manual_seed(config.seed)
+    rng, device = torch.Generator(), processes.device
+    store, dynamics = SegmentStore(config.data), Bicycle()
+    data = SceneDataset(store, config.agent.interactive, dynamics, routes=True, duration=config.duration)
+
+    # Networks.
+    spec = config.spec("bicycle", data.dt, goals=True)
+    policy, goals = policy_network(spec), goal_network(spec)
+    agent = Agent(str(config.out), policy, spec, goals).to(device)
+
+    # Losses and optimizers.
+    policy_loss = processes.share(BCLoss(policy))
+    goal_loss = processes.share(GoalLoss(goals))
+    optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+
+    # The order of updates.
+    def update(step: int) -> Updates:
+        items, sees = data.draw(config.segments, rng), observation_of(spec)
+        yield "policy", policy_loss(data.sample_states(items, config.states, sees, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, config.goals, sees, rng, device))
+
+    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes)

@@ -1,0 +1,82 @@
+"""Adversarial imitation through the model: the row "MGAIL" of the paper's tables (section II-C)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torch.optim import Adam
+
+from symphony.agents import Agent, discriminator_network, observation_of, policy_network
+from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
+from symphony.config import TrainConfig
+from symphony.data.store import SegmentStore
+from symphony.envs import Displacement, DrivingEnv
+from symphony.modules import SeededNoise
+from symphony.objectives import BCLoss, DiscriminatorLoss, MGAILLoss
+from symphony.simulation import SceneDataset, SearchReplay
+from symphony.simulation.search import branched_streams, collector_settings, realism_score
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
+
+
+def mgail(config: TrainConfig, processes: Processes) -> Trainer:
+    """Regress to the log first, then follow the gradient of the discriminator through the simulation."""
+    torch.manual_seed(config.seed)
+    seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
+    store, dynamics = SegmentStore(config.data), Displacement()
+    data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
+
+    # Networks.
+    spec = config.spec("displacement", data.dt, judged=True)
+    policy, discriminator = policy_network(spec), discriminator_network(spec)
+    agent = Agent(str(config.out), policy, spec, discriminator=discriminator).to(device)
+
+    # Environment and collector: nothing is pruned, a search that keeps all.
+    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
+    collector = BeamSearchCollector(
+        with_rows(env, [min(config.search.segments, len(data))]),
+        TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
+        score=realism_score(env, discriminator),
+        rule=KeepAll(),
+        prepare=branched_streams,
+        **collector_settings(config.search, seed, data.decisions),
+    )
+    replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
+
+    # Losses and optimizers.
+    regression_loss = processes.share(BCLoss(policy))
+    mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
+    optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+
+    # The order of updates, in three phases.
+    def regression(step: int) -> Updates:
+        items = data.draw(config.segments, rng)
+        yield "policy", regression_loss(data.sample_states(items, config.states, sees, rng, device))
+
+    def discriminate(step: int) -> Updates:
+        yield "search", replay.refresh(step)
+        for _ in range(config.mgail.discriminator_updates):
+            yield "discriminator", realism_loss(replay.both_kinds(rng))
+
+    def head_start(step: int) -> Updates:
+        data.draw(config.segments, rng)
+        yield from discriminate(step)
+
+    def adversarial(step: int) -> Updates:
+        items = data.draw(config.segments, rng)
+        yield from discriminate(step)
+        losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
+        if config.mgail.expert_weight:
+            experts = data.sample_states(items, config.states, sees, rng, device)
+            losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
+        yield "policy", losses
+
+    sees, begin = observation_of(spec, judged=False), config.mgail.regression
+    slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
+    phases = [
+        Phase(begin, regression, cosine(rates, begin)),
+        Phase(begin + config.mgail.head_start, head_start, slower),
+        Phase(config.steps, adversarial, slower),
+    ]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)

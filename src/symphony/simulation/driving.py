@@ -1,0 +1,169 @@
+"""What an agent does on a batch of scenes, as it was trained or as a configuration says."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+
+from symphony import keys
+from symphony.agents import Agent
+from symphony.collectors import BeamSearchResult, KeepAll
+from symphony.config import EvaluateConfig
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.scene import SceneBatch
+from symphony.errors import ConfigError
+from symphony.metrics import collisions, offroad
+from symphony.modules import SeededNoise
+from symphony.simulation.demonstrations import logged
+from symphony.simulation.finite import FiniteWatch
+from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
+from symphony.simulation.search import aggregate_of, pruning_rule, search
+
+
+class Simulation(NamedTuple):
+    """What came of a simulation.
+
+    Attributes:
+        rollouts: [B, K, ...].
+        goal: [B, K, N] number of the route that each agent followed, -1 for none.
+        search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
+    """
+
+    rollouts: Rollouts
+    goal: Tensor
+    search: BeamSearchResult | None
+
+
+def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
+    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
+
+    Raises:
+        ConfigError, NotFiniteError: as :func:`simulation`.
+    """
+    return simulation(agent, scenes, config).rollouts
+
+
+def simulation(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, *, keep_tree: bool = False
+) -> Simulation:
+    """K rollouts of every scene, and how they came about.
+
+    Args:
+        agent: that drives.
+        scenes: B scenes.
+        config: how.
+        keep_tree: of a search keep the pruned branches, too.
+
+    Raises:
+        ConfigError: if the search needs a discriminator and the agent has none, or the agent learned another time
+            step.
+        NotFiniteError: if one of its networks puts out a number that is not finite.
+    """
+    if agent.policy is None:
+        raise ValueError("log playback has nothing to simulate")
+    agent.check_step(float(scenes.dt[0]))
+    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
+    trees, branches, taken = _plan(agent, config)
+    watch = FiniteWatch(env)
+    goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
+    actor = watch.watched(agent.policy, [keys.LOGITS, keys.ACTION], "policy")
+    start = start_states(
+        env,
+        goals,
+        trees=trees,
+        branches=branches,
+        seed=config.seed,
+        logged_goals=config.logged_goals,
+    )
+    result = None
+    if search_kind(agent, config) == "none":
+        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor)
+        found = simulate(env, policy, start)
+    else:
+        best = config.search == "best"
+        settings = config.pruning(agent.search)
+        judge = None
+        if config.search != "oracle" and agent.discriminator is not None:
+            judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator")
+        with torch.no_grad():
+            result = search(
+                env,
+                actor,
+                judge,
+                start,
+                seed=config.seed,
+                rule=KeepAll() if best else pruning_rule(settings),
+                prune_every=settings.prune_every,
+                aggregate=aggregate_of(settings),
+                leaves=None if best else taken,
+                retries=0 if best else config.retries,
+                retry_above=config.retry_above,
+                keep_tree=keep_tree and not best,
+            )
+        found = rollouts_of(env, start, result.trajectories)
+        if best:
+            order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            found, result = Rollouts(*(_branches(part, order) for part in found)), None
+    watch.check()
+    goal = start.get(keys.GOAL)[:, :, :taken].flatten(1, 2)
+    return Simulation(Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found)), goal, result)
+
+
+def search_kind(agent: Agent, config: EvaluateConfig) -> str:
+    """How the rollouts come about: ``none``, ``tree``, ``oracle`` or ``best``; ``log`` for playback."""
+    if agent.policy is None:
+        return "log"
+    if config.search == "agent":
+        return "tree" if agent.searches and agent.discriminator is not None else "none"
+    if config.search in ("tree", "best") and agent.discriminator is None:
+        raise ConfigError(
+            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none"
+        )
+    return config.search
+
+
+def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
+    """Trees per segment, branches per tree, and rollouts taken from each tree."""
+    kind = search_kind(agent, config)
+    if kind == "none":
+        return config.rollouts, 1, 1
+    branches = config.branches or agent.search.test_branches
+    if kind == "best":
+        return config.rollouts, branches, 1
+    taken = config.rollouts // config.trees
+    if taken > branches:
+        raise ConfigError(
+            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
+        )
+    return config.trees, branches, taken
+
+
+def _branches(part: Tensor, order: Tensor) -> Tensor:
+    """part [B, trees, S, ...] at the branches order [B, trees, K]."""
+    index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
+    return part.gather(2, index)
+
+
+def driven_by(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
+    """What an agent does [B, K, ...]: :func:`playback` of the log, or :func:`simulated`."""
+    return playback(scenes) if agent.policy is None else simulated(agent, scenes, config)
+
+
+def playback(scenes: SceneBatch) -> Rollouts:
+    """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
+    log, valid = logged(scenes)
+    position, heading = scenes.log_state[..., :2].transpose(1, 2), scenes.log_state[..., 2].transpose(1, 2)
+    everyone = scenes.log_valid.transpose(1, 2)
+    hit = collisions(position, heading, scenes.box_size, everyone, scenes.interactive).transpose(1, 2) & valid
+    edges = (
+        scenes.edge_start,
+        scenes.edge_end,
+        scenes.edge_valid,
+        scenes.edge_previous,
+        scenes.edge_following,
+    )
+    off = offroad(log[..., :2], *edges) & valid
+    return Rollouts(log[:, None], hit[:, None, 1:], off[:, None, 1:], valid[:, None, 1:])

@@ -1,0 +1,188 @@
+"""Logged vehicles as demonstrations: the actions that lead through what they did, fitted many segments at a time."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from symphony.data.segment import AgentType, RunSegment
+from symphony.data.selection import MOVING, travel
+from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.routes import RouteTable, route_table
+from symphony.geometry.frames import forward_speed
+from symphony.roadgraph import LaneGraph, lane_of
+
+IN_LANE = 1.0
+"""Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
+
+TOGETHER = 256
+"""Vehicles fitted at a time: more save no more calls worth saving, and their temporaries leave the cache."""
+
+
+@dataclass(frozen=True)
+class Experts:
+    """Logged vehicles of one segment as demonstrations, after the fit to the action space.
+
+    Attributes:
+        agent: [K] rows of the segment's agents.
+        states: [K, T, 4] fitted x, y, heading, speed.
+        actions: [K, T - 1] int16 or [K, T - 1, 2].
+        valid: [K, T - 1] where the log is valid before and after the action.
+        error: [K] metres between the last valid fitted and logged position.
+        routes: feasible routes of each expert from its first valid state; empty where not asked for.
+    """
+
+    agent: Tensor
+    states: Tensor
+    actions: Tensor
+    valid: Tensor
+    error: Tensor
+    routes: tuple[RouteTable, ...] = ()
+
+
+def experts(
+    segment: RunSegment,
+    dynamics: Bicycle | Displacement,
+    graph: LaneGraph | None = None,
+    *,
+    routes: bool = False,
+) -> Experts:
+    """The demonstrations of one segment; see :func:`fit_experts`."""
+    return fit_experts([segment], dynamics, None if graph is None else [graph], routes=routes)[0]
+
+
+def fit_experts(
+    segments: Sequence[RunSegment],
+    dynamics: Bicycle | Displacement,
+    graphs: Sequence[LaneGraph] | None = None,
+    *,
+    routes: bool = False,
+) -> list[Experts]:
+    """Fit every vehicle of some segments that moves or stands in a lane (waiting is driving, parking is not), and the
+    ego in any case.
+
+    Vehicles are fitted independently of one another: whatever is fitted together, the result is the same.
+
+    Args:
+        segments: the run segments.
+        dynamics: the action space.
+        graphs: of their lanes, made here if not given.
+        routes: whether to find the experts' routes.
+    """
+    graphs = [LaneGraph(segment.road) for segment in segments] if graphs is None else graphs
+    rows = [_demonstrators(segment, graph) for segment, graph in zip(segments, graphs, strict=True)]
+    fits = _fit(segments, rows, dynamics)
+    found = []
+    for segment, graph, chosen, (actions, states) in zip(segments, graphs, rows, fits, strict=True):
+        mask = torch.from_numpy(segment.valid[chosen])
+        last = mask.shape[1] - 1 - mask.flip(1).int().argmax(1)
+        which = torch.arange(len(chosen))
+        away = states[which, last, :2] - torch.from_numpy(segment.position[chosen, last.numpy(), :2])
+        tables = tuple(route_table(segment, graph, int(row)) for row in chosen) if routes else ()
+        known = mask[:, 1:] & mask[:, :-1]
+        found.append(Experts(torch.from_numpy(chosen), states, actions, known, away.norm(dim=-1), tables))
+    return found
+
+
+def _demonstrators(segment: RunSegment, graph: LaneGraph) -> NDArray[np.int64]:
+    """Rows of the agents to learn from."""
+    valid = segment.valid
+    everyone, first = np.arange(segment.num_agents), valid.argmax(1)
+    lane = lane_of(
+        graph,
+        segment.position[everyone, first, :2],
+        segment.heading[everyone, first],
+        tolerance=IN_LANE,
+    )
+    chosen = (segment.agent_type == AgentType.VEHICLE) & ((travel(segment) > MOVING) | (lane >= 0))
+    chosen[segment.ego] = True
+    chosen &= (valid[:, 1:] & valid[:, :-1]).any(1)
+    return np.flatnonzero(chosen)
+
+
+def _fit(
+    segments: Sequence[RunSegment], rows: Sequence[NDArray[np.int64]], dynamics: Bicycle | Displacement
+) -> list[tuple[Tensor, Tensor]]:
+    """Actions [K, T - 1(, 2)], joint indices as int16, and states [K, T, 4] of the rows of each segment."""
+    found: dict[int, tuple[Tensor, Tensor]] = {}
+    for dt in dict.fromkeys(segment.dt for segment in segments):
+        group: list[int] = []
+        waiting = [k for k, segment in enumerate(segments) if segment.dt == dt]
+        for place, k in enumerate(waiting):
+            group.append(k)
+            if place == len(waiting) - 1 or sum(len(rows[g]) for g in group) >= TOGETHER:
+                found.update(_fit_together(segments, rows, group, dynamics))
+                group = []
+    return [found[k] for k in range(len(segments))]
+
+
+def _fit_together(
+    segments: Sequence[RunSegment],
+    rows: Sequence[NDArray[np.int64]],
+    group: Sequence[int],
+    dynamics: Bicycle | Displacement,
+) -> dict[int, tuple[Tensor, Tensor]]:
+    """The same by segment for a group of one time step."""
+    steps = max(segments[k].num_steps for k in group)
+
+    def joined(name: str) -> Tensor:
+        parts = [getattr(segments[k], name)[rows[k]] for k in group]
+        # Shorter segments are padded with steps that are not valid, which come after theirs and change nothing.
+        late = [[(0, 0), (0, steps - part.shape[1])] + [(0, 0)] * (part.ndim - 2) for part in parts]
+        return torch.from_numpy(
+            np.concatenate([np.pad(part, width) for part, width in zip(parts, late, strict=True)])
+        )
+
+    position, heading, velocity, valid = map(joined, ("position", "heading", "velocity", "valid"))
+    size = torch.from_numpy(np.concatenate([segments[k].size[rows[k], :2] for k in group]))
+    # An agent that appears later is fitted from its first valid state; its rows before that are masked.
+    actions, states = dynamics.fit(
+        position[..., :2],
+        heading,
+        forward_speed(velocity[..., :2], heading),
+        valid,
+        size,
+        segments[group[0]].dt,
+    )
+    actions = actions.to(torch.int16) if dynamics.discrete else actions
+    counts, found = [len(rows[k]) for k in group], {}
+    for k, action, state in zip(group, actions.split(counts), states.split(counts), strict=True):
+        length = segments[k].num_steps
+        # Copies, so that a segment kept in memory doesn't keep the whole group.
+        found[k] = action[:, : length - 1].clone(), state[:, :length].clone()
+    return found
+
+
+class ExpertCache:
+    """The demonstrations of items, made when first asked for, several at a time; those used longest ago go first.
+
+    Args:
+        make: the demonstrations of some items.
+        keep: items held in memory.
+    """
+
+    def __init__(self, make: Callable[[Sequence[int]], list[Experts]], keep: int) -> None:
+        self.make, self.keep = make, keep
+        self._kept: OrderedDict[int, Experts] = OrderedDict()
+
+    def __call__(self, item: int) -> Experts:
+        """Those of one item."""
+        return self.many([item])[0]
+
+    def many(self, items: Sequence[int]) -> list[Experts]:
+        """Those of several items, in their order."""
+        missing = [item for item in dict.fromkeys(items) if item not in self._kept]
+        made = dict(zip(missing, self.make(missing), strict=True)) if missing else {}
+        found = [made[item] if item in made else self._kept[item] for item in items]
+        self._kept.update(made)
+        for item in items:
+            self._kept.move_to_end(item)
+        while len(self._kept) > self.keep:
+            self._kept.popitem(last=False)
+        return found

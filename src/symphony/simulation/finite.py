@@ -1,0 +1,101 @@
+"""Numbers that are not finite end a simulation: comparisons with NaN would choose in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from symphony import keys
+from symphony.envs.driving import DrivingEnv
+from symphony.errors import SymphonyError
+
+_NEVER = 1 << 30
+
+
+class NotFiniteError(SymphonyError):
+    """A network put out a number that is not finite.
+
+    Attributes:
+        row: of the scene, in its batch.
+    """
+
+    def __init__(self, what: str, row: int, step: int, name: str = "") -> None:
+        where = f"segment {name}: " if name else ""
+        super().__init__(f"{where}the {what} put out a number that is not finite at step {step}")
+        self.what, self.row, self.step = what, row, step
+
+    def named(self, segment: str) -> NotFiniteError:
+        """The same error, with the segment's name."""
+        return NotFiniteError(self.what, self.row, self.step, segment)
+
+
+class FiniteWatch:
+    """Remembers in which scenes, and when first, what networks put out was not finite; looked at once, at the end,
+    so that no step waits for the device.
+
+    Args:
+        env: of the simulation.
+    """
+
+    def __init__(self, env: DrivingEnv) -> None:
+        self.env = env
+        self._first: dict[str, Tensor] = {}
+
+    def watched(self, module: TensorDictModuleBase, out_keys: Sequence[keys.Key], what: str) -> Watched:
+        """A module whose output is watched.
+
+        Args:
+            module: reads and writes TensorDicts of the environment.
+            out_keys: floating-point entries [*b, N, ...] that must be finite for valid agents; absent ones are not
+                looked at.
+            what: its name in the error.
+        """
+        return Watched(module, out_keys, lambda tensordict, value: self._see(tensordict, value, what))
+
+    def check(self) -> None:
+        """Raise NotFiniteError for the first scene in which something was not finite."""
+        for what, first in self._first.items():
+            bad = (first < _NEVER).nonzero()
+            if len(bad):
+                row = int(bad[0])
+                raise NotFiniteError(what, row, int(first[row]))
+
+    def _see(self, tensordict: TensorDictBase, value: Tensor, what: str) -> None:
+        valid = tensordict.get(keys.VALID)
+        finite = value.isfinite()
+        finite = finite.flatten(valid.ndim).all(-1) if finite.ndim > valid.ndim else finite
+        bad = (valid & ~finite).any(-1)
+        step = torch.where(bad, tensordict.get(keys.STEP).squeeze(-1), _NEVER)
+        first = self._first.get(what)
+        if first is None:
+            first = torch.full((len(self.env.scenes),), _NEVER, dtype=step.dtype, device=step.device)
+        scene = tensordict.get(keys.SCENE).squeeze(-1)
+        # Branches of a scene share its row: the earliest of them counts.
+        self._first[what] = first.scatter_reduce(0, scene.flatten(), step.flatten(), "amin")
+
+
+class Watched(TensorDictModuleBase):
+    """A module that shows somebody what it writes."""
+
+    def __init__(
+        self,
+        module: TensorDictModuleBase,
+        out_keys: Sequence[keys.Key],
+        see: Callable[[TensorDictBase, Tensor], None],
+    ) -> None:
+        super().__init__()
+        self.module, self.shown, self.see = module, out_keys, see
+        self.in_keys, self.out_keys = module.in_keys, module.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Call the module."""
+        out = self.module(tensordict)
+        for key in self.shown:
+            value = out.get(key, None)
+            if value is not None and value.is_floating_point():
+                self.see(out, value)
+        return out

@@ -1,0 +1,193 @@
+"""The beam search on the driving environment (paper, section IV-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+
+from symphony import keys
+from symphony.collectors import (
+    BeamSearchResult,
+    KeepBest,
+    KeyScore,
+    PruningRule,
+    Systematic,
+    beam_search,
+    max_then_sum,
+    mean_then_sum,
+)
+from symphony.config import SearchConfig
+from symphony.envs.driving import DrivingEnv
+from symphony.imports import build_object, load_object
+from symphony.modules import SeededNoise
+from symphony.simulation.rollouts import decisions_of
+from symphony.streams import fold_in, uniform
+
+ENDED = -100.0
+"""Score past a scene's last logged step, below all others: it decides no maximum, and in a mean or sum it weighs
+equally on all branches.
+"""
+_PRUNING = (1 << 40) + 1
+_RETRIES = (1 << 40) + 2
+"""Numbers of the streams that prunings and repeats draw from, far above those of rollouts and agents."""
+OUTCOME: Sequence[keys.Key] = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
+KEPT: Sequence[keys.Key] = [
+    keys.SCENE,
+    keys.STEP,
+    keys.STREAM,
+    keys.VALID,
+    keys.GOAL,
+    keys.STATE,
+    keys.ACTION,
+    keys.NOISE,
+    *OUTCOME,
+]
+"""What is kept of every step of a search: enough to observe its states anew."""
+AGGREGATES = {"max_then_sum": max_then_sum, "mean_then_sum": mean_then_sum}
+
+
+def pruning_rule(config: SearchConfig) -> PruningRule:
+    """Which branches go on."""
+    if ":" in config.rule:
+        return build_object(config.rule)
+    rules: dict[str, Callable[[], PruningRule]] = {
+        "best": lambda: KeepBest(config.keep),
+        "systematic": lambda: Systematic(config.temperature),
+    }
+    return rules[config.rule]()
+
+
+def aggregate_of(config: SearchConfig) -> Callable[[Tensor], Tensor]:
+    """From scores of steps and agents to one per branch."""
+    return load_object(config.aggregate) if ":" in config.aggregate else AGGREGATES[config.aggregate]
+
+
+def flag_score(state: TensorDictBase) -> Tensor:
+    """Score [..., N] of an oracle: 1 where an agent collides or is off the road."""
+    bad = state.get(keys.COLLISION) | state.get(keys.OFFROAD)
+    return (bad.squeeze(-1) & state.get(keys.VALID)).float()
+
+
+def realism_score(
+    env: DrivingEnv, discriminator: TensorDictModuleBase | None
+) -> Callable[[TensorDictBase], Tensor]:
+    """Scores [..., N] of states up to their scene's last logged step, :data:`ENDED` beyond.
+
+    Args:
+        env: whose states are scored.
+        discriminator: writes them; None takes the true collision and off-road flags (an oracle).
+    """
+    score: Callable[[TensorDictBase], Tensor] = flag_score
+    if discriminator is not None:
+        score = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID)
+
+    def until_the_end(state: TensorDictBase) -> Tensor:
+        going = state.get(keys.STEP) <= env.scenes.last_step[state.get(keys.SCENE)]
+        return torch.where(going, score(state), ENDED)
+
+    return until_the_end
+
+
+def branched_streams(start: TensorDictBase) -> TensorDictBase:
+    """A start state [*b, S] whose branches each have a stream of random numbers of their own."""
+    slot = torch.arange(start.shape[-1], device=start.device)[:, None]
+    return start.set(keys.STREAM, fold_in(start.get(keys.STREAM), slot))
+
+
+def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
+    """Numbers [*b, P] for the rule from a start state [*b, S]: the tree's, which are those of its first branch, told
+    apart from its actions'.
+    """
+
+    def noise(start: TensorDictBase, periods: int) -> Tensor:
+        root = start.get(keys.STREAM)[..., 0, :]
+        return uniform(seed, fold_in(root, _PRUNING), torch.arange(periods, device=start.device))
+
+    return noise
+
+
+def collector_settings(config: SearchConfig, seed: int, decisions: int) -> dict[str, Any]:
+    """What a collector of driving needs beside environment, policy and scores: whole trees, random numbers that
+    depend on nothing but seed, segment, branch and step.
+
+    Args:
+        config: of the search.
+        seed: of the pruning.
+        decisions: T, actions until the end of the longest segment.
+    """
+    return {
+        "branches": config.branches,
+        "leaves": config.branches,
+        "keep_tree": True,
+        "prune_every": config.prune_every,
+        "aggregate": aggregate_of(config),
+        "rule_noise": pruning_noise(seed),
+        # A copy takes the random numbers of the place it lands in, so that forks part.
+        "slot_keys": (keys.STREAM,),
+        "keep": KEPT,
+        "frames_per_batch": config.segments * config.branches * decisions,
+        "total_frames": -1,
+    }
+
+
+def search(
+    env: DrivingEnv,
+    policy: TensorDictModuleBase,
+    discriminator: TensorDictModuleBase | None,
+    start: TensorDictBase,
+    *,
+    seed: int,
+    rule: PruningRule,
+    prune_every: int,
+    aggregate: Callable[[Tensor], Tensor] = max_then_sum,
+    leaves: int | None = None,
+    keep_tree: bool = False,
+    retries: int = 0,
+    retry_above: float = 0.0,
+) -> BeamSearchResult:
+    """Beam search from a start state [..., S] to the last logged step.
+
+    Args:
+        env: the environment.
+        policy: writes the action.
+        discriminator: scores the states; None takes the true collision and off-road flags (an oracle).
+        start: all branches of a tree.
+        seed: of the actions.
+        rule: which branches go on.
+        prune_every: T_p.
+        aggregate: from scores of steps and agents to one per branch.
+        leaves: return only so many of each tree, the best of the last period; by default all.
+        keep_tree: also return the pruned branches.
+        retries: how often a period is simulated again, from its start, for branches that end it with a total above
+            ``retry_above``.
+        retry_above: that total.
+    """
+    steps = decisions_of(env, start)
+    return beam_search(
+        env,
+        TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
+        realism_score(env, discriminator),
+        start,
+        steps=steps,
+        prune_every=prune_every,
+        rule=rule,
+        aggregate=aggregate,
+        noise=pruning_noise(seed)(start, -(-steps // prune_every)),
+        leaves=leaves,
+        # A copy takes the random numbers of the place it lands in, so that forks part.
+        slot_keys=(keys.STREAM,),
+        keep=KEPT,
+        keep_tree=keep_tree,
+        retries=retries,
+        retry_above=retry_above if retries else None,
+        reseed=_reseed,
+    )
+
+
+def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:
+    return state.set(keys.STREAM, fold_in(state.get(keys.STREAM), _RETRIES + attempt))

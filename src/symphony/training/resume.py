@@ -1,0 +1,56 @@
+"""Where a run begins: at its last checkpoint, at another run's networks, or anew."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from symphony.agents.agent import Agent
+from symphony.agents.checkpoint import latest, load_checkpoint, parts_of
+from symphony.agents.choice import choose, split_name
+from symphony.config import RunConfig, read_json
+from symphony.errors import ConfigError
+
+FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every")
+"""Settings that may be others when a run goes on."""
+
+
+def checkpoint_to_resume(config: RunConfig) -> Path | None:
+    """The checkpoint to go on from; None for a new run.
+
+    Raises:
+        ConfigError: if the folder holds a run that is not to be gone on with, or another one.
+    """
+    path = config.out / "config.json"
+    if path.exists():
+        if not config.resume:
+            raise ConfigError(f"{config.out} holds a run already; choose another folder or --resume")
+        before = read_json(type(config), path)
+        # More updates, another machine or fewer records do not make it another run.
+        free = {name: getattr(config, name) for name in FREE}
+        # Scores on other segments could not be compared with those so far.
+        free["validation"] = config.validation
+        if before.validation.data is not None:
+            free["validation"] = dataclasses.replace(
+                before.validation, data=config.validation.data, every=config.validation.every
+            )
+        before = dataclasses.replace(before, **free)
+        changed = [
+            f.name for f in dataclasses.fields(config) if getattr(before, f.name) != getattr(config, f.name)
+        ]
+        if changed:
+            raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
+    return latest(config.out / "checkpoints")
+
+
+def warm_start(agent: Agent, run: Path) -> None:
+    """Take over the networks that another run has too.
+
+    Raises:
+        ConfigError: if there is no such run.
+        CheckpointError: if its networks have other shapes.
+    """
+    source = choose(*split_name(str(run)))
+    there = parts_of(source)
+    shared = {name: module for name, module in agent.modules.items() if name in there}
+    load_checkpoint(source, modules=shared, partial=True, restore_rng=False)

@@ -1,0 +1,265 @@
+"""Changes to files that keep their structure, so that they get past the first check; all drawn from one generator."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Rng = np.random.Generator
+
+NUMBERS: tuple[Any, ...] = (
+    *(0, 1, -1, 2, 3, 7, 100, 4_999, 5_001, 9_999, 36_000, 10**6, 9.9e7, 2**31 - 1, 2**31, 2**53, 2**62),
+    *(
+        2**63 - 1,
+        2**63,
+        -(2**63),
+        2**64,
+        10**30,
+        0.5,
+        1e-6,
+        1e-300,
+        5e-324,
+        1e4,
+        2.1e4,
+        1e8,
+        1e30,
+        3e38,
+        1e300,
+    ),
+    *(float("inf"), float("-inf"), float("nan")),
+)
+TEXTS = (
+    "",
+    " ",
+    "nan",
+    "-1",
+    "1e999",
+    "0x10",
+    "\x1b[2J",
+    "\u202e",
+    "a/b",
+    "x" * 300,
+    "٣",
+    "true",
+    "null",
+    "AV",
+)
+SMALL = 1 << 20
+"""Bytes that a changed file may have at most: what is asked for is that small files stay harmless."""
+
+
+def pick(rng: Rng, options: Any) -> Any:
+    """One of the options."""
+    return options[int(rng.integers(len(options)))]
+
+
+def number(rng: Rng) -> Any:
+    """A number of the sort that breaks things, or of any size."""
+    return pick(rng, NUMBERS) if rng.random() < 0.8 else float(rng.normal() * 10.0 ** rng.integers(-8, 12))
+
+
+def bytes_(rng: Rng, data: bytes) -> bytes:
+    """A few bits flipped, bytes set, stretches taken out, repeated or filled, or the end cut off."""
+    changed = bytearray(data)
+    for _ in range(int(rng.integers(1, 4))):
+        if not changed:
+            break
+        at, size = int(rng.integers(len(changed))), int(rng.integers(1, 65))
+        way = int(rng.integers(7))
+        if way == 0:
+            changed[at] ^= 1 << int(rng.integers(8))
+        elif way == 1:
+            changed[at] = pick(rng, (0, 1, 0x7F, 0x80, 0xFF))
+        elif way == 2:
+            del changed[at : at + size]
+        elif way == 3:
+            changed[at:at] = changed[at : at + size] * int(rng.integers(1, 9))
+        elif way == 4:
+            changed[at : at + size] = bytes([pick(rng, (0, 0xFF))]) * size
+        elif way == 5:
+            del changed[at:]
+        else:
+            kind = pick(rng, ("<f4", "<f8", "<i4", "<i8"))
+            with np.errstate(all="ignore"):
+                value = np.float64(pick(rng, NUMBERS))
+                raw = (
+                    (np.float64(0) if "i" in kind and not np.isfinite(value) else value)
+                    .astype(kind)
+                    .tobytes()
+                )
+            at -= at % len(raw)
+            changed[at : at + len(raw)] = raw
+    return bytes(changed[:SMALL])
+
+
+def tree(rng: Rng, value: Any, times: int | None = None) -> Any:
+    """Nested lists and tables with some places changed: another value, gone, repeated, or as deep as it goes."""
+    for _ in range(int(rng.integers(1, 4)) if times is None else times):
+        value = _change(rng, value, 0)
+    return value
+
+
+def _change(rng: Rng, value: Any, depth: int) -> Any:
+    inside = isinstance(value, dict | list) and len(value) > 0
+    if inside and rng.random() < 0.9:
+        keys = list(value) if isinstance(value, dict) else range(len(value))
+        key = pick(rng, keys)
+        copy = dict(value) if isinstance(value, dict) else list(value)
+        way = rng.random()
+        if way < 0.05:
+            del copy[key]
+        elif way < 0.10 and isinstance(copy, list):
+            copy[key:key] = [copy[key]] * int(rng.integers(1, 50))
+        elif way < 0.10:
+            copy[pick(rng, (*TEXTS, "0", str(key) + "0"))] = copy[key]
+        elif way < 0.13:
+            other = pick(rng, list(keys))
+            copy[key], copy[other] = copy[other], copy[key]
+        else:
+            copy[key] = _change(rng, copy[key], depth + 1)
+        return copy
+    return leaf(rng, value)
+
+
+def leaf(rng: Rng, value: Any) -> Any:
+    """Another value, of the same kind more often than not."""
+    if isinstance(value, bool) and rng.random() < 0.5:
+        return not value
+    if isinstance(value, int | float) and rng.random() < 0.8:
+        return number(rng) if rng.random() < 0.7 else value * pick(rng, (-1, 1e3, 1e-3, 1 + 1e-7))
+    if isinstance(value, str) and rng.random() < 0.7:
+        return pick(rng, TEXTS)
+    others: tuple[Callable[[], Any], ...] = (
+        lambda: None,
+        lambda: number(rng),
+        lambda: pick(rng, TEXTS),
+        lambda: [],
+        lambda: {},
+        lambda: [value] * 3,
+        lambda: {"a": value},
+        lambda: True,
+    )
+    return pick(rng, others)()
+
+
+def json_(rng: Rng, data: bytes) -> bytes:
+    """JSON with some of its places changed; at times with the deepest nesting, or as bytes."""
+    way = rng.random()
+    if way < 0.1:
+        return bytes_(rng, data)
+    if way < 0.11:
+        return b"[" * 100_000 + b"]" * 100_000
+    return json.dumps(tree(rng, json.loads(data))).encode("utf-8", "surrogatepass")[: 4 * SMALL]
+
+
+def xml(rng: Rng, data: bytes) -> bytes:
+    """XML with some elements changed, gone, repeated or moved; at times as bytes."""
+    if rng.random() < 0.1:
+        return bytes_(rng, data)
+    root = ET.fromstring(data)  # noqa: S314 - made here
+    for _ in range(int(rng.integers(1, 5))):
+        parents = {child: parent for parent in root.iter() for child in parent}
+        if not parents:
+            break
+        node = pick(rng, list(parents))
+        parent, way = parents[node], int(rng.integers(8))
+        if way == 0:
+            parent.remove(node)
+        elif way == 1:
+            parent.extend([node] * int(rng.integers(1, 30)))
+        elif way == 2:
+            parents[pick(rng, list(parents))].append(node)
+            if _loops(root):
+                return ET.tostring(ET.fromstring(data))  # noqa: S314
+        elif way == 3 and node.attrib:
+            node.attrib[pick(rng, list(node.attrib))] = _text(rng)
+        elif way == 4:
+            node.tag = pick(rng, [other.tag for other in parents])
+        else:
+            leaves = [each for each in node.iter() if len(each) == 0]
+            pick(rng, leaves).text = _text(rng)
+    return ET.tostring(root)[: 4 * SMALL]
+
+
+def _loops(root: ET.Element) -> bool:
+    """Whether an element has become its own descendant."""
+    stack: list[tuple[ET.Element, frozenset[int]]] = [(root, frozenset())]
+    while stack:
+        node, above = stack.pop()
+        if id(node) in above:
+            return True
+        stack += [(child, above | {id(node)}) for child in node]
+    return False
+
+
+def _text(rng: Rng) -> str:
+    text = str(number(rng)) if rng.random() < 0.8 else str(pick(rng, TEXTS))
+    return "".join(letter for letter in text if letter >= " ")
+
+
+def message(rng: Rng, record: Any) -> None:
+    """A protobuf message with some fields changed, cleared or repeated, in place."""
+    for _ in range(int(rng.integers(1, 5))):
+        _change_message(rng, record)
+
+
+def _change_message(rng: Rng, record: Any) -> None:
+    present = [field for field, _ in record.ListFields()]
+    fields = present if present and rng.random() < 0.85 else list(record.DESCRIPTOR.fields)
+    field = pick(rng, fields)
+    value = getattr(record, field.name)
+    repeated = hasattr(value, "__len__") and not isinstance(value, str | bytes)
+    if field.message_type is None:
+        if not repeated:
+            _set(rng, record, field)
+        elif len(value) and rng.random() < 0.6:
+            _try(lambda: value.__setitem__(int(rng.integers(len(value))), _scalar(rng, field)))
+        elif len(value) and rng.random() < 0.5:
+            del value[int(rng.integers(len(value))) :]
+        else:
+            _try(lambda: value.extend([_scalar(rng, field)] * int(rng.integers(1, 300))))
+    elif repeated:
+        way = rng.random()
+        if len(value) and way < 0.75:
+            _change_message(rng, pick(rng, value))
+        elif len(value) and way < 0.85:
+            del value[int(rng.integers(len(value)))]
+        elif len(value):
+            copies = [pick(rng, value)] * int(rng.integers(1, 100))
+            value.extend(copies)
+        else:
+            value.add()
+    elif rng.random() < 0.9:
+        _change_message(rng, value)
+    else:
+        record.ClearField(field.name)
+
+
+def _set(rng: Rng, record: Any, field: Any) -> None:
+    if rng.random() < 0.1:
+        record.ClearField(field.name)
+    else:
+        _try(lambda: setattr(record, field.name, _scalar(rng, field)))
+
+
+def _try(action: Callable[[], object]) -> None:
+    # A value that the field can't take, whoever writes it.
+    with contextlib.suppress(ValueError, TypeError, OverflowError, IndexError):
+        action()
+
+
+def _scalar(rng: Rng, field: Any) -> Any:
+    kind = field.cpp_type
+    if kind in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
+        return float(number(rng))
+    if kind == field.CPPTYPE_BOOL:
+        return bool(rng.random() < 0.5)
+    if kind == field.CPPTYPE_STRING:
+        return pick(rng, TEXTS)
+    with np.errstate(all="ignore"):
+        return pick(rng, (0, 1, 2, 3, 5, 9, -1, 100, 2**31 - 1, -(2**31), 2**63 - 1))

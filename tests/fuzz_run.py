@@ -1,0 +1,172 @@
+"""Running targets on changed files, in processes that may take little time and memory, and counting the outcomes."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import json
+import os
+import resource
+import select
+import shutil
+import signal
+import tempfile
+import time
+import traceback
+import warnings
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from fuzz_targets import FOREIGN, TARGETS, Files, Target
+
+SECONDS, MEMORY = 10, 1 << 30
+"""What one input may take."""
+BATCH = 200
+"""Inputs per process."""
+OUTCOMES = ("accepted", "refused", "foreign", "hang", "memory", "crash", "absurd")
+BAD = OUTCOMES[2:]
+KEPT = 20
+"""Findings of one kind that are described."""
+
+
+@dataclass
+class Counts:
+    """What came of the inputs of a target so far.
+
+    Attributes:
+        inputs: how many; those up to this number.
+        outcomes: how often each of :data:`OUTCOMES` was seen.
+        found: number of the input and what was wrong, for some of the bad ones.
+    """
+
+    inputs: int = 0
+    outcomes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(OUTCOMES, 0))
+    found: list[tuple[int, str, str]] = field(default_factory=list)
+
+    def add(self, number: int, outcome: str, detail: str) -> None:
+        """Count one."""
+        self.inputs += 1
+        self.outcomes[outcome] += 1
+        if outcome in BAD and sum(kind == outcome for _, kind, _ in self.found) < KEPT:
+            self.found.append((number, outcome, detail))
+
+    @property
+    def bad(self) -> int:
+        """Inputs that were not read as they should be."""
+        return sum(self.outcomes[name] for name in BAD)
+
+
+def inputs(name: str, seed: int, number: int) -> Files:
+    """The files of one input; the same ones whenever it is asked for."""
+    target = TARGETS[name]
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return target.mutate(rng, dict(target.good()))
+
+
+def attempt(target: Target, files: Files, folder: Path) -> tuple[str, str]:
+    """What a target makes of files, in this process."""
+    for file, data in files.items():
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            outcome, detail = target.run(folder, next(iter(files)))
+    except MemoryError:
+        return "memory", "MemoryError"
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        outcome, detail = (
+            FOREIGN,
+            f"{type(error).__name__}: {str(error)[:150]} ({Path(where.filename).name}:{where.lineno})",
+        )
+    if "MemoryError" in detail or "alloc" in detail.lower():
+        return "memory", detail
+    return outcome, detail
+
+
+def fuzz(
+    name: str,
+    counts: Counts,
+    total: int,
+    *,
+    seed: int = 0,
+    until: float = np.inf,
+    tell: Callable[[], None] | None = None,
+) -> None:
+    """Go on with a target until so many inputs are counted, or a moment of :func:`time.monotonic` has come."""
+    with tempfile.TemporaryDirectory() as folder:  # here, lest each process import everything anew
+        attempt(TARGETS[name], dict(TARGETS[name].good()), Path(folder))
+    while counts.inputs < total and time.monotonic() < until:
+        _batch(name, counts, min(total, counts.inputs + BATCH), seed, until)
+        if tell is not None:
+            tell()
+
+
+def _batch(name: str, counts: Counts, stop: int, seed: int, until: float) -> None:
+    """Inputs in one process; ends early after one that it did not survive."""
+    folder = Path(tempfile.mkdtemp(prefix="symphony-fuzz-"))
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read)
+        _work(name, range(counts.inputs, stop), seed, write, folder)
+    os.close(write)
+    try:
+        with os.fdopen(read, "rb", buffering=0) as pipe:
+            data = b""
+            while counts.inputs < stop:
+                ready, _, _ = select.select([pipe], [], [], SECONDS)
+                chunk = pipe.read(1 << 16) if ready else b""
+                if not chunk:
+                    lost = ("crash", "the process ended") if ready else ("hang", f"more than {SECONDS} s")
+                    counts.add(counts.inputs, *lost)
+                    return
+                *lines, data = (data + chunk).split(b"\n")
+                for line in lines:
+                    counts.add(counts.inputs, *json.loads(line))
+                if time.monotonic() > until:
+                    return
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _work(name: str, numbers: range, seed: int, pipe: int, folder: Path) -> None:
+    """In the process of its own: never returns."""
+    try:
+        faulthandler.disable()
+        os.fsync = lambda _: None  # nothing here is to last
+        null = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(null, stream)
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        for number in numbers:
+            place = folder / str(number)
+            place.mkdir()
+            result = attempt(TARGETS[name], inputs(name, seed, number), place)
+            shutil.rmtree(place, ignore_errors=True)
+            os.write(pipe, json.dumps(result).encode() + b"\n")
+    finally:
+        os._exit(0)
+
+
+def to_json(counts: dict[str, Counts]) -> str:
+    """Counts as text, to go on with later."""
+    return json.dumps({name: asdict(each) for name, each in counts.items()}, indent=1) + "\n"
+
+
+def from_json(text: str) -> dict[str, Counts]:
+    """The reverse of :func:`to_json`."""
+    return {name: Counts(**each) for name, each in json.loads(text).items()}

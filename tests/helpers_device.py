@@ -1,0 +1,120 @@
+"""A device that exists in name only, to test code for accelerators on a machine that has none.
+
+Inside :func:`pretend` tensors have shapes, types and devices but no numbers. PyTorch itself refuses to mix devices
+and to read a number; copies between device and host, which would wait for the device, are noted here.
+
+    env = DrivingEnv(...)  # on the host, with numbers
+    with pretend() as device:
+        on(device, env)
+        ...
+    assert not device.waits
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+
+from symphony.envs import DrivingEnv
+from symphony.geometry import constants
+
+NAME = "fakegpu"
+
+
+class PretendDevice:
+    """A device without numbers.
+
+    Attributes:
+        device: for tensors made inside.
+        waits: copies between it and the host so far, as text.
+    """
+
+    def __init__(self) -> None:
+        self.device = torch.device(NAME, 0)
+        self.waits: list[str] = []
+
+
+class _Watch(TorchDispatchMode):
+    def __init__(self, pretended: PretendDevice) -> None:
+        super().__init__()
+        self.pretended = pretended
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        before = {v.device.type for v in tree_leaves((args, kwargs)) if isinstance(v, Tensor)}
+        after = {v.device.type for v in tree_leaves(out) if isinstance(v, Tensor)}
+        if len(before | after) > 1 and before:
+            shapes = [tuple(v.shape) for v in tree_leaves((args, kwargs)) if isinstance(v, Tensor)]
+            # A single number of the host may take part in anything: it travels with the call.
+            if "copy" in str(func):
+                self.pretended.waits.append(f"{func} {sorted(before)} -> {sorted(after)} {shapes}")
+        return out
+
+
+class _Backend(_DummyBackendModule):
+    """What PyTorch and TensorDict take for the device's module, such as ``torch.cuda``."""
+
+    pretended: PretendDevice | None = None
+
+    def synchronize(self, *_: Any) -> None:
+        if self.pretended is not None:
+            self.pretended.waits.append("synchronize")
+
+
+BACKEND = _Backend()
+
+
+def _name_the_device() -> None:
+    if torch._C._get_privateuse1_backend_name() != NAME:
+        # Without it PyTorch knows the device, but can't index its tensors.
+        _setup_privateuseone_for_python_backend(NAME, BACKEND)
+
+
+@contextmanager
+def pretend() -> Iterator[PretendDevice]:
+    """Everything made inside is without numbers; what is made on the device is noted to be there."""
+    _name_the_device()
+    BACKEND.pretended = device = PretendDevice()
+    # Constants without numbers must not be found by what runs later, nor those with numbers by what runs here.
+    constants.made.cache_clear()
+    try:
+        with FakeTensorMode(), _Watch(device):
+            yield device
+    finally:
+        BACKEND.pretended = None
+        constants.made.cache_clear()
+
+
+def on(device: PretendDevice, given: Any) -> Any:
+    """A tensor, TensorDict, tensor class, or in place a module or environment, as it would be on the device."""
+
+    def moved(value: Tensor) -> Tensor:
+        fake = torch.empty(value.shape, dtype=value.dtype, device=device.device)
+        return fake.requires_grad_(value.requires_grad)
+
+    if isinstance(given, Tensor):
+        return moved(given)
+    if isinstance(given, DrivingEnv):
+        given._scenes = on(device, given.scenes)
+        return given.to(device.device)
+    if isinstance(given, nn.Module):
+        for module in given.modules():
+            for name, value in module._parameters.items():
+                if value is not None:
+                    module._parameters[name] = nn.Parameter(moved(value.detach()), value.requires_grad)
+            for name, value in module._buffers.items():
+                if value is not None:
+                    module._buffers[name] = moved(value)
+        return given
+    if isinstance(given, TensorDictBase) or hasattr(given, "apply"):
+        return given.apply(moved, device=device.device)
+    raise TypeError(f"can't move {type(given).__name__}")

@@ -1,0 +1,72 @@
+"""The allocator is set where the process is ours, and only there."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from symphony import allocator, cli
+
+GLIBC = platform.system() == "Linux" and platform.libc_ver()[0] == "glibc"
+
+FAULTS = """
+import resource, numpy as np
+from symphony import allocator
+set_ = allocator.tune()
+def use():
+    # Largest first: glibc itself learns from what is freed, but only up to 32 MiB.
+    for _ in range(5):
+        np.ones(1 << 26, np.uint8)
+use()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+use()
+print(int(set_), resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def outcome(**more: str) -> tuple[bool, int]:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "SYMPHONY_MALLOPT"))}
+    done = subprocess.run(
+        [sys.executable, "-c", FAULTS],
+        env={**environment, **more},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    tuned, faults = done.stdout.split()
+    return tuned == "1", int(faults)
+
+
+@pytest.mark.skipif(not GLIBC, reason="not glibc")
+def test_memory_is_kept_once_it_is_set() -> None:
+    tuned, kept = outcome()
+    untuned, returned = outcome(SYMPHONY_MALLOPT="0")
+    assert (tuned, untuned) == (True, False)
+    # 5 x 64 MiB are 81 920 pages of 4 KiB; pages of the kernel's choice may be larger.
+    assert kept < 100
+    assert returned > 100
+
+
+@pytest.mark.skipif(not GLIBC, reason="not glibc")
+def test_settings_of_the_user_take_precedence() -> None:
+    assert outcome(MALLOC_TOP_PAD_="1024")[0] is False
+
+
+def test_nothing_happens_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SYMPHONY_MALLOPT", raising=False)
+    monkeypatch.setattr(platform, "system", lambda: "Darwin")
+    assert allocator.tune() is False
+
+
+def test_the_command_sets_it_for_a_process_of_its_own_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(allocator, "tune", lambda: calls.append(1))
+    assert cli.main(["--version"]) == 0
+    assert calls == []
+    monkeypatch.setattr(sys, "argv", ["symphony", "--version"])
+    assert cli.main() == 0
+    assert calls == [1]

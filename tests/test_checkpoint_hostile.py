@@ -1,0 +1,241 @@
+"""Checkpoints that were tampered with: an error that names file and field, and nothing is changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from helpers_segments import crossing
+from helpers_store import fill
+from symphony.agents.checkpoint import (
+    MANIFEST,
+    CheckpointError,
+    checkpoints,
+    load_checkpoint,
+    save_checkpoint,
+)
+from symphony.agents.choice import choose
+from symphony.agents.fitting import match_optimizer
+from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig, ValidationConfig
+from symphony.recipes import train
+from symphony.training.alarms import Skips
+
+
+def parts() -> dict[str, Any]:
+    module = nn.Linear(3, 2)
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
+    module(torch.ones(4, 3)).sum().backward()
+    optimizer.step()
+    schedule = torch.optim.lr_scheduler.StepLR(optimizer, 3)
+    optimizers = {"adam": optimizer, "schedule": schedule}
+    return {
+        "modules": {"policy": module},
+        "optimizers": optimizers,
+        "generators": {"data": torch.Generator()},
+    }
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    return save_checkpoint(tmp_path, step=7, **parts(), extra={"best": None, "seen": (1, 2.5)})
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Every place in nested JSON but the inside of long lists of numbers."""
+    yield at
+    items = (
+        value.items() if isinstance(value, dict) else enumerate(value[:3]) if isinstance(value, list) else ()
+    )
+    for key, inner in items:
+        yield from places(inner, (*at, key))
+
+
+def put(value: Any, at: tuple[Any, ...], new: Any) -> Any:
+    if not at:
+        return new
+    copy = dict(value) if isinstance(value, dict) else list(value)
+    copy[at[0]] = put(value[at[0]], at[1:], new)
+    return copy
+
+
+HOSTILE = [None, True, -1, 10**30, 1e308, "", "nan", [], {}, [[]], {"$": "tensor", "value": "x"}, {"$": []}]
+
+
+def refusal(path: Path, own: dict[str, Any]) -> CheckpointError | None:
+    """Why a checkpoint is not loaded, if it isn't; nothing else is raised."""
+    try:
+        load_checkpoint(path, **own)
+    except CheckpointError as error:
+        return error
+    return None
+
+
+def test_no_manifest_makes_loading_fail_otherwise(saved: Path) -> None:
+    file = saved / MANIFEST
+    good = json.loads(file.read_text())
+    errors = 0
+    for at in places(good):
+        for new in HOSTILE:
+            file.write_text(json.dumps(put(good, at, new)))
+            own = parts()
+            before = [t.clone() for t in own["modules"]["policy"].state_dict().values()]
+            state = torch.get_rng_state()
+            error = refusal(saved, own)
+            if error is None:
+                continue
+            errors += 1
+            assert error.file is not None
+            assert error.field is not None
+            # A schedule says what it dislikes as it takes it.
+            if at[:2] != ("parts", "optimizer.schedule"):
+                after = own["modules"]["policy"].state_dict().values()
+                assert all(map(torch.equal, before, after))
+                assert torch.equal(state, torch.get_rng_state())
+    assert errors > 500
+
+
+@pytest.mark.parametrize(
+    ("at", "new", "field"),
+    [
+        (("format",), True, "format"),
+        (("step",), 1.0, "step"),
+        (("step",), True, "step"),
+        (("step",), 8, "step"),
+        (("parts", "extra", "state"), [1], "extra"),
+        (("parts", "module.policy", "file"), "../module.policy.safetensors", "parts.module.policy"),
+        (("parts", "module.policy", "sha256"), None, "parts.module.policy"),
+        (("parts", "rng", "state", "python"), 3, "rng.python"),
+        (("parts", "rng", "state", "numpy", "state", "pos"), 10**6, "rng.numpy"),
+        (("parts", "rng", "state", "cuda"), [3], "rng.cuda"),
+        (("parts", "rng", "state", "generators"), [], "rng.generators"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), -1.0, "param_groups.lr"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), "fast", "param_groups.lr"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "amsgrad"), 7, "param_groups.amsgrad"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "params"), [1, 0], "param_groups"),
+        (
+            ("parts", "optimizer.adam", "state", "param_groups", 0, "betas", "items"),
+            [0.9, 1.5],
+            "param_groups.betas",
+        ),
+    ],
+)
+def test_fields_are_named(saved: Path, at: tuple[Any, ...], new: Any, field: str) -> None:
+    file = saved / MANIFEST
+    file.write_text(json.dumps(put(json.loads(file.read_text()), at, new)))
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(saved, **parts())
+    assert (caught.value.field, Path(str(caught.value.file)).parent) == (field, saved)
+
+
+def test_nesting_without_end(saved: Path) -> None:
+    (saved / MANIFEST).write_text('{"format": 1, "step": 7, "parts": ' + "[" * 100_000 + "]" * 100_000 + "}")
+    with pytest.raises(CheckpointError):
+        load_checkpoint(saved, **parts())
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_weights_that_are_not_finite_are_refused(value: float, tmp_path: Path) -> None:
+    bad, own = parts(), parts()
+    with torch.no_grad():
+        bad["modules"]["policy"].weight[1, 2] = value
+    path = save_checkpoint(tmp_path, step=1, **bad)
+    before = own["modules"]["policy"].weight.clone()
+    with pytest.raises(CheckpointError, match="1 of 6 numbers are not finite") as caught:
+        load_checkpoint(path, **own)
+    assert (caught.value.field, caught.value.file) == ("weight", path / "module.policy.safetensors")
+    assert torch.equal(before, own["modules"]["policy"].weight)
+
+
+@pytest.mark.parametrize(
+    ("name", "new"),
+    [
+        ("exp_avg", torch.full((2, 3), float("nan"))),
+        ("exp_avg_sq", -torch.ones(2, 3)),
+        ("exp_avg_sq", torch.ones(3, 2)),
+        ("step", torch.tensor(-1.0)),
+        ("step", 3),
+        ("exp_avg", None),
+    ],
+)
+def test_moments_are_looked_at(name: str, new: Any) -> None:
+    optimizer = parts()["optimizers"]["adam"]
+    state = optimizer.state_dict()
+    match_optimizer(Path("a"), optimizer, state)
+    state["state"][0][name] = new
+    with pytest.raises(CheckpointError, match=r"state\.0"):
+        match_optimizer(Path("a"), optimizer, state)
+
+
+@pytest.mark.parametrize(
+    "skips", [3, "x", {"total": -1, "in_row": {}}, {"total": 1}, {"total": 1, "in_row": {"policy": "x"}}]
+)
+def test_counts_are_counts(skips: Any) -> None:
+    with pytest.raises(CheckpointError):
+        Skips.of({"skips": skips})
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    fill(tmp_path / "store", [crossing(seed=k, steps=21) for k in range(3)])
+    return tmp_path / "store"
+
+
+def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
+    """The smallest run."""
+    small: dict[str, Any] = {
+        "agent": AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        "search": SearchConfig(branches=2, prune_every=4, segments=2, updates=2, states=8, test_branches=2),
+        "discriminator": DiscriminatorConfig(hidden=8, head=8, states=8),
+        "steps": 4,
+        "segments": 2,
+        "states": 16,
+        "checkpoint_every": 2,
+        "log_every": 1,
+        "wandb": "disabled",
+    }
+    return TrainConfig(method=method, data=store, out=out, **small | changes)
+
+
+@pytest.mark.parametrize("at", ["best", "skips", "processes"])
+def test_what_a_run_keeps_is_looked_at_when_it_goes_on(at: str, store: Path, tmp_path: Path) -> None:
+    judged = ValidationConfig(data=store, segments=1, rollouts=1)
+    train(tiny("bc", store, tmp_path / "run", validation=judged))
+    file = checkpoints(tmp_path / "run" / "checkpoints")[-1] / MANIFEST
+    good = json.loads(file.read_text())
+    assert good["parts"]["extra"]["state"]["best"] is not None
+    for new in ("x", -1, {"step": "one", "infractions": 2}):
+        file.write_text(json.dumps(put(good, ("parts", "extra", "state", at), new)))
+        with pytest.raises(CheckpointError) as caught:
+            train(tiny("bc", store, tmp_path / "run", steps=6, validation=judged, resume=True))
+        assert (caught.value.file, caught.value.field) == (file, f"extra.{at}")
+        if at == "best":
+            with pytest.raises(CheckpointError, match=MANIFEST):
+                choose(tmp_path / "run")
+
+
+def test_equal_runs_write_equal_checkpoints(store: Path, tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 2)):
+        # Whatever the process did before.
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        torch.manual_seed(seed)
+        train(tiny("bc_ts", store, tmp_path / name, seed=5))
+    digests = [
+        {
+            (path.name, file.name): hashlib.sha256(file.read_bytes()).hexdigest()
+            for path in checkpoints(tmp_path / name / "checkpoints")
+            for file in path.iterdir()
+        }
+        for name in "ab"
+    ]
+    assert len(digests[0]) > 6
+    assert digests[0] == digests[1]

@@ -1,0 +1,105 @@
+"""What the collector needs of TorchRL: each failure names the member that is missing or has changed."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+
+import symphony.collectors
+from helpers_collectors import ACTION, Policy, Walk, distance
+from symphony.collectors import BeamSearchCollector, _torchrl
+
+SOURCES = sorted(Path(symphony.collectors.__file__).parent.glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def plain() -> Collector:
+    return Collector(
+        Walk(), Policy(), frames_per_batch=8, total_frames=16, auto_register_policy_transforms=False
+    )
+
+
+def read_of_self(name: str) -> set[str]:
+    """Attributes of `self` that a class of the collector's module reads and does not make itself."""
+    tree = ast.parse(Path(inspect.getfile(BeamSearchCollector)).read_text())
+    (found,) = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == name]
+    own = {node.name for node in found.body if isinstance(node, ast.FunctionDef)}
+    used = [
+        node
+        for node in ast.walk(found)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "self"
+    ]
+    own |= {node.attr for node in used if isinstance(node.ctx, ast.Store)}
+    return {node.attr for node in used} - own
+
+
+def test_every_member_the_collector_reads_is_there(plain):
+    read = read_of_self("BeamSearchCollector")
+    assert {"env", "policy", "postproc", "storing_device", "set_truncated"} <= read
+    private = {name for name in read if name.startswith("_")}
+    assert not private, f"private members belong into _torchrl.PRIVATE: {private}"
+    missing = sorted(name for name in {*read, *_torchrl.PRIVATE} if not hasattr(plain, name))
+    assert not missing, f"TorchRL's Collector no longer has {missing}"
+
+
+def test_nothing_private_of_torchrl_is_imported():
+    for source in SOURCES:
+        for node in ast.walk(ast.parse(source.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchrl"):
+                names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+                assert not any(name.startswith("_") for name in names), (source.name, names)
+
+
+def test_private_members_do_what_is_asked_of_them(plain):
+    policy = _torchrl.policy_of(plain)
+    state = plain.env.reset()
+    assert policy(state.copy()).get(ACTION).shape == (2, 1)
+    first, second = (_torchrl.new_trajectories(plain, 3, torch.device("cpu")) for _ in range(2))
+    assert first.dtype == torch.int64
+    assert len(torch.cat([first, second]).unique()) == 6
+
+
+def test_what_is_gone_is_named(plain, monkeypatch):
+    for name in list(_torchrl.PRIVATE):
+        monkeypatch.setitem(_torchrl.PRIVATE, f"{name}_gone", "a test")
+        with pytest.raises(RuntimeError, match=rf"TorchRL 0\.\d+.* has no Collector.{name}_gone \(a test\)"):
+            _torchrl._member(plain, f"{name}_gone")
+
+
+def test_what_the_base_class_calls_is_still_called_so(plain):
+    """Methods that the search replaces: an override that nothing calls any more would be silent."""
+    ours = {name for name, value in vars(BeamSearchCollector).items() if inspect.isfunction(value)}
+    replaced = {"rollout", "fake_tensordict", "set_seed", "state_dict", "load_state_dict", "stats"}
+    assert replaced <= ours
+    gone = sorted(name for name in replaced if not callable(getattr(Collector, name, None)))
+    assert not gone, f"TorchRL's Collector no longer has {gone}"
+    calls = ast.walk(ast.parse(inspect.getsource(inspect.getmodule(Collector))))
+    called = {node.attr for node in calls if isinstance(node, ast.Attribute)}
+    assert "rollout" in called
+    # Trajectories of a batch never go on in the next one, by the public option.
+    search = BeamSearchCollector(Walk(), Policy(), score=distance, branches=2, frames_per_batch=8)
+    assert search.reset_at_each_iter
+
+
+def test_bound_classes_are_classes_that_can_be_pickled():
+    bound = BeamSearchCollector.bind(score=distance, branches=4, prune_every=2)
+    assert issubclass(bound, BeamSearchCollector)
+    assert bound is not BeamSearchCollector
+    again = pickle.loads(pickle.dumps(bound))  # noqa: S301
+    assert again.settings == bound.settings
+    assert issubclass(again, BeamSearchCollector)
+    for kind in (bound, again):
+        collector = kind(Walk(), Policy(), frames_per_batch=8, total_frames=8)
+        assert (collector.branches, collector.prune_every) == (4, 2)
+        assert next(iter(collector)).shape == (8,)
+    assert bound(Walk(), Policy(), frames_per_batch=8, branches=3).branches == 3
+    more = pickle.loads(pickle.dumps(bound.bind(leaves=2)))  # noqa: S301
+    assert more(Walk(), Policy(), frames_per_batch=8).leaves == 2
+    # The settings of one subclass do not reach another.
+    assert not hasattr(BeamSearchCollector, "settings")

@@ -1,0 +1,181 @@
+"""The pages: examples run, commands exist, tables are those of the records, links lead somewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import inspect
+import io
+import os
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import symphony.cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "recipes/README.md",
+    *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")),
+)
+FENCE = re.compile(
+    r"^(?:<!-- not run: (?P<reason>[^\n]+) -->\n)?```(?P<kind>\w+)(?P<more>[^\n]*)\n(?P<text>.*?)^```$",
+    re.M | re.S,
+)
+"""A block of code; a comment before it says why it is not run, and `title="FILE"` that it is a file."""
+
+
+def blocks(page: str, kind: str) -> list[tuple[str, str]]:
+    """Text of every block that is meant to work, with the file that it is (or nothing)."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    found = [block for block in FENCE.finditer(text) if block["kind"] == kind and not block["reason"]]
+    titles = [re.search(r'title="([^"]+)"', block["more"]) for block in found]
+    return [(block["text"], title[1] if title else "") for block, title in zip(found, titles, strict=True)]
+
+
+def commands(page: str) -> list[list[str]]:
+    """Every command of the shell blocks of a page, lines joined, loops at their first word, without comments."""
+    found = []
+    for block, _ in blocks(page, "sh"):
+        first = dict(re.findall(r"for (\w+) in (\w+)", block))
+        text = re.sub(r"\$(\w+)", lambda name, first=first: first.get(name[1], "1"), block)
+        for line in text.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["torchrun"]:
+                words = words[words.index("-m") + 1 :]
+            if words:
+                found.append(words)
+    return found
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
+def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules)
+    space: dict[str, object] = {"__name__": "example"}
+    with contextlib.redirect_stdout(io.StringIO()):
+        for text, file in blocks(page, "python"):
+            if file:
+                (tmp_path / file).write_text(text)
+            else:
+                exec(compile(text, page, "exec"), space)  # noqa: S102
+    for name in set(sys.modules) - before:
+        if getattr(sys.modules[name], "__file__", None) and str(tmp_path) in str(sys.modules[name].__file__):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if any(c[0] == "symphony" for c in commands(page))])
+def test_commands_are_understood(
+    page: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(symphony.cli, "_guarded", lambda run: 0)  # parsed as ever, but nothing runs
+    for words in commands(page):
+        if words[0] == "symphony":
+            assert symphony.cli.main(words[1:]) == 0, (
+                f"{page}: {shlex.join(words)}\n{capsys.readouterr().err}"
+            )
+
+
+def test_a_wrong_flag_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(symphony.cli, "_guarded", lambda run: 0)
+    assert symphony.cli.main(["data", "info", "DIR"]) == 0
+    assert symphony.cli.main(["data", "info", "DIR", "--no-such-flag"]) == 2
+
+
+def test_other_commands_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    for page in PAGES:
+        for words in commands(page):
+            if words[0] == "make":
+                assert words[1] in targets, f"{page}: {shlex.join(words)}"
+            if words[0] == "python":
+                assert (ROOT / words[1]).is_file(), f"{page}: {shlex.join(words)}"
+        for target in re.findall(r"`make ([a-z-]+)`", (ROOT / page).read_text()):
+            assert target in targets, f"{page}: make {target}"
+
+
+def test_tables_are_those_of_the_records(capsys: pytest.CaptureFixture[str]) -> None:
+    page = runpy.run_path(str(ROOT / "scripts" / "results_page.py"))
+    assert page["main"](["--check"]) == 0, capsys.readouterr().err
+    blocks = [
+        found[2] for name in page["PAGES"] for found in page["BLOCK"].finditer((ROOT / name).read_text())
+    ]
+    assert set(blocks) == set(page["TABLES"])
+
+
+def test_a_changed_figure_is_found() -> None:
+    page = runpy.run_path(str(ROOT / "scripts" / "results_page.py"))
+    text = (ROOT / "docs" / "results.md").read_text()
+    figure = re.search(r"\| BC \| (\d+\.\d) ", text)
+    assert figure is not None
+    assert page["rewritten"](text.replace(figure[0], "| BC | 0.1 ")) == text
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    for page in ("README.md", "CONTRIBUTING.md", "recipes/README.md"):
+        for link in re.findall(r"\]\(([^)#]+)[^)]*\)", (ROOT / page).read_text()):
+            assert link.startswith("https://") or ((ROOT / page).parent / link).exists(), f"{page}: {link}"
+
+
+def test_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+OTHERS = re.compile(r"(?<![\w-])symphony\[[a-z]|pip install (?:[^\n`|#]*[\s'\"])?symphony(?![\w-])")
+"""Of the package index: an extra of `symphony`, or `symphony` itself, which is another project."""
+
+
+def test_nothing_tells_to_install_another_project() -> None:
+    name = "symphony"
+    for wrong in (f"{name}[sumo]", f"pip install -U {name}", f"pip install '{name}'"):
+        assert OTHERS.search(wrong)
+    files = [
+        file
+        for folder in ("", "docs", "src", "tests", "scripts", "recipes", "examples", "benchmarks")
+        for pattern in ("*.md", "*.py", "*.toml")
+        for file in (ROOT.glob(pattern) if not folder else (ROOT / folder).rglob(pattern))
+    ]
+    assert len(files) > 200
+    for file in files:
+        found = OTHERS.search(file.read_text(encoding="utf-8"))
+        assert found is None, f"{file.relative_to(ROOT)}: {found and found[0]}"
+
+
+needs_mkdocs = pytest.mark.skipif(
+    importlib.util.find_spec("mkdocs") is None, reason="mkdocs is not installed (the extra [docs])"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONWARNINGS": "default"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
+
+
+@needs_mkdocs
+def test_every_public_name_is_in_the_reference(site: Path) -> None:
+    missing = set()
+    for package in sorted((ROOT / "src" / "symphony").glob("*/__init__.py")):
+        room = package.parent.name
+        module = importlib.import_module(f"symphony.{room}")
+        objects = [getattr(module, name) for name in getattr(module, "__all__", ())]
+        names = {found.__name__ for found in objects if inspect.isclass(found) or inspect.isfunction(found)}
+        if room != "cli" and names:
+            page = (site / "reference" / f"{room}.html").read_text(encoding="utf-8")
+            shown = set(re.findall(rf'id="symphony\.{room}\.(?:\w+\.)*(\w+)"', page))
+            missing |= {f"{room}.{name}" for name in names - shown}
+    # Where a function has the name of its module, the page needs `::: symphony.ROOM.NAME.NAME`.
+    assert missing == set()

@@ -1,0 +1,92 @@
+"""What is asked for is observed and nothing else; simulation does not depend on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from helpers_segments import crossing, straight_road
+from symphony import keys
+from symphony.envs import (
+    Bicycle,
+    ConstantVelocity,
+    Displacement,
+    DrivingEnv,
+    ObservationConfig,
+    collate,
+    scene,
+)
+
+NOTHING = ObservationConfig.nothing()
+EVERYTHING = ObservationConfig(num_objects=4, num_points=60, clearance=True, foresight=(0.5, 1.0))
+KEYS = {"own", "objects", "objects_mask", "points", "points_mask", "gap", "gap_ahead", "road"}
+
+
+def make_env(config: ObservationConfig, dynamics: Any = None) -> DrivingEnv:
+    return DrivingEnv(collate([scene(s, [0, 1]) for s in (straight_road(), crossing())]), dynamics, config)
+
+
+@pytest.mark.parametrize(
+    ("config", "missing"),
+    [
+        (EVERYTHING, set()),
+        (ObservationConfig(num_objects=0, num_points=0), KEYS - {"own"}),
+        (ObservationConfig(num_objects=0, num_points=7), KEYS - {"own", "points", "points_mask"}),
+        (ObservationConfig(3, 0), KEYS - {"own", "objects", "objects_mask"}),
+        (ObservationConfig(0, 0, clearance=True, foresight=(1.0,)), KEYS - {"own", "road"}),
+        (NOTHING, KEYS),
+    ],
+)
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_there_are_entries_for_what_is_asked_for(
+    config: ObservationConfig, missing: set[str], shape: tuple[int, ...]
+) -> None:
+    env = make_env(config)
+    start = env.reset(TensorDict(batch_size=shape))
+    check_env_specs(env, tensordict=start)
+    agents = start["agents"]
+    seen = set(agents["observation"].keys()) if "observation" in agents.keys() else set()  # noqa: SIM118
+    assert seen == KEYS - missing
+    assert ("observation" in agents.keys()) == bool(seen)  # noqa: SIM118
+
+
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_what_is_observed_changes_no_state_and_no_flag(dynamics: Any) -> None:
+    envs = [make_env(config, dynamics) for config in (EVERYTHING, NOTHING, ObservationConfig(0, 3))]
+    now = [env.start(torch.tensor([0, 1, 1]), torch.arange(3)) for env in envs]
+    rng, flags = torch.Generator().manual_seed(0), torch.zeros(())
+    for _ in range(25):
+        action = (
+            torch.randint(147, (3, 2), generator=rng)
+            if dynamics.discrete
+            else torch.rand(3, 2, 2, generator=rng) * torch.tensor([3.0, 0.3])
+        )
+        now = [env.step(td.set(keys.ACTION, action))["next"] for env, td in zip(envs, now, strict=True)]
+        for other in now[1:]:
+            for key in (keys.STATE, keys.COLLISION, keys.OFFROAD, keys.REWARD, "done"):
+                assert torch.equal(now[0][key], other[key])
+        flags = flags + now[0][keys.REWARD].sum()
+    assert flags < 0
+
+
+def test_constant_velocity_needs_no_observation() -> None:
+    env = make_env(NOTHING)
+    policy, now = ConstantVelocity(env.dynamics), env.start(torch.tensor([0]))
+    for _ in range(50):
+        now = env.step(policy(now))["next"]
+    truth = torch.from_numpy(straight_road().position[:2, 50, :2])
+    torch.testing.assert_close(now[keys.STATE][0, :, :2], truth, atol=0.01, rtol=0)
+
+
+def test_tables_follow_the_scenes() -> None:
+    one, two = make_env(EVERYTHING), make_env(EVERYTHING)
+    two.scenes = collate([scene(crossing(5), [0, 1]), scene(straight_road(3), [0, 1])])
+    fresh = DrivingEnv(two.scenes, None, EVERYTHING)
+    one.start(torch.tensor([0, 1]))
+    one.scenes = two.scenes
+    for env in (one, two):
+        assert (env.start(torch.tensor([0, 1])) == fresh.start(torch.tensor([0, 1]))).all()

@@ -1,0 +1,97 @@
+"""Demonstrations fitted together are those fitted one by one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from helpers_segments import crossing, hide, straight_road
+from symphony.data.builtin import builtin_store
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+from symphony.envs import Bicycle, Displacement, ObservationConfig
+from symphony.geometry import forward_speed
+from symphony.simulation import experts as module
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.experts import ExpertCache, Experts, experts, fit_experts
+
+DYNAMICS = pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+
+
+def segments() -> list[RunSegment]:
+    """Of several lengths and time steps, with gaps, with made and recorded traffic."""
+    store = SegmentStore(builtin_store("train"))
+    return [
+        straight_road(4, steps=31),
+        hide(crossing(5), 2, slice(10, 20)),
+        store[3],
+        straight_road(3, steps=11).replace(dt=0.1),
+        hide(straight_road(5), 1, slice(0, 7)),
+        store[40],
+    ]
+
+
+@DYNAMICS
+@pytest.mark.parametrize("together", [1, 12, 10_000])
+def test_fitting_together_is_fitting_one_by_one(
+    dynamics: Any, together: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "TOGETHER", together)
+    given = segments()
+    for segment, found in zip(given, fit_experts(given, dynamics), strict=True):
+        alone = experts(segment, dynamics)
+        for name in ("agent", "valid", "actions"):
+            one, many = getattr(alone, name), getattr(found, name)
+            assert one.dtype == many.dtype
+            if one.is_floating_point():
+                torch.testing.assert_close(many, one, atol=1e-6, rtol=0)
+            else:
+                assert torch.equal(many, one)
+        torch.testing.assert_close(found.states, alone.states, atol=1e-6, rtol=0)
+        torch.testing.assert_close(found.error, alone.error, atol=1e-6, rtol=0)
+
+
+@DYNAMICS
+def test_the_fit_is_that_of_the_dynamics(dynamics: Any) -> None:
+    for segment, found in zip(segments(), fit_experts(segments(), dynamics), strict=True):
+        rows = found.agent.numpy()
+        heading = torch.from_numpy(segment.heading[rows])
+        speed = forward_speed(torch.from_numpy(segment.velocity[rows]), heading)
+        actions, states = dynamics.fit(
+            torch.from_numpy(segment.position[rows, :, :2]),
+            heading,
+            speed,
+            torch.from_numpy(segment.valid[rows]),
+            torch.from_numpy(segment.size[rows, :2]),
+            segment.dt,
+        )
+        assert len(rows) > 1
+        torch.testing.assert_close(found.actions.to(actions.dtype), actions, atol=1e-6, rtol=0)
+        torch.testing.assert_close(found.states, states, atol=1e-6, rtol=0)
+        assert found.states.untyped_storage().nbytes() == states.nbytes
+
+
+def test_the_cache_makes_what_is_missing_together_and_lets_the_oldest_go() -> None:
+    asked: list[list[int]] = []
+
+    def make(items: Any) -> list[Experts]:
+        asked.append(list(items))
+        return [Experts(torch.tensor([item]), *[torch.zeros(1)] * 4) for item in items]
+
+    cache = ExpertCache(make, keep=3)
+    assert [int(e.agent) for e in cache.many([4, 2, 4])] == [4, 2, 4]
+    assert int(cache(2).agent) == 2
+    cache.many([4])
+    assert [int(e.agent) for e in cache.many([5, 6, 7, 8])] == [5, 6, 7, 8]
+    assert int(cache(8).agent) == 8
+    cache(4)
+    assert asked == [[4, 2], [5, 6, 7, 8], [4]]
+
+
+def test_a_batch_of_expert_states_has_whole_actions() -> None:
+    dataset = SceneDataset(SegmentStore(builtin_store("train")))
+    batch = dataset.sample_states([0, 5, 9], 20, ObservationConfig(2, 10), torch.Generator().manual_seed(0))
+    assert batch["agents", "action"].dtype == torch.int64
+    assert batch["agents", "action"].unique().numel() > 3

@@ -1,0 +1,84 @@
+"""A step, goals and flags on a device that isn't the CPU: no mixed devices, and nothing waits for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError
+
+from helpers_device import NAME, on, pretend
+from helpers_segments import crossing, straight_road
+from symphony import keys
+from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.flags import collision_flags, offroad_flags
+from symphony.envs.observation import objects_at, observe
+from symphony.roadgraph import LaneGraph
+
+EVERYTHING = ObservationConfig(num_objects=3, num_points=60, route=True, clearance=True, foresight=(0.5, 1.0))
+CONFIGS = pytest.mark.parametrize(
+    "config", [EVERYTHING, ObservationConfig(16, 4000), ObservationConfig.nothing()]
+)
+
+
+SCENES = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(), crossing(6))])
+
+
+@CONFIGS
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+@pytest.mark.parametrize("gradient", [False, True])
+def test_steps_goals_and_observations_stay_on_the_device(
+    config: ObservationConfig, dynamics: Any, gradient: bool
+) -> None:
+    env = DrivingEnv(SCENES, dynamics, config)
+    with pretend() as device, torch.set_grad_enabled(gradient):
+        on(device, env)
+        number = torch.arange(2, device=device.device)[:, None].expand(2, 3)
+        first = env.start(number, number)
+        env.step(act(env, first, gradient))
+        device.waits.clear()
+        start = env.start(number, number)
+        if config.route:
+            start = env.with_goals(env.choices(start))
+        out = env.step(act(env, start, gradient))["next"]
+        out = env.at(out)
+        assert {v.device.type for v in out.values(True, True)} == {NAME}
+        assert out[keys.COLLISION].shape == (2, 3, 2, 1)
+        if gradient and not dynamics.discrete and config.num_points:
+            out[keys.POINTS].sum().backward()
+        assert device.waits == []
+
+
+def act(env: DrivingEnv, state: Any, gradient: bool) -> Any:
+    shape = (*state.shape, env.num_agents)
+    if env.dynamics.discrete:
+        action = torch.zeros(shape, dtype=torch.int64, device=state.device)
+    else:
+        action = torch.zeros(*shape, 2, device=state.device, requires_grad=gradient)
+    return state.copy().set(keys.ACTION, action)
+
+
+def test_observing_without_an_environment_stays_on_the_device() -> None:
+    with pretend() as device:
+        given = on(device, SCENES)
+        row = torch.zeros(5, dtype=torch.int64, device=device.device)
+        agent = row[:, None].expand(5, 2)
+        objects = objects_at(given, row, row)
+        seen = observe(given, row, row, objects, agent, EVERYTHING)
+        flags = collision_flags(objects, agent), offroad_flags(given, row, objects.state[:, :2, :2])
+        found = [value for value in (*seen, *flags) if value is not None]
+        assert {value.device.type for value in found} == {NAME}
+
+
+def test_the_pretended_device_notices() -> None:
+    with pretend() as device:
+        there = torch.zeros(3, device=device.device)
+        with pytest.raises(FakeTensorDeviceMismatchError):
+            there + torch.ones(3)
+        with pytest.raises(DataDependentOutputException):
+            bool(there.any())
+        assert device.waits == []
+        there.cpu()
+        torch.tensor([1.0, 2.0]).to(device.device)
+        assert len(device.waits) == 2

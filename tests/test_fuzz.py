@@ -1,0 +1,95 @@
+"""A small part of `make fuzz` (see scripts/fuzz.py), and that it notices what it is for."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="memory is limited on Linux only"
+)
+if sys.platform.startswith("linux"):
+    import fuzz_run
+    import fuzz_targets
+    from fuzz_run import BAD, Counts, attempt, from_json, fuzz, inputs, to_json
+    from fuzz_targets import TARGETS, Target
+
+NEEDS = {"argoverse2": "pyarrow"}
+INPUTS = 40
+
+
+@pytest.fixture(params=["womd", "commonroad", "argoverse2", "store", "checkpoint", "configuration"])
+def name(request: pytest.FixtureRequest) -> str:
+    package = NEEDS.get(request.param)
+    if package is not None and importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    return str(request.param)
+
+
+def test_every_target_is_tested() -> None:
+    assert set(TARGETS) == {"womd", "commonroad", "argoverse2", "store", "checkpoint", "configuration"}
+
+
+def test_good_files_are_good(name: str, tmp_path: Path) -> None:
+    assert attempt(TARGETS[name], dict(TARGETS[name].good()), tmp_path) == ("accepted", "")
+
+
+def test_nothing_but_errors_of_ours(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process: no limits, but quick; the limits are for the long runs."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    counts = Counts()
+    for number in range(INPUTS):
+        (folder := tmp_path / str(number)).mkdir()
+        counts.add(number, *attempt(TARGETS[name], inputs(name, 1, number), folder))
+    assert counts.found == []
+    assert counts.outcomes["refused"] > INPUTS / 10
+
+
+def test_inputs_are_the_same_whenever_they_are_asked_for(name: str) -> None:
+    assert inputs(name, 3, 17) == inputs(name, 3, 17)
+    assert any(inputs(name, 3, k) != inputs(name, 4, k) for k in range(5))
+
+
+def misbehaves(folder: Path, file: str) -> tuple[str, str]:
+    """Does what a byte says."""
+    way = (folder / file).read_bytes()[0] % 6
+    if way == 0:
+        raise KeyError("lanes")
+    if way == 1:
+        time.sleep(60)
+    if way == 2:
+        np.ones(1 << 29)
+    if way == 3:
+        os.abort()
+    return ("absurd", "a speed") if way == 4 else ("refused", "")
+
+
+def test_whatever_goes_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz_run, "SECONDS", 1)
+    monkeypatch.setattr(fuzz_run, "inputs", lambda name, seed, number: {"a": bytes([number % 6])})
+    monkeypatch.setitem(TARGETS, "bad", Target(lambda: {"a": b"5"}, lambda rng, files: files, misbehaves))
+    counts = Counts()
+    fuzz("bad", counts, 4)
+    fuzz("bad", counts, 9)
+    expected = {"foreign": 2, "hang": 2, "memory": 2, "crash": 1, "absurd": 1, "refused": 1}
+    assert counts.outcomes == {**dict.fromkeys(fuzz_run.OUTCOMES, 0), **expected}
+    assert (counts.inputs, counts.bad) == (9, 8)
+    assert {kind for _, kind, _ in counts.found} == set(BAD)
+    again = from_json(to_json({"bad": counts}))["bad"]
+    assert dataclasses.replace(again, found=[tuple(each) for each in again.found]) == counts
+
+
+def test_absurd_segments_are_known(tmp_path: Path) -> None:
+    from helpers_segments import straight_road
+
+    good = straight_road()
+    assert fuzz_targets.absurd(good) == ""
+    fast = good.replace(velocity=good.velocity * np.float32(1e6))
+    assert "speed" in fuzz_targets.absurd(fast)

@@ -1,0 +1,256 @@
+"""Looking things up in the cells of a map gives what looking at everything gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import helpers_oracle as oracle
+from helpers_segments import crossing, straight_road
+from symphony.data.builtin import builtin_store
+from symphony.data.store import SegmentStore
+from symphony.envs import ObservationConfig, SceneBatch, collate, grids, scene
+from symphony.envs.flags import collision_flags, offroad_flags
+from symphony.envs.grids import GridCache
+from symphony.envs.observation import objects_at
+from symphony.envs.points import nearest_points, see_points
+from symphony.envs.road import road_distance
+from symphony.envs.tables import Tables
+from symphony.geometry import NO_BOUNDARY
+from symphony.geometry.grid import edge_grid, point_grid
+from symphony.geometry.nearest import nearest, smallest
+
+FEW = ObservationConfig(num_objects=4, num_points=60)
+
+
+@pytest.fixture(autouse=True)
+def fresh_cache(monkeypatch: pytest.MonkeyPatch) -> GridCache:
+    cache = GridCache()
+    monkeypatch.setattr(grids, "CACHE", cache)
+    return cache
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grids are made at the first query."""
+    monkeypatch.setattr(grids, "POINT_QUERIES", 0)
+    monkeypatch.setattr(grids, "EDGE_QUERIES", 0)
+
+
+@pytest.fixture(scope="module")
+def scenes() -> SceneBatch:
+    """Maps of several sizes, made and recorded, one without lights and one without a boundary."""
+    store = SegmentStore(builtin_store("train"))
+    bare = scene(straight_road(4))
+    bare = bare.replace(**{name: getattr(bare, name)[:, :0] for name in _EDGES})
+    given = [scene(s) for s in (straight_road(), crossing(6), *(store[k] for k in (0, 9, 21)))]
+    return collate([*given, bare])
+
+
+_EDGES = ("edge_start", "edge_end", "edge_valid", "edge_previous", "edge_following")
+
+
+def places(scenes: SceneBatch, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows of scenes [M] and positions [M, count, 2]: on points, near them, anywhere, and far off every map."""
+    rng = torch.Generator().manual_seed(seed)
+    row = torch.arange(len(scenes)).repeat_interleave(5)
+    pick = (torch.rand(len(row), count, generator=rng) * scenes.point_valid.sum(1)[row, None]).long()
+    near = scenes.point[row[:, None], pick]
+    spread = torch.tensor([0.0, 0.5, 5.0, 60.0, 2000.0])[torch.randint(5, (*pick.shape, 1), generator=rng)]
+    return row, near + spread * torch.randn(near.shape, generator=rng)
+
+
+@pytest.mark.usefixtures("at_once")
+@pytest.mark.parametrize("count", [1, 8, 60, 300, 5000])
+def test_the_nearest_points_are_those_among_all(scenes: SceneBatch, count: int) -> None:
+    row, where = places(scenes, 9)
+    tables = Tables(scenes, replace(FEW, num_points=count))
+    flat, mask = nearest_points(tables, row, where)
+    total = scenes.point.shape[1]
+    if count < total:
+        assert (tables.point_grids(1) is None) == (count == 5000)
+        expected = oracle.nearest_points(scenes, row, where, count)
+        exist = scenes.point_valid[row[:, None, None], expected]
+        assert torch.equal(mask, exist)
+        assert torch.equal(flat[mask], (expected + row[:, None, None] * total)[exist])
+    else:
+        assert torch.equal(mask.sum(-1), scenes.point_valid.sum(1)[row, None].expand(mask.shape[:2]))
+
+
+@pytest.mark.usefixtures("at_once")
+def test_points_are_seen_as_by_the_plain_formula_with_and_without_a_gradient(scenes: SceneBatch) -> None:
+    row, where = places(scenes, 3)
+    rng = torch.Generator().manual_seed(1)
+    pose = torch.cat([where, torch.randn(*where.shape[:2], 2, generator=rng) * 5], -1)
+    step = torch.randint(60, (len(row),), generator=rng)
+    tables = Tables(scenes, FEW)
+    inputs = pose[..., :2].clone().requires_grad_(), pose[..., 2], pose[..., 3]
+    with_graph, mask = see_points(tables, row, step, *inputs)
+    plain, again = see_points(tables, row, step, pose[..., :2], pose[..., 2], pose[..., 3])
+    chosen = oracle.nearest_points(scenes, row, where, FEW.num_points)
+    expected, exist = oracle.see_points(scenes, row, step, chosen, pose, FEW)
+    assert with_graph.requires_grad
+    assert not plain.requires_grad
+    assert torch.equal(mask, exist)
+    assert torch.equal(again, exist)
+    assert torch.equal(with_graph.detach(), expected)
+    assert torch.equal(plain, expected)
+    assert (expected[..., -9:].sum((-1, -2)) > 0).any()
+
+
+@pytest.mark.usefixtures("at_once")
+def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) -> None:
+    row, where = places(scenes, 40, seed=2)
+    tables = Tables(scenes, FEW)
+    expected = oracle.road_distance(scenes, row, where)
+    distance = road_distance(scenes, row, where, tables)
+    # Far from every edge float32 itself is coarser.
+    torch.testing.assert_close(distance, expected, atol=1e-5, rtol=1e-6)
+    flags = offroad_flags(scenes, row, where, tables)
+    sure = expected.abs() > 1e-4
+    assert torch.equal(flags[sure], (expected > 0)[sure])
+    assert 0.2 < flags.float().mean() < 0.8
+    assert (distance[row == len(scenes) - 1] == NO_BOUNDARY).all()
+    cells = tables.edge_grids(1)
+    assert cells is not None
+    assert 0.3 < (cells.sign != 0).mean() < 1
+
+
+@pytest.mark.usefixtures("at_once")
+def test_the_gradient_of_a_road_distance_is_that_among_all_edges(scenes: SceneBatch) -> None:
+    row, where = places(scenes, 10, seed=3)
+    there = [where.clone().requires_grad_() for _ in range(2)]
+    road_distance(scenes, row, there[0], Tables(scenes, FEW)).sum().backward()
+    oracle.road_distance(scenes, row, there[1]).sum().backward()
+    same = (there[0].grad - there[1].grad).norm(dim=-1) < 1e-4
+    # Where two edges are equally near, either gradient will do.
+    assert same.float().mean() > 0.98
+    assert (there[0].grad[row < len(scenes) - 1].norm(dim=-1) > 0.99).float().mean() > 0.95
+
+
+@pytest.mark.usefixtures("at_once")
+def test_padding_batch_and_order_change_nothing(scenes: SceneBatch) -> None:
+    row, where = places(scenes, 6, seed=4)
+    together = Tables(scenes, FEW)
+    flat, _ = nearest_points(together, row, where)
+    distance = road_distance(scenes, row, where, together)
+    for b in (3, 0):
+        valid, edges = scenes.point_valid[b].sum(), scenes.edge_valid[b].sum()
+        fields = {n: getattr(scenes, n)[b : b + 1] for n in SceneBatch.__annotations__}
+        for name in fields:
+            limit = {"point": valid, "edge_": edges}.get(name[:5])
+            if limit is not None:
+                fields[name] = fields[name][:, :limit]
+        lone = SceneBatch(**fields, batch_size=[1])
+        mine = row == b
+        zero = torch.zeros(int(mine.sum()), dtype=torch.int64)
+        alone = Tables(lone, FEW)
+        found, _ = nearest_points(alone, zero, where[mine].flip(1))
+        assert torch.equal(found.flip(1), flat[mine] - b * scenes.point.shape[1])
+        assert torch.equal(road_distance(lone, zero, where[mine].flip(1), alone).flip(1), distance[mine])
+
+
+def test_answers_stay_when_a_map_gets_its_grid(scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grids, "POINT_QUERIES", 100)
+    monkeypatch.setattr(grids, "EDGE_QUERIES", 100)
+    row, where = places(scenes, 6, seed=5)
+    tables, seen = Tables(scenes, FEW), []
+    for _ in range(6):
+        flat, _ = nearest_points(tables, row, where)
+        seen.append(
+            (flat, road_distance(scenes, row, where, tables), offroad_flags(scenes, row, where, tables))
+        )
+    assert tables.point_grids.complete
+    assert tables.edge_grids.complete
+    for flat, distance, flag in seen[1:]:
+        assert torch.equal(flat, seen[0][0])
+        torch.testing.assert_close(distance, seen[0][1], atol=1e-5, rtol=1e-6)
+        assert torch.equal(flag, seen[0][2])
+
+
+@pytest.mark.usefixtures("at_once")
+def test_scenes_on_one_map_share_a_grid_and_old_ones_make_room(fresh_cache: GridCache) -> None:
+    one, two = scene(crossing(6), [0, 1]), scene(crossing(6), [2, 3])
+    Tables(collate([one, two, one]), FEW).point_grids(1)
+    alone = fresh_cache.used
+    assert alone > 0
+    Tables(one, FEW).point_grids(1)
+    assert fresh_cache.used == alone
+    fresh_cache.memory = alone
+    Tables(scene(straight_road(8), [0]), FEW).point_grids(1)
+    assert 0 < fresh_cache.used <= alone
+
+
+def test_collisions_are_those_of_all_pairs() -> None:
+    scenes = collate([scene(crossing(7), [0, 1, 2]), scene(straight_road(5), [0, 1, 2])])
+    rng = torch.Generator().manual_seed(6)
+    row = torch.arange(2).repeat(200)
+    state = torch.randn(400, 3, 4, generator=rng) * torch.tensor([6.0, 6.0, 2.0, 3.0])
+    state[..., :2] += scenes.log_state[row, 3, 2, :2][:, None]
+    index, real = scenes.interactive[row], torch.rand(400, 3, generator=rng) < 0.9
+    objects = objects_at(scenes, row, torch.full_like(row, 3), state, index, real)
+    found, expected = collision_flags(objects, index), oracle.collisions(objects, index)
+    assert torch.equal(found, expected)
+    assert 0.1 < expected.float().mean() < 0.9
+
+
+@settings(max_examples=60)
+@given(st.integers(1, 6), st.integers(1, 40), st.integers(1, 45), st.integers(0, 10**6), st.booleans())
+def test_the_smallest_are_the_first_of_a_stable_sort(
+    rows: int, width: int, count: int, seed: int, spoiled: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.integers(0, 6, (rows, width)).astype(np.float32)
+    values[values == 5] = np.inf
+    if spoiled:
+        values[rng.random(values.shape) < 0.2] = np.nan
+    expected = np.sort(np.argsort(values, axis=-1, kind="stable")[:, :count], axis=-1)
+    found = smallest(values, count).reshape(rows, -1) - np.arange(rows)[:, None] * width
+    np.testing.assert_array_equal(found, expected)
+    index, finite = nearest(torch.from_numpy(values), count)
+    assert index.shape == finite.shape == (rows, count)
+    known = np.isfinite(values[np.arange(rows)[:, None], expected])
+    np.testing.assert_array_equal(finite[:, : expected.shape[1]], known)
+    assert not finite[:, expected.shape[1] :].any()
+
+
+@pytest.mark.parametrize("shift", [0.0, 3e4])
+def test_lists_hold_every_element_that_can_be_nearest(shift: float) -> None:
+    rng = np.random.default_rng(7)
+    points = np.cumsum(rng.normal(0, 2, (900, 2)), 0) + shift
+    grid, k = point_grid(points, 20), 20
+    assert grid is not None
+    start, end = points[:-1], points[1:]
+    number = np.arange(len(start))
+    edges = edge_grid(start, end, number - 1, np.where(number + 1 < len(start), number + 1, -1))
+    assert edges is not None
+    for made in (grid, edges):
+        columns, rows = made.shape
+        cell = rng.integers(0, columns * rows, 300)
+        corner = np.stack([cell % columns, cell // columns], -1) + rng.integers(0, 2, (300, 2)) * (1 - 1e-9)
+        place = np.array(made.origin) + made.size * corner
+        for c, where in zip(cell, place, strict=True):
+            listed = set(made.items[made.begin[c] : made.begin[c + 1]].tolist())
+            if made is grid:
+                wanted = np.argsort(np.linalg.norm(points - where, axis=-1))[:k]
+            else:
+                along = end - start
+                share = np.clip(((where - start) * along).sum(-1) / (along**2).sum(-1), 0, 1)
+                wanted = [np.linalg.norm(start + share[:, None] * along - where, axis=-1).argmin()]
+            assert listed.issuperset(np.asarray(wanted).tolist())
+    assert len(grid.items) < 0.5 * len(grid.sign) * len(points)
+
+
+def test_maps_without_elements_have_no_grid() -> None:
+    none: Any = np.zeros((0, 2))
+    assert point_grid(none, 5) is None
+    assert point_grid(np.random.default_rng(0).normal(size=(9, 2)), 9) is None
+    assert edge_grid(none, none, np.zeros(0, int), np.zeros(0, int)) is None
+    same = np.ones((3, 2))
+    assert edge_grid(same, same, np.full(3, -1), np.full(3, -1)) is None

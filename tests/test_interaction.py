@@ -1,0 +1,358 @@
+"""The INTERACTION reader: layouts, windows, egos, lights, and files that are refused."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers_interaction import CARS, COLUMNS, KML, META, PHASES, osm, public, taf, text, track, walker
+from helpers_sources import read_error, read_one
+from symphony.data.conformance import check_reader
+from symphony.data.segment import AgentType, RunSegment, SignalState, validate
+from symphony.data.sources import get_reader
+from symphony.data.sources.interaction_tracks import read_rows
+from symphony.errors import ConfigError, DataError
+
+
+def segments(path: Path, **options: object) -> list[RunSegment]:
+    """All segments of a file, which must be good."""
+    items = list(get_reader("interaction", **options).read(path))
+    assert all(isinstance(item, RunSegment) for item in items), items
+    return [item for item in items if isinstance(item, RunSegment)]
+
+
+# What a segment holds
+
+
+def test_tracks_of_the_public_layout(tmp_path: Path) -> None:
+    path = public(tmp_path, CARS, [*walker("P1"), *walker("P2", speed=6)])
+    segment = read_one("interaction", path)
+    assert segment.segment_id == "DR_X_000_t0"
+    assert segment.group == "DR_X_000"
+    assert segment.file == "vehicle_tracks_000.csv"
+    assert (segment.dt, segment.num_steps) == (0.1, 101)
+    assert segment.agent_id.tolist() == [-3, -2, 3, 5, 9]
+    kinds = [AgentType.CYCLIST, AgentType.PEDESTRIAN] + 3 * [AgentType.VEHICLE]
+    assert segment.agent_type.tolist() == kinds
+    np.testing.assert_allclose(segment.size[:, :2], [(1.8, 0.7), (0.7, 0.7)] + 3 * [(4.5, 2)], rtol=1e-6)
+    # The middle of the map is the origin.
+    np.testing.assert_array_equal(segment.origin, (50, 4, 0))
+    car = segment.position[2] + segment.origin
+    np.testing.assert_allclose(car[:, 0], np.arange(101), atol=1e-4)
+    np.testing.assert_allclose(car[:, 1], 2, atol=1e-4)
+    assert np.unique(segment.velocity[2], axis=0).tolist() == [[10, 0]]
+    # Walkers look where they walk.
+    np.testing.assert_allclose(segment.heading[1], np.pi / 2, rtol=1e-6)
+    # Of the two that move and are there throughout, both have one neighbour that moves beside the walkers.
+    assert segment.agent_id[segment.ego] == 3
+
+
+def test_windows_of_a_recording(tmp_path: Path) -> None:
+    path = public(tmp_path, track(3, steps=range(256)))
+    found = segments(path)
+    assert [(s.segment_id, s.num_steps) for s in found] == [
+        ("DR_X_000_t0", 101),
+        ("DR_X_000_t10", 101),
+        ("DR_X_000_t20", 56),
+    ]
+    assert {s.group for s in found} == {"DR_X_000"}
+    np.testing.assert_allclose(found[1].position[:, 0], found[0].position[:, 100])
+    # A rest of less than half a window is left out; so is none of it where windows overlap.
+    assert [s.num_steps for s in segments(public(tmp_path, track(3, steps=range(250))))] == [101, 101]
+    starts = [s.segment_id for s in segments(path, window=5, stride=10)]
+    assert starts == ["DR_X_000_t0", "DR_X_000_t10", "DR_X_000_t20"]
+    assert len(segments(path, window=20, stride=0.5)) == 30
+
+
+def test_egos(tmp_path: Path) -> None:
+    path = public(tmp_path, [*CARS, *track(7, y=6, steps=range(60))])
+    one, two = segments(path, egos="all")
+    assert [s.segment_id for s in (one, two)] == ["DR_X_000_t0_ego3", "DR_X_000_t0_ego5"]
+    assert [s.agent_id[s.ego] for s in (one, two)] == [3, 5]
+    assert one.group == two.group == "DR_X_000"
+    np.testing.assert_array_equal(one.road.lanes.points, two.road.lanes.points)
+    nobody = read_error("interaction", public(tmp_path, track(9, speed=0)))
+    assert nobody.segment == "DR_X_000_t0"
+    assert "no moving vehicle is observed at every step" in nobody.message
+
+
+def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
+    (tmp_path / "train").mkdir()
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "DR_Y.osm_xy").write_text(osm())
+    rows = []
+    for case, x in ((2.0, 0), (1.0, 20)):
+        both = [*track(1, x=x, steps=range(1, 41)), *track(2, x=x - 12, steps=range(1, 41))]
+        rows += [f"{case},{row},{int(k < 40)},0" for k, row in enumerate(both)]
+        rows += [f"{case},P1,{k},{100 * k},pedestrian/bicycle,48,{k / 10},0,1,,,,0,1" for k in range(1, 41)]
+    path = tmp_path / "train" / "DR_Y_train.csv"
+    path.write_text(text(rows, f"case_id,{COLUMNS},track_to_predict,interesting_agent"))
+    found = segments(path)
+    assert [s.segment_id for s in found] == ["DR_Y_train_case1", "DR_Y_train_case2"]
+    assert {s.group for s in found} == {"DR_Y_train"}
+    for segment, x in zip(found, (20, 0), strict=True):
+        assert (segment.num_steps, segment.current_step) == (40, 9)
+        assert segment.agent_id.tolist() == [-2, 1, 2]
+        assert (segment.predict.tolist(), segment.interest.tolist()) == ([1], [0])
+        assert segment.agent_type[0] == AgentType.PEDESTRIAN
+        np.testing.assert_allclose(segment.position[1, 0] + segment.origin, (x + 1, 2, 0), atol=1e-4)
+
+
+def test_lights_of_the_test_area(tmp_path: Path) -> None:
+    segment = read_one("interaction", taf(tmp_path))
+    assert segment.segment_id == "k1_001_t0"
+    lane = segment.road.lane_id[segment.signal_lane].tolist()
+    assert lane == [103, 104]
+    np.testing.assert_allclose(segment.signal_point + segment.origin, [(49, 2, 0), (49, 6, 0)], atol=1e-3)
+    assert segment.signal_state[0].tolist() == 20 * [SignalState.STOP] + 81 * [SignalState.GO]
+    assert segment.signal_state[1].tolist() == 20 * [SignalState.UNKNOWN] + 81 * [SignalState.STOP]
+    later = segments(taf(tmp_path, rows=track(3, steps=range(80))), window=2, stride=3)
+    assert [s.signal_state[0, 0] for s in later] == [SignalState.STOP, SignalState.GO, SignalState.GO]
+    without = read_one("interaction", taf(tmp_path, "000"))
+    assert without.signal_state.shape == (0, 101)
+    np.testing.assert_allclose(without.position, segment.position, atol=1e-5)
+
+
+# Motion that does not fit
+
+
+def raw(x: float = 0, **options: float) -> list[str]:
+    return [row for k in range(3) for row in track(k, x=x - 15 * k, **options)]
+
+
+@pytest.mark.parametrize("factor", [0.56, -1.0, 3.6])
+def test_velocities_that_are_not_those_of_the_positions(factor: float, tmp_path: Path) -> None:
+    path = public(tmp_path, raw(logged=factor))
+    error = read_error("interaction", path)
+    assert error.field == "vx, vy"
+    assert "motion='positions'" in error.message
+    segment = read_one("interaction", path, motion="positions")
+    np.testing.assert_allclose(segment.velocity, np.broadcast_to((10, 0), segment.velocity.shape), atol=1e-3)
+    np.testing.assert_allclose(segment.heading, 0, atol=1e-3)
+
+
+def test_headings_that_are_not_those_of_the_motion(tmp_path: Path) -> None:
+    path = public(tmp_path, [row.replace(",0.0,0.0,4.5", ",0.0,3.1,4.5") for row in raw()])
+    assert read_error("interaction", path).field == "psi_rad"
+    np.testing.assert_allclose(read_one("interaction", path, motion="positions").heading, 0, atol=1e-3)
+    # One that stands keeps the heading that was logged.
+    stands = [row.replace(",0.0,0.0,4.5", ",0.0,1.25,4.5") for row in track(9, x=20, speed=0)]
+    still = read_one("interaction", public(tmp_path, [*raw(), *stands]), motion="positions")
+    np.testing.assert_allclose(still.heading[3], 1.25, rtol=1e-6)
+
+
+def test_states_logged_twice(tmp_path: Path) -> None:
+    rows = [*CARS, track(3)[7].replace("7.0000,2.0000", "7.2000,2.1000")]
+    path = public(tmp_path, rows)
+    error = read_error("interaction", path)
+    assert "track 3 has two states at 700 ms" in error.message
+    found = read_one("interaction", path, motion="positions")
+    np.testing.assert_allclose(found.position[0, 7, :2] + found.origin[:2], (7.1, 2.05), atol=1e-4)
+
+
+# What is refused
+
+GOOD = text(CARS)
+BROKEN: dict[str, tuple[str, str]] = {
+    "empty": ("", "empty"),
+    "no rows": (COLUMNS + "\n", "no rows"),
+    "cut short": (GOOD[:-1], "cut short"),
+    "a column less": (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
+    "a column twice": (GOOD.replace("frame_id", "x", 1), "2 columns of that name"),
+    "a field less": (GOOD.replace(",car,", ",", 1), "10 fields, expected 11"),
+    "no number": (GOOD.replace(",2.0000,", ",two,", 1), "is not a number"),
+    "infinity": (GOOD.replace(",2.0000,", ",inf,", 1), "is not a number of metres"),
+    "no position": (GOOD.replace(",2.0000,", ",,", 1), "is not a number of metres"),
+    "an unknown type": (GOOD.replace(",car,", ",cow,", 1), "unknown value 'cow'"),
+    "a strange id": (GOOD.replace("\n3,", "\n3;,", 1), "unknown value '3;'"),
+    "half a millisecond": (GOOD.replace(",100,car", ",100.5,car", 1), "not a whole number"),
+    "uneven times": (GOOD.replace(",100,car", ",130,car"), "no multiples of their usual step"),
+    "one time": (text(track(3, steps=range(1))), "fewer than two steps"),
+    "not ASCII": (GOOD.replace("car", "autó", 1), "not ASCII"),
+    "two types": (GOOD.replace(",car,", ",truck,", 1).replace(",truck,", ",bicycle,", 1), "more than one"),
+    "no size": (GOOD.replace(",4.5,2.0", ",,"), "length and width must be positive"),
+    "another place": (text(track(3, x=9000)), "away from the map"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_tracks_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    content, message = BROKEN[name]
+    path = public(tmp_path)
+    path.write_text(content, encoding="utf-8")
+    error = read_error("interaction", path)
+    assert message in error.message
+    assert error.file == path
+
+
+def test_files_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("symphony.data.sources.interaction_tracks.MAX_BYTES", 1000)
+    path = public(tmp_path)
+    assert "at most 1000 can be read" in read_error("interaction", path).message
+    with pytest.raises(DataError, match="at most 1000"):
+        read_rows(path)
+
+
+COMPANIONS: dict[str, tuple[str, str | None, str]] = {
+    "no map": ("../../maps/k1.osm", None, "the map is missing"),
+    "a map that is none": ("../../maps/k1.osm", "<osm/>", "has no lanelets"),
+    "no meta data, so another projection": ("meta_data.csv", None, "away from the map"),
+    "no such recording": ("meta_data.csv", META.replace("001", "002"), "0 rows for recording 001"),
+    "no origin": ("meta_data.csv", META.replace("originLat", "lat"), "is not a number"),
+    "maybe phases": ("meta_data.csv", META.replace("yes", "maybe"), "neither yes nor no"),
+    "no phases": ("signal_phases_001.csv", None, "are missing"),
+    "another file": ("signal_phases_001.csv", "a,b\n", "expected rows of"),
+    "an unknown state": ("signal_phases_001.csv", PHASES.replace("DARK", "PINK"), "is no phase"),
+    "no group": ("signal_phases_001.csv", PHASES.replace("\n7,", "\nx,", 1), "is not an integer"),
+    "two states": ("signal_phases_001.csv", PHASES.replace("2000", "1000"), "has two states"),
+    "phases of another time": (
+        "signal_phases_001.csv",
+        PHASES.replace("000,", ","),
+        "the tracks at 11900 ms",
+    ),
+    "no connections": ("k1_map.kml", None, "are missing"),
+    "no lanes": (
+        "k1_map.kml",
+        "<kml xmlns='http://www.opengis.net/kml/2.2'/>",
+        "no lanes with a signal group",
+    ),
+    "a document type": ("k1_map.kml", KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),
+    "groups that are not there": (
+        "k1_map.kml",
+        KML.replace("7, 8", "17, 18").replace(">8<", ">18<"),
+        "fits a lane",
+    ),
+    "a group less": ("k1_map.kml", KML.replace("7, 8", "7"), "1 for 2 sinks"),
+}
+
+
+@pytest.mark.parametrize("name", COMPANIONS)
+def test_broken_companions_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    file, content, message = COMPANIONS[name]
+    path = taf(tmp_path)
+    companion = (path.parent / file).resolve()
+    if content is None:
+        companion.unlink()
+    else:
+        companion.write_text(content)
+    error = read_error("interaction", path)
+    assert message in error.message
+    assert Path(str(error.file)).resolve() in {path, companion}
+
+
+def test_names_of_another_format(tmp_path: Path) -> None:
+    (tmp_path / "tracks.csv").write_text(GOOD)
+    assert "expected a name like" in read_error("interaction", tmp_path / "tracks.csv").message
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"egos": "some"}, "'one' or 'all'"),
+        ({"motion": "both"}, "'logged' or 'positions'"),
+        ({"window": 0}, "window must be"),
+        ({"window": float("nan")}, "window must be"),
+        ({"stride": -1}, "stride must be"),
+    ],
+)
+def test_options_out_of_range(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        get_reader("interaction", **options)
+
+
+# Damage
+
+
+def one_folder(folder: Path, path: Path) -> Path:
+    """The recording with everything beside it."""
+    for file in [*path.parent.iterdir(), *(path.parents[2] / "maps").iterdir()]:
+        (folder / file.name).write_bytes(file.read_bytes())
+    return folder / path.name
+
+
+@pytest.mark.parametrize("layout", [public, taf])
+def test_conforms(layout: Callable[..., Path], tmp_path: Path) -> None:
+    rows = [*CARS, *track(11, x=-30, speed=8)]
+    extra = [walker("P1")] if layout is public else []
+    path = layout(
+        tmp_path / "tree", *([rows] if layout is public else []), *extra, **({} if extra else {"rows": rows})
+    )
+    report = check_reader(get_reader("interaction"), [path], flips=12)
+    assert report.segments == 1
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    assert check_reader(get_reader("interaction"), [one_folder(flat, path)], flips=4).segments == 1
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_mutated_recordings_give_errors_or_valid_segments(seed: int, tmp_path: Path) -> None:
+    """Lines, fields and elements are dropped, repeated, swapped and replaced by what is likely to hurt."""
+    rng = random.Random(seed)
+    path = taf(tmp_path)
+    parts = [path, *get_reader("interaction").companions(path)]
+    for _ in range(3):
+        file = rng.choice(parts)
+        content = file.read_text()
+        cut = ">" if file.suffix in {".osm", ".kml"} else rng.choice(",\n")
+        pieces = content.split(cut)
+        a, b = rng.randrange(len(pieces)), rng.randrange(len(pieces))
+        nasty = ["", "nan", "-1", "1e308", "9" * 30, "'", "<node/", "\x00", "id='1'", "car", pieces[b]]
+        match rng.randrange(4):
+            case 0:
+                pieces[a] = rng.choice(nasty)
+            case 1:
+                del pieces[a]
+            case 2:
+                pieces[a], pieces[b] = pieces[b], pieces[a]
+            case _:
+                pieces.insert(a, pieces[b])
+        file.write_text(cut.join(pieces))
+    items = list(get_reader("interaction", window=4, motion=rng.choice(["logged", "positions"])).read(path))
+    assert items
+    for item in items:
+        if isinstance(item, RunSegment):
+            validate(item)
+        else:
+            assert item.message
+            assert item.file is not None
+
+
+@pytest.mark.samples
+def test_samples(samples: Path) -> None:
+    folder = samples / "real" / "interaction" / "datasets" / "recorded_trackfiles"
+    if not folder.is_dir():
+        pytest.skip("the INTERACTION samples are not among the samples")
+    lit = folder / "k733_2020-09-15" / "vehicle_tracks_000.csv"
+    assert "0.56 times the speed" in read_error("interaction", lit).message
+    assert "two states" in read_error("interaction", folder / "k733_2018-05-02" / lit.name).message
+    reader = get_reader("interaction", window=5, motion="positions")
+    found = [item for item in reader.read(lit) if isinstance(item, RunSegment)]
+    assert len(found) == 28
+    # Of the cars that drive over a stop line, none does so at red.
+    assert crossings(found) == {SignalState.GO: 25, SignalState.CAUTION: 2}
+    clean = check_reader(
+        get_reader("interaction"), [folder / "k729_2022-03-16" / "vehicle_tracks_011.csv"], flips=2
+    )
+    assert clean.segments == 1
+
+
+def crossings(found: list[RunSegment]) -> dict[SignalState, int]:
+    """How many cars enter a lane with a light, by its state."""
+    counts: dict[SignalState, int] = {}
+    for s in found:
+        for light, lane in enumerate(s.signal_lane):
+            line = s.road.lanes[lane][:, :2]
+            along = (line[1] - line[0]) / np.hypot(*(line[1] - line[0]))
+            away = s.position[..., :2] - line[0]
+            ahead, aside = away @ along, away @ np.array([-along[1], along[0]])
+            enters = (ahead[:, :-1] < 0) & (ahead[:, 1:] >= 0) & (np.abs(aside[:, 1:]) < 1.5)
+            enters &= s.valid[:, :-1] & s.valid[:, 1:] & (s.agent_type == AgentType.VEHICLE)[:, None]
+            enters &= np.cos(s.heading[:, 1:] - np.arctan2(along[1], along[0])) > 0.9
+            for _, step in zip(*enters.nonzero(), strict=True):
+                state = SignalState(s.signal_state[light, step])
+                counts[state] = counts.get(state, 0) + 1
+    return counts

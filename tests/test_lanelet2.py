@@ -1,0 +1,235 @@
+"""Lanelet2 maps: what is read, how lanes connect, and what is refused."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, ROAD, WAYS, osm
+from helpers_sources import off_road
+from symphony.data.segment import LaneType, MarkType, RoadMap
+from symphony.data.sources.geodesy import mercator, utm
+from symphony.data.sources.lanelet2 import LaneletMap, read_lanelet2
+from symphony.data.sources.lanelet2_road import lane_lanelets, middle, road_map, stop_line
+from symphony.errors import DataError
+
+FROM_ORIGIN = partial(mercator, origin=np.array(ORIGIN))
+
+
+def read(folder: Path, content: str) -> LaneletMap:
+    path = folder / "made.osm"
+    path.write_text(content)
+    return read_lanelet2(path, FROM_ORIGIN)
+
+
+def road_of(folder: Path, content: str) -> RoadMap:
+    return road_map(read(folder, content), np.zeros(2))
+
+
+def refused(folder: Path, content: str) -> DataError:
+    with pytest.raises(DataError) as caught:
+        road_of(folder, content)
+    return caught.value
+
+
+@pytest.mark.parametrize("how", ["xy", "local", "degrees"])
+def test_lanes_links_and_neighbours(how: str, tmp_path: Path) -> None:
+    road = road_of(tmp_path, osm(how))
+    assert road.lane_id.tolist() == [101, 102, 103, 104]
+    assert road.successors.tolist() == [[0, 2], [1, 3]]
+    assert road.left_neighbors.tolist() == [[0, 1], [2, 3]]
+    assert road.right_neighbors.tolist() == [[1, 0], [3, 2]]
+    np.testing.assert_allclose(road.lane_width, 4, atol=1e-4)
+    for k, (begin, y) in enumerate(((0, 2), (0, 6), (50, 2), (50, 6))):
+        line = road.lanes[k]
+        np.testing.assert_allclose(line[[0, -1], :2], [(begin, y), (begin + 50, y)], atol=1e-4)
+        assert np.diff(line[:, 0]).max() < 2.01
+    # The lowest of the lanelet's own limit and its rule's.
+    np.testing.assert_allclose(road.speed_limit, [30 / 3.6, np.nan, np.nan, np.nan], rtol=1e-6)
+    assert set(road.lane_type.tolist()) == {LaneType.SURFACE_STREET}
+
+
+def test_marks(tmp_path: Path) -> None:
+    source = read(tmp_path, osm())
+    road = road_map(source, np.zeros(2))
+    kinds = road.mark_type.tolist()
+    assert sorted(kinds) == sorted([MarkType.ROAD_LINE] * 3 + [MarkType.STOP_SIGN, MarkType.CROSSWALK])
+    sign = road.marks[kinds.index(MarkType.STOP_SIGN)]
+    np.testing.assert_allclose(sign, [[100, 2, 0]])
+    ring = road.marks[kinds.index(MarkType.CROSSWALK)]
+    np.testing.assert_array_equal(ring[0], ring[-1])
+    lanes = lane_lanelets(source)
+    np.testing.assert_allclose(stop_line(lanes[0], source.rules), (50, 4))
+    assert stop_line(lanes[1], source.rules) is None
+    np.testing.assert_array_equal(middle(source), (50, 4))
+
+
+def test_the_boundary_is_open_at_both_ends(tmp_path: Path) -> None:
+    road = road_of(tmp_path, osm())
+    spots = np.array([(50, 4), (120, 4), (-20, 4), (50, -1), (50, 9), (120, 9)])
+    assert (off_road(road, spots) < 0).tolist() == [True, True, True, False, False, False]
+    assert len(road.boundary) == 2
+
+
+@given(st.lists(st.booleans(), min_size=len(WAYS), max_size=len(WAYS)), st.booleans())
+def test_the_direction_ways_are_drawn_in_does_not_matter(turned: list[bool], swapped: bool) -> None:
+    ways = {
+        name: (tuple(nodes)[::-1] if turn else tuple(nodes), tags)
+        for (name, (nodes, tags)), turn in zip(WAYS.items(), turned, strict=True)
+    }
+    lanelets = dict(reversed(LANELETS.items())) if swapped else LANELETS
+    with tempfile.TemporaryDirectory() as folder:
+        road, same = (
+            road_of(Path(folder), content) for content in (osm(ways=ways, lanelets=lanelets), osm())
+        )
+    order = np.argsort(road.lane_id)
+    assert {(int(road.lane_id[a]), int(road.lane_id[b])) for a, b in road.successors} == {
+        (101, 103),
+        (102, 104),
+    }
+    left = {(int(road.lane_id[a]), int(road.lane_id[b])) for a, b in road.left_neighbors}
+    assert left == {(101, 102), (103, 104)}
+    for k, lane in enumerate(order):
+        np.testing.assert_allclose(road.lanes[int(lane)], same.lanes[k], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("tags", "left", "right"),
+    [
+        (DASHED, True, True),
+        ({"type": "virtual"}, True, True),
+        ({}, True, True),
+        (BORDER, False, False),
+        ({"type": "curbstone"}, False, False),
+        ({"type": "line_thin", "subtype": "solid"}, False, False),
+        ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
+        ({"type": "line_thin", "subtype": "solid", "lane_change": "yes"}, True, True),
+        ({"type": "line_thin", "subtype": "dashed", "lane_change": "no"}, False, False),
+        # The solid one is on the left of the way as drawn: it may be crossed from its other side.
+        ({"type": "line_thin", "subtype": "solid_dashed"}, True, False),
+        ({"type": "line_thin", "subtype": "dashed_solid"}, False, True),
+    ],
+)
+def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool, tmp_path: Path) -> None:
+    for nodes, swap in (((3, 4), False), ((4, 3), True)):
+        road = road_of(tmp_path, osm(ways=WAYS | {22: (nodes, tags)}))
+        found = [0, 1] in road.left_neighbors.tolist(), [1, 0] in road.right_neighbors.tolist()
+        assert found == ((right, left) if swap else (left, right))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("50", 50 / 3.6),
+        ("50 km/h", 50 / 3.6),
+        ("25 mph", 25 * 0.44704),
+        ("8.5 m/s", 8.5),
+        ("de274-60", 60 / 3.6),
+        ("us_r2-1-25", 25 * 0.44704),
+        ("none", np.nan),
+        ("", np.nan),
+        ("900", np.nan),
+    ],
+)
+def test_speed_limits(text: str, expected: float, tmp_path: Path) -> None:
+    rules = {202: ({"subtype": "speed_limit", "sign_type": text}, {})}
+    lanelets = LANELETS | {101: (22, 21, ROAD, (202,))}
+    np.testing.assert_allclose(
+        road_of(tmp_path, osm(lanelets=lanelets, rules=rules)).speed_limit[0], expected, 1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("subtype", "kind"),
+    [
+        ("bicycle_lane", LaneType.BIKE_LANE),
+        ("highway", LaneType.FREEWAY),
+        ("bus_lane", LaneType.SURFACE_STREET),
+    ],
+)
+def test_lane_types(subtype: str, kind: LaneType, tmp_path: Path) -> None:
+    lanelets = LANELETS | {101: (22, 21, {"type": "lanelet", "subtype": subtype}, ())}
+    assert road_of(tmp_path, osm(lanelets=lanelets)).lane_type[0] == kind
+
+
+def test_oncoming_lanes_are_no_neighbours(tmp_path: Path) -> None:
+    nodes = NODES | {3: (0, 4), 5: (0, 8)}
+    # Bounds named the other way round: this lane comes towards the first.
+    lanelets = LANELETS | {102: (22, 23, ROAD, ())}
+    road = road_of(tmp_path, osm(nodes=nodes, lanelets=lanelets))
+    line = road.lanes[1]
+    assert line[0, 0] > line[-1, 0]
+    assert [0, 1] not in road.left_neighbors.tolist()
+    assert [1, 0] not in road.left_neighbors.tolist()
+
+
+def deleted(content: str) -> str:
+    return content.replace("<relation id='104'", "<relation action='delete' id='104'")
+
+
+def test_what_an_editor_deleted_is_not_there(tmp_path: Path) -> None:
+    assert road_of(tmp_path, deleted(osm())).lane_id.tolist() == [101, 102, 103]
+
+
+BROKEN: dict[str, tuple[str, str]] = {
+    "no XML": ("this is no map", "not well-formed XML"),
+    "empty": ("", "empty"),
+    "another root": ("<gpx/>", "not an OSM file"),
+    "a document type": (osm().replace("<osm", "<!DOCTYPE osm><osm", 1), "document type"),
+    "an entity": (
+        "<!DOCTYPE osm [<!ENTITY a 'b'>]><osm>&a;</osm>",
+        "document type, which OSM files never do",
+    ),
+    "no lanelets": (osm(lanelets={}), "has no lanelets"),
+    "only crosswalks": (osm(lanelets={105: LANELETS[105]}), "has no lanes"),
+    "one bound": (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), "0 ways, expected one"),
+    "an unknown way": (osm(lanelets={101: (22, 99, ROAD, ())}), "there is no way 99"),
+    "an unknown node": (osm(ways=WAYS | {21: ((1, 77), BORDER)}), "there is no node 77"),
+    "a bound of one point": (osm(ways=WAYS | {21: ((1,), BORDER)}), "fewer than 2 points"),
+    "no number": (osm().replace("x='50'", "x='fifty'", 1), "is not a number"),
+    "infinity": (osm().replace("x='50'", "x='inf'", 1), "not finite"),
+    "no place": (osm().replace("x='50'", "", 1), "is not a number"),
+    "a pole": (osm("degrees").replace("lat='49.", "lat='89.", 1), "outside latitudes"),
+    "two of one id": (
+        osm().replace("<relation id='102'", "<relation id='101'"),
+        "two lanelets of one id",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_maps_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    content, message = BROKEN[name]
+    error = refused(tmp_path, content)
+    assert message in error.message
+    if name not in {"only crosswalks", "two of one id"}:
+        assert error.file == tmp_path / "made.osm"
+
+
+def test_missing_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="can't be read"):
+        read_lanelet2(tmp_path / "nowhere.osm", FROM_ORIGIN)
+
+
+@pytest.mark.samples
+def test_sample_maps(samples: Path) -> None:
+    files = sorted(samples.glob("real/interaction/datasets/maps/*.osm"))
+    if not files:
+        pytest.skip("the Lanelet2 samples are not among the samples")
+    for file in files:
+        projection: Any = partial(utm, origin=np.array([49.0, 8.4]))
+        source = read_lanelet2(file, projection)
+        road = road_map(source, middle(source))
+        ends = road.lanes.points[road.lanes.offsets[1:] - 1]
+        starts = road.lanes.points[road.lanes.offsets[:-1]]
+        gaps = np.hypot(*(ends[road.successors[:, 0]] - starts[road.successors[:, 1]])[:, :2].T)
+        assert len(gaps) >= 30
+        assert gaps.max() < 1e-3
+        assert 1 < road.lane_width.min() < road.lane_width.max() < 7

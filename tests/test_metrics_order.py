@@ -1,0 +1,132 @@
+"""Who goes first where paths cross or merge."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symphony.data.context import relations
+from symphony.metrics import order_statistics, passing_gap
+from test_context import CASES, scene
+
+STEPS, DT = 60, 0.2
+TIME = torch.arange(STEPS) * DT
+EVERY = torch.ones(STEPS, dtype=torch.bool)
+
+
+def along_x(arrival: float, speed: float = 10.0) -> torch.Tensor:
+    """Drives along +x and is at the origin at a time."""
+    x = speed * (TIME - arrival)
+    return torch.stack((x, torch.zeros_like(x)), -1)
+
+
+def along_y(arrival: float, speed: float = 10.0) -> torch.Tensor:
+    return along_x(arrival, speed).flip(-1)
+
+
+def joining(arrival: float, speed: float = 10.0) -> torch.Tensor:
+    """Comes from the side at 45 degrees into +x at the origin."""
+    x = speed * (TIME - arrival)
+    return torch.stack(
+        (torch.where(x < 0, x * math.sqrt(0.5), x), torch.where(x < 0, x * math.sqrt(0.5), 0.0)), -1
+    )
+
+
+def gap(a: torch.Tensor, b: torch.Tensor, **changes: torch.Tensor) -> float:
+    masks = {"first_valid": EVERY, "second_valid": EVERY, **changes}
+    return passing_gap(a, b, **masks, dt=DT).item()
+
+
+@pytest.mark.parametrize(("mine", "theirs"), [(4.0, 6.0), (6.0, 4.5), (5.0, 5.5), (3.0, 10.0)])
+def test_crossing_paths(mine: float, theirs: float) -> None:
+    assert gap(along_x(mine), along_y(theirs)) == pytest.approx(theirs - mine, abs=0.1)
+
+
+@pytest.mark.parametrize(("mine", "theirs"), [(4.0, 6.0), (6.0, 4.5)])
+def test_merging_paths(mine: float, theirs: float) -> None:
+    assert gap(along_x(mine), joining(theirs)) == pytest.approx(theirs - mine, abs=0.2)
+
+
+def test_paths_that_do_not_meet() -> None:
+    aside = along_x(4.0) + torch.tensor([0.0, 3.5])
+    assert math.isnan(gap(along_x(4.0), aside))
+    # The other one stops short of the crossing.
+    assert math.isnan(gap(along_x(4.0), along_y(6.0).clamp(max=-3.0)))
+
+
+def test_fast_vehicles_do_not_jump_over_the_place() -> None:
+    # At 30 m/s a step is 6 m.
+    assert gap(along_x(4.1, 30.0), along_y(6.1, 30.0)) == pytest.approx(2.0, abs=0.1)
+
+
+def test_steps_that_are_not_valid_do_not_count() -> None:
+    seen = TIME < 5.0
+    assert math.isnan(gap(along_x(4.0), along_y(6.0), second_valid=seen))
+    hidden = torch.where(seen[:, None], along_y(6.0), torch.nan)
+    assert math.isnan(gap(along_x(4.0), hidden, second_valid=seen))
+    wild = torch.where((TIME < 7.0)[:, None], along_y(6.0), 1e30)
+    assert gap(along_x(4.0), wild, second_valid=TIME < 7.0) == gap(along_x(4.0), along_y(6.0))
+
+
+def test_both_at_once() -> None:
+    assert gap(along_x(5.0), along_y(5.0)) == 0
+
+
+@given(st.floats(1, 11), st.floats(1, 11), st.floats(2, 20), st.floats(2, 20), st.floats(-4, 4))
+def test_swapping_turning_and_moving(
+    mine: float, theirs: float, speed: float, other: float, angle: float
+) -> None:
+    a, b = along_x(mine, speed).double(), along_y(theirs, other).double()
+    plain = gap(a, b)
+    assert gap(b, a) == pytest.approx(-plain)
+    turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]).double()
+    moved = torch.tensor([30.0, -7.0]).double()
+    assert gap(a @ turn + moved, b @ turn + moved) == pytest.approx(plain, abs=2 * DT / 4)
+
+
+def test_batches() -> None:
+    a = torch.stack([along_x(4.0), along_x(6.0)])[:, None].expand(2, 3, -1, -1)
+    b = torch.stack([along_y(5.0), along_y(6.5), along_y(9.0)])[None].expand(2, 3, -1, -1)
+    found = passing_gap(a, b, EVERY.expand(2, 3, -1), EVERY.expand(2, 3, -1), DT)
+    expected = [[gap(a[i, j], b[i, j]) for j in range(3)] for i in range(2)]
+    np.testing.assert_allclose(found.numpy(), expected)
+
+
+def test_statistics() -> None:
+    nan = math.nan
+    log = torch.tensor([2.0, -1.0, nan, 0.0])
+    simulated = torch.tensor(
+        [[3.0, -1.0, 1.0, 1.0], [-2.0, nan, 1.0, 1.0], [1.0, 0.0, nan, 1.0], [2.0, -2.0, 1.0, 1.0]]
+    )
+    found = order_statistics(simulated, log)
+    assert found.pairs == 2
+    assert (found.kept, found.reversed, found.apart) == pytest.approx((5 / 8, 1 / 8, 2 / 8))
+    assert found.gap_error == pytest.approx((1 + 4 + 1 + 0 + 0 + 1 + 1) / 7)
+
+
+def test_the_log_keeps_its_own_order() -> None:
+    log = torch.tensor([2.0, -1.0, math.nan])
+    found = order_statistics(log.expand(5, 3), log)
+    assert (found.pairs, found.kept, found.reversed, found.apart, found.gap_error) == (2, 1, 0, 0, 0)
+
+
+def test_nothing_to_count() -> None:
+    found = order_statistics(torch.zeros(3, 0), torch.zeros(0))
+    assert found.pairs == 0
+    assert math.isnan(found.kept)
+
+
+@pytest.mark.parametrize("case", [
+    "turns in before", "turns in after", "changes lane ahead", "ego changes lane", "crosses", "crosses from a stop",
+])  # fmt: skip
+def test_pairs_that_interact_pass_one_after_the_other(case: str) -> None:
+    segment = scene(CASES[case][1])
+    found = relations(segment, np.array([1]))
+    position, valid = torch.from_numpy(segment.position[:2, :, :2]), torch.from_numpy(segment.valid[:2])
+    ahead = passing_gap(position[0], position[1], valid[0], valid[1], segment.dt).item()
+    assert abs(ahead) == pytest.approx(min(found.merge[0], found.crossing[0]), abs=0.5)

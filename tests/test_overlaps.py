@@ -1,0 +1,142 @@
+"""Overlaps in logs: found as shapely finds them, counted, told, and left out on request."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers_segments import hide, random_segment, straight_road
+from helpers_sources import ROAD, commonroad, driver
+from symphony.cli import main
+from symphony.data.convert import convert, info
+from symphony.data.overlaps import overlapping
+from symphony.data.report import Report, Skip
+from symphony.data.segment import AgentType, RunSegment
+from symphony.data.selection import travel
+from symphony.data.sources.base import Item, Reader
+from symphony.data.store import SegmentStore
+
+
+def boxes(s: RunSegment, step: int) -> list[shapely.Polygon]:
+    found = []
+    for a in range(s.num_agents):
+        length, width = s.size[a, :2].astype(float) / 2
+        shape = shapely.box(-length, -width, length, width)
+        cos, sin = np.cos(float(s.heading[a, step])), np.sin(float(s.heading[a, step]))
+        turned = shapely.transform(shape, lambda p, c=cos, n=sin: p @ np.array([[c, n], [-n, c]]))
+        found.append(shapely.transform(turned, lambda p, a=a: p + s.position[a, step, :2].astype(float)))
+    return found
+
+
+@given(st.integers(0, 200))
+def test_agrees_with_shapely(seed: int) -> None:
+    segment = random_segment(seed=seed, agents=7)
+    # Nearer to each other than they come, so that some overlap.
+    segment = segment.replace(position=segment.position * np.float32(0.05))
+    drives = (segment.agent_type == AgentType.VEHICLE) & (travel(segment) > 2)
+    expected = set()
+    for step in range(segment.num_steps):
+        there = np.flatnonzero(segment.valid[:, step])
+        shapes = boxes(segment, step)
+        for i, a in enumerate(there.tolist()):
+            for b in there[i + 1 :].tolist():
+                if (drives[a] or drives[b]) and shapes[a].intersection(shapes[b]).area > 1e-6:
+                    expected.add((a, b))
+    assert {tuple(pair) for pair in overlapping(segment).tolist()} == expected
+
+
+def overlapped(seed: int = 0) -> RunSegment:
+    """Two cars of the first lane, of which one stands inside the other's path."""
+    segment = straight_road(3, seed=seed, dt=0.1, steps=91, segment_id=f"bad-{seed}")
+    position = segment.position.copy()
+    position[2] = position[0, 30]
+    velocity = segment.velocity.copy()
+    velocity[2] = 0
+    return segment.replace(position=position, velocity=velocity)
+
+
+def test_who_counts() -> None:
+    segment = overlapped()
+    assert overlapping(segment).tolist() == [[0, 2]]
+    assert overlapping(straight_road(4)).tolist() == []
+    # Not where one of them is not there, and not where neither is a vehicle that moves.
+    assert overlapping(hide(segment, 0, slice(15, 45))).tolist() == []
+    types = segment.agent_type.copy()
+    types[0] = AgentType.PEDESTRIAN
+    assert overlapping(segment.replace(agent_type=types)).tolist() == []
+    types[0], types[2] = AgentType.VEHICLE, AgentType.PEDESTRIAN
+    assert overlapping(segment.replace(agent_type=types)).tolist() == [[0, 2]]
+
+
+class Mixed(Reader):
+    """Each line of a file is the seed of a clean segment or, after an ``x``, of one with an overlap."""
+
+    name = "mixed"
+    patterns = ("*.mixed",)
+
+    def _read(self, path: Path) -> Iterator[Item]:
+        for line in path.read_text().split():
+            seed = int(line.removeprefix("x"))
+            clean = straight_road(4, seed=seed, dt=0.1, steps=91, segment_id=f"good-{seed}")
+            found = overlapped(seed) if line.startswith("x") else clean
+            yield found.replace(source=self.name, file=path.name)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_conversion_counts_and_tells(workers: int, tmp_path: Path) -> None:
+    for k, text in enumerate(("x1 2 3", "4 x5")):
+        (tmp_path / f"{k}.mixed").write_text(text)
+    report = convert(Mixed(), [tmp_path], tmp_path / "all", workers=workers)
+    assert (report.converted, report.overlaps) == (5, 2)
+    assert "in 2 of 5 segments (40.0 %)" in report.warning
+    store = SegmentStore(tmp_path / "all")
+    tagged = {store.ids[i] for i in range(5) if store.tags(i).get("overlaps")}
+    assert tagged == {"bad-1", "bad-5"}
+    assert info(tmp_path / "all")["overlaps"] == 2
+    assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
+    (tmp_path / "more.mixed").write_text("6 x7")
+    convert(Mixed(), [tmp_path / "more.mixed"], tmp_path / "all", append=True, workers=workers)
+    assert info(tmp_path / "all")["overlaps"] == 3
+
+    without = convert(Mixed(), [tmp_path], tmp_path / "clean", exclude_overlaps=True, workers=workers)
+    assert (without.converted, without.overlaps, without.warning) == (4, 0, "")
+    assert without.exclusions["overlaps"] == 3
+    assert without.settings["exclude_overlaps"] is True
+    assert {skip.segment for skip in without.skipped} == {"bad-1", "bad-5", "bad-7"}
+    assert without.problems == {}
+
+
+def test_few_overlaps_are_counted_without_a_warning() -> None:
+    assert Report(converted=100, overlaps=5).warning == ""
+    assert "6.0 %" in Report(converted=100, overlaps=6).warning
+    assert Report().warning == ""
+    both = Report(converted=3, overlaps=1).after(Report(converted=4, overlaps=2, skipped=[Skip("a")]))
+    assert (both.converted, both.overlaps, len(both.skipped)) == (7, 3, 1)
+
+
+def test_the_command_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # The second is slower and starts ahead of the first, which drives through it.
+    cars = (
+        driver(7, steps=range(25)),
+        driver(8, x=6, speed=5, steps=range(25)),
+        driver(9, x=-30, steps=range(25)),
+    )
+    file = tmp_path / "a.xml"
+    file.write_text(commonroad(ROAD, *cars))
+    out = str(tmp_path / "store")
+    assert main(["data", "convert", "commonroad", str(file), "--out", out]) == 0
+    shown = capsys.readouterr()
+    assert "boxes overlap in the log" in shown.err
+    assert "converted with boxes that overlap" in shown.out
+    assert main(["data", "info", out]) == 0
+    assert "boxes overlap in the log of" in capsys.readouterr().out
+    clean = str(tmp_path / "clean")
+    assert main(["data", "convert", "commonroad", str(file), "--out", clean, "--exclude-overlaps"]) == 1
+    assert "overlap in the log" in capsys.readouterr().err

@@ -1,0 +1,328 @@
+"""Runs that preview what their agent does while they train."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from helpers_runs import build, same_weights, tiny, weights
+from helpers_segments import crossing, hide, straight_road
+from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import checkpoints
+from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig, read_json, to_json
+from symphony.data.store import SegmentStore
+from symphony.envs.scene import scene
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation import evaluate
+from symphony.evaluation.pictures import clip_of
+from symphony.recipes import train
+from symphony.render import Clip, curves
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.driving import playback, simulated
+from symphony.simulation.rollouts import Rollouts
+from symphony.training.logging import read_metrics
+from symphony.training.previews import QUANTILES, ROLLOUTS, Preview, samples_of
+
+MOTIONS = ("speed", "acceleration", "turn")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "train"
+    fill(
+        path, [straight_road(4, seed=0, steps=9), crossing(4, seed=0, steps=7), crossing(5, seed=1, steps=8)]
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "held_out"
+    fill(path, [crossing(6, seed=10 + seed, steps=7) for seed in range(4)])
+    return path
+
+
+def config(store: Path, out: Path, every: int, method: Any = "bc", **changes: Any) -> TrainConfig:
+    return tiny(method, store, out, preview=PreviewConfig(every=every, segments=2), **changes)
+
+
+def media(run: Path) -> list[str]:
+    return sorted(path.name for path in (run / "media").glob("*"))
+
+
+def previewed(run: Path) -> dict[int, dict[str, Any]]:
+    """What was recorded of it, by the update."""
+    records = [
+        (r["step"], {k: v for k, v in r.items() if k.startswith("preview_")}) for r in read_metrics(run)
+    ]
+    return {step: found for step, found in records if found}
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write the numbers instead of drawing them, which takes a second."""
+
+    def write(clips: list[Clip], path: Path) -> None:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"".join(clip.position.tobytes() for clip in clips))
+
+    monkeypatch.setattr("symphony.training.previews.animate_rollouts", write)
+
+
+@pytest.fixture(scope="module")
+def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(config(store, tmp_path_factory.mktemp("runs") / "bc_ts_h", 2, "bc_ts_h", steps=5))
+
+
+def test_a_run_shows_itself_now_and_then_and_at_its_end(run: Path) -> None:
+    assert media(run) == [f"rollout-00000{step}.gif" for step in (2, 4, 5)]
+    assert list(previewed(run)) == [2, 4, 5]
+    for name in media(run):
+        with Image.open(run / "media" / name) as image:
+            assert image.n_frames == 8
+
+
+def test_runs_shorter_than_that_and_others_show_nothing(store: Path, tmp_path: Path) -> None:
+    for every in (0, 3):
+        out = train(config(store, tmp_path / str(every), every, steps=2))
+        assert not (out / "media").exists()
+        assert previewed(out) == {}
+
+
+@pytest.mark.parametrize(
+    ("method", "validated"), [("bc", True), ("bc_ts_h", False), ("bc_ts_h", True), ("mgail", False)]
+)
+@pytest.mark.usefixtures("undrawn")
+def test_being_watched_changes_nothing(
+    store: Path, held_out: Path, tmp_path: Path, method: str, validated: bool
+) -> None:
+    noisy = replace(tiny(method, store, tmp_path).discriminator, instance_noise=0.1)
+    changes = {"discriminator": noisy, "validation": ValidationConfig(data=held_out if validated else None)}
+    changes["validation"] = replace(changes["validation"], rollouts=2)
+    blind, watched = (
+        train(config(store, tmp_path / str(every), every, method, **changes)) for every in (0, 2)
+    )
+    assert same_weights(weights(f"{blind}@last"), weights(f"{watched}@last"))
+    assert len(media(watched)) == 2
+    strip = [
+        [
+            {k: v for k, v in record.items() if not k.startswith("preview_") and k != "updates_per_second"}
+            for record in read_metrics(run)
+        ]
+        for run in (blind, watched)
+    ]
+    assert strip[0] == strip[1]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_resumed_run_shows_the_rest_whatever_is_there(store: Path, tmp_path: Path) -> None:
+    whole = config(store, tmp_path / "run", 2, "bc_ts", steps=6)
+    train(whole)
+    before = {name: (whole.out / "media" / name).read_bytes() for name in media(whole.out)}
+    numbers = previewed(whole.out)
+    shutil.rmtree(checkpoints(whole.out / "checkpoints")[-1])
+    (whole.out / "media" / "rollout-000002.gif").unlink()
+    (whole.out / "media" / "rollout-000006.gif").write_bytes(b"cut short")
+    train(replace(whole, resume=True))
+    assert media(whole.out) == ["rollout-000004.gif", "rollout-000006.gif"]
+    assert all((whole.out / "media" / name).read_bytes() == before[name] for name in media(whole.out))
+    assert previewed(whole.out) == numbers
+    # How often it is shown does not make it another run.
+    train(replace(whole, resume=True, steps=8, preview=PreviewConfig(every=8)))
+    assert media(whole.out)[-1] == "rollout-000008.gif"
+
+
+def test_segments_to_validate_on_are_shown_where_there_are_some(
+    store: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(
+        "symphony.training.previews.animate_rollouts",
+        lambda clips, path: seen.extend(clip.segment.segment_id for clip in clips),
+    )
+    for data in (None, held_out):
+        validation = ValidationConfig(data=data, rollouts=1)
+        train(config(store, tmp_path / str(data is None), 2, steps=2, validation=validation))
+    assert seen == ["straight-0", "crossing-0", "crossing-10", "crossing-12"]
+
+
+def test_the_numbers_are_quantiles_of_what_the_agent_does(run: Path, store: Path) -> None:
+    """Simulated with its search and its goals, as the evaluator does; the rest is worked out once more by numpy."""
+    agent, segments = load_agent(f"{run}@4"), SegmentStore(store)
+    dataset = SceneDataset(segments, 2, agent.dynamics, [0, 1], routes=True)
+    scenes = dataset.scenes([0, 1])
+    found = simulated(agent, scenes, EvaluateConfig(rollouts=ROLLOUTS))
+    values: dict[str, list[float]] = {name: [] for name in (*MOTIONS, *(f"{m}_log" for m in MOTIONS), "ade")}
+    for b in range(2):
+        segment, away = dataset.segment(b), []
+        for n, agent_row in enumerate(scenes.interactive[b].tolist()):
+            heading = segment.heading[agent_row].astype(float)
+            course = np.stack([np.cos(heading), np.sin(heading)], -1)
+            speed = (segment.velocity[agent_row] * course).sum(-1)
+            tracks = [(segment.position[agent_row, :, :2], heading, speed, "_log")]
+            for k in range(ROLLOUTS):
+                state = found.state[b, k, : segment.num_steps, n].double().numpy()
+                tracks.append((state[:, :2], state[:, 2], state[:, 3], ""))
+                away.append(np.linalg.norm(state[1:, :2] - segment.position[agent_row, 1:, :2], axis=-1))
+            for _, angle, pace, kind in tracks:
+                values[f"speed{kind}"].extend(pace[1:])
+                values[f"acceleration{kind}"].extend(np.diff(pace) / segment.dt)
+                turn = (np.diff(angle) + math.pi) % (2 * math.pi) - math.pi
+                values[f"turn{kind}"].extend(turn / segment.dt)
+        values["ade"].append(float(np.mean(away)))
+    record = previewed(run)[4]
+    for name, numbers in values.items():
+        for q, expected in zip(QUANTILES, np.percentile(numbers, QUANTILES), strict=True):
+            assert record[f"preview_{name}_p{q}"] == pytest.approx(expected, rel=1e-3, abs=1e-3), name
+    for name in ("score_simulated", "score_data"):
+        low, middle, high = (record[f"preview_{name}_p{q}"] for q in QUANTILES)
+        assert low <= middle <= high
+    assert len(record) == 3 * (len(values) + 2)
+
+
+def test_displacement_is_the_evaluators(run: Path, store: Path) -> None:
+    agent = load_agent(str(run))
+    dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
+    scenes, how = dataset.scenes(range(3)), EvaluateConfig(rollouts=2)
+    samples = samples_of(scenes, simulated(agent, scenes, how), [0.2] * 3)
+    rows = evaluate(agent, SegmentStore(store), how).metrics.rows()
+    np.testing.assert_allclose(sorted(samples["ade"]), sorted(row["ade"] for row in rows), rtol=1e-5)
+
+
+def test_the_log_is_like_itself_and_what_is_not_there_is_left_out() -> None:
+    segment = crossing(4, steps=9)
+    gone = hide(segment, 1, slice(3, 6))
+    for shown_segment in (segment, gone):
+        scenes = scene(shown_segment, [0, 1])
+        samples = samples_of(scenes, playback(scenes), [segment.dt])
+        assert samples["ade"].tolist() == [0]
+        assert all(np.isfinite(values).all() for values in samples.values())
+    assert len(samples["speed"]) == 8 + 5
+    # Of the log, steps with both ends.
+    assert len(samples["speed_log"]) == 8 + 4
+
+
+def test_statistics_of_nothing_are_no_numbers(tmp_path: Path) -> None:
+    scenes = scene(crossing(4, steps=5), [0, 1])
+    found = playback(scenes)
+    nobody = Rollouts(*found[:3], torch.zeros_like(found.counted))
+    samples = samples_of(scenes, nobody, [0.2])
+    assert len(samples["speed"]) == len(samples["ade"]) == 0
+    numbers = Preview(tmp_path, samples).numbers()
+    assert math.isnan(numbers["preview_speed_p50"])
+    assert math.isfinite(numbers["preview_speed_log_p50"])
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_judge_that_has_not_judged_yet_has_no_scores(store: Path, tmp_path: Path) -> None:
+    early = replace(tiny("mgail", store, tmp_path).mgail, regression=4)
+    out = train(config(store, tmp_path / "run", 2, "mgail", steps=6, mgail=early))
+    assert [previewed(out)[step]["preview_score_data_p50"] is None for step in (2, 4, 6)] == [
+        True,
+        True,
+        False,
+    ]
+    assert not any(
+        "score" in name for name in previewed(train(config(store, tmp_path / "bc", 2, steps=2)))[2]
+    )
+
+
+def test_padding_of_a_batch_is_cut_off(store: Path) -> None:
+    dataset = SceneDataset(SegmentStore(store), 2)
+    together = dataset.scenes(range(3))
+    for b in range(3):
+        segment, alone = dataset.segment(b), dataset.scene(b)
+        one, other = (
+            clip_of(segment, together, playback(together), b),
+            clip_of(segment, alone, playback(alone)),
+        )
+        for name, value in vars(one).items():
+            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+
+
+class Recorder:
+    """Stands in for a run of Weights & Biases."""
+
+    def __init__(self) -> None:
+        self.logged: list[tuple[int, dict[str, Any]]] = []
+
+    def log(self, values: dict[str, Any], step: int) -> None:
+        self.logged.append((step, values))
+
+    def finish(self) -> None:
+        """Nothing to do."""
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_weights_and_biases_gets_video_and_histograms(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import wandb
+
+    recorder = Recorder()
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setattr(wandb, "init", lambda **_: recorder)
+    early = replace(tiny("mgail", store, tmp_path).mgail, regression=2)
+    settings = config(store, tmp_path / "run", 2, "mgail", mgail=early, wandb="offline")
+    train(settings)
+    assert [step for step, _ in recorder.logged] == sorted(step for step, _ in recorder.logged)
+    found = {step: values for step, values in recorder.logged if "preview/rollout" in values}
+    assert list(found) == [2, 4]
+    motions = {f"preview/{name}{kind}" for name in MOTIONS for kind in ("", "_log")}
+    assert found[2].keys() == {"preview/rollout", "preview/ade", *motions}
+    assert found[4].keys() - found[2].keys() == {"preview/score_simulated", "preview/score_data"}
+    for step, values in found.items():
+        video = values.pop("preview/rollout")
+        assert isinstance(video, wandb.Video)
+        assert video._path == str(settings.out / "media" / f"rollout-{step:06d}.gif")
+        assert all(isinstance(value, wandb.Histogram) and sum(value.histogram) for value in values.values())
+
+
+def test_settings_are_checked_and_read_back(store: Path, tmp_path: Path) -> None:
+    for bad in ({"every": -1}, {"segments": 0}):
+        with pytest.raises(ConfigError):
+            PreviewConfig(**bad)
+    file = tmp_path / "config.json"
+    file.write_text(to_json(config(store, tmp_path, 7)))
+    assert read_json(TrainConfig, file).preview == PreviewConfig(every=7, segments=2)
+    saved = json.loads(file.read_text())
+    del saved["preview"]
+    file.write_text(json.dumps(saved))
+    assert read_json(TrainConfig, file).preview == PreviewConfig()
+
+
+def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
+    settings = config(store, tmp_path / "run", 2)
+    settings.out.mkdir()
+    (settings.out / "media").touch()
+    with pytest.raises(DataError, match=r"rollout-000002\.gif"):
+        train(settings)
+
+
+def test_networks_are_left_as_they_were(store: Path, tmp_path: Path) -> None:
+    trainer = build(config(store, tmp_path, 2, "bc_ts"))
+    previewer, policy = trainer.previewer, trainer.agent.modules["policy"]
+    assert previewer is not None
+    state = torch.get_rng_state()
+    before = [parameter.clone() for parameter in policy.parameters()]
+    first = previewer(2)
+    assert first.video.is_file()
+    assert all(map(torch.equal, before, policy.parameters()))
+    assert policy.training
+    assert torch.equal(state, torch.get_rng_state())
+    assert first.numbers().keys() == previewer(4).numbers().keys()
+
+
+def test_all_that_is_previewed_has_a_panel(run: Path) -> None:
+    known = {name for _, names in curves.PANELS for name in names}
+    assert {name for record in previewed(run).values() for name in record} <= known

@@ -1,0 +1,213 @@
+"""Pickles of plain data are read; everything else is refused by name, and nothing in it is run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import random
+import struct
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from symphony.data.sources import safe_pickle
+from symphony.data.sources.safe_pickle import Array, load_plain
+from symphony.errors import DataError
+
+PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=9)
+ARRAYS = arrays.arrays(
+    st.sampled_from([np.dtype(name) for name in ("<f8", ">f4", "<i8", "|u1", "|b1", "<U3", "|S4")]),
+    arrays.array_shapes(max_dims=3, max_side=4, min_side=0),
+)
+TREES = st.recursive(
+    SCALARS | ARRAYS | st.binary(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.tuples(inner, inner)
+        | st.dictionaries(st.text(max_size=4), inner, max_size=4)
+        | st.sets(st.integers(), max_size=3)
+    ),
+    max_leaves=12,
+)
+
+
+def load(data: bytes, folder: Path) -> Any:
+    path = folder / "a.pkl"
+    path.write_bytes(data)
+    return load_plain(path)
+
+
+def refused(data: bytes, folder: Path) -> str:
+    with pytest.raises(DataError) as caught:
+        load(data, folder)
+    assert caught.value.file == folder / "a.pkl"
+    return caught.value.message
+
+
+def same(found: Any, expected: Any) -> bool:
+    if isinstance(expected, np.ndarray):
+        assert isinstance(found, Array)
+        equal = np.array_equal(found.value, expected, equal_nan=expected.dtype.kind == "f")
+        return equal and found.value.dtype == expected.dtype
+    if isinstance(expected, dict):
+        return list(found) == list(expected) and all(same(found[k], v) for k, v in expected.items())
+    if isinstance(expected, list | tuple):
+        both = type(found) is type(expected) and len(found) == len(expected)
+        return both and all(map(same, found, expected))
+    return type(found) is type(expected) and found == expected
+
+
+@given(TREES, st.sampled_from(PROTOCOLS))
+def test_plain_data_comes_back(tmp_path_factory: pytest.TempPathFactory, tree: Any, protocol: int) -> None:
+    assert same(load(pickle.dumps(tree, protocol), tmp_path_factory.getbasetemp()), tree)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_arrays_of_any_order_and_scalars(protocol: int, tmp_path: Path) -> None:
+    turned = np.arange(24.0).reshape(2, 3, 4).transpose(2, 0, 1)
+    tree = {"a": np.asfortranarray(turned), "b": turned[::2], "c": turned.copy()}
+    found = load(pickle.dumps(tree, protocol), tmp_path)
+    assert same(found, tree)
+    numbers = [np.float32(1.5), np.int64(-7), np.bool_(True), np.str_("ab")]
+    assert load(pickle.dumps(numbers, protocol), tmp_path) == [1.5, -7, True, "ab"]
+
+
+class Bomb:
+    """Would leave a file behind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return os.system, (f"touch {self.path}",)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_code_is_refused_by_name_and_never_run(protocol: int, tmp_path: Path) -> None:
+    trap = tmp_path / "sprung"
+    message = refused(pickle.dumps({"id": [Bomb(trap)]}, protocol), tmp_path)
+    assert "system, which no plain data needs" in message
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        (OrderedDict(a=1), "collections.OrderedDict"),
+        (Path("x"), "path"),
+        (len, "builtins.len"),
+        (np.random.default_rng(0), "numpy.random"),
+        (np.array([{}], object), "an array of type 'O8'"),
+        (np.zeros(2, [("a", "f8")]), "an array of type 'V8'"),
+        (np.zeros(2, "M8[s]"), "an array of type 'M8'"),
+        (np.zeros(1, "U9999"), "an array of type 'U9999'"),
+    ],
+)
+def test_other_things_are_refused_by_name(value: Any, name: str, tmp_path: Path) -> None:
+    assert name in refused(pickle.dumps(value), tmp_path)
+
+
+def array_pickle(shape: Any, data: Any, kind: str = "f8", order: Any = "<") -> bytes:
+    """An array whose state is made up."""
+
+    class Kind:
+        def __reduce__(self) -> Any:
+            return np.dtype, (kind, False, True), (3, order, None, None, None, -1, -1, 0)
+
+    class Made:
+        def __reduce__(self) -> Any:
+            maker = np._core.multiarray._reconstruct  # type: ignore[attr-defined]
+            return maker, (np.ndarray, (0,), b"b"), (1, shape, Kind(), False, data)
+
+    return pickle.dumps(Made())
+
+
+@pytest.mark.parametrize(
+    ("shape", "data", "kind", "order", "message"),
+    [
+        ((10**12,), b"", "f8", "<", "impossible shape"),
+        ((-1,), b"", "f8", "<", "impossible shape"),
+        ((2.0,), b"12345678" * 2, "f8", "<", "impossible shape"),
+        ((True,), b"12345678", "f8", "<", "impossible shape"),
+        ((10**5,) * 8, b"12345678", "f8", "<", "in 8 bytes"),
+        ((0,) * 99, b"", "f8", "<", "without a shape"),
+        ([1], b"12345678", "f8", "<", "without a shape"),
+        ((2,), b"12345678", "f8", "<", "in 8 bytes"),
+        ((1,), "12345678", "f8", "<", "of objects"),
+        ((1,), [1.0], "f8", "<", "of objects"),
+        ((1,), b"12345678", "O", "<", "of type 'O'"),
+        ((1,), b"12345678", "f8,f8", "<", "of type"),
+        ((1,), b"12345678", "f8", "!", "structured"),
+    ],
+)
+def test_arrays_that_lie_are_refused(
+    shape: Any, data: Any, kind: str, order: str, message: str, tmp_path: Path
+) -> None:
+    assert message in refused(array_pickle(shape, data, kind, order), tmp_path)
+
+
+def test_a_made_array_that_does_not_lie(tmp_path: Path) -> None:
+    found = load(array_pickle((1,), struct.pack(">d", 2.5), order=">"), tmp_path)
+    assert found.value.tolist() == [2.5]
+
+
+RAW: dict[str, tuple[bytes, str]] = {
+    "empty": (b"", "empty"),
+    "no end": (pickle.dumps([1, 2])[:-1], "not a pickle"),
+    "noise": (b"\xff" * 100, "not a pickle"),
+    "a huge memo": (b"\x80\x04]r\xff\xff\xff\x7f.", "entry 2147483647 after"),
+    "a huge memo in text": (b"(lp999999999\n.", "entry 999999999 after"),
+    "an object of a class": (b"\x80\x04)\x81.", "NEWOBJ"),
+    "an old object": (b"(i__main__\nBomb\n.", "INST"),
+    "a persistent id": (b"Pabc\n.", "PERSID"),
+    "an extension": (b"\x80\x02\x82\x01.", "EXT1"),
+    "more bytes than there are": (b"\x80\x04B\xff\xff\xff\x7fabc.", "not a pickle"),
+    "a byte array that is not there": (b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00abc.", "not a pickle"),
+    "the allowed names by themselves": (b"cnumpy\nndarray\n(t(tR.", "not a pickle"),
+    "state for what has none": (b"cnumpy\nndarray\n}b.", "sets the state"),
+    "a name inside a name": (b"\x80\x04\x8c\x05numpy\x8c\x0bos.path.sep\x93.", "refers to numpy.os.path.sep"),
+    "another codec": (b"c_codecs\nencode\n(X\x01\x00\x00\x00aX\x04\x00\x00\x00zliptR.", "encodes something"),
+    "an array that was never filled": (b"cnumpy\ndtype\n(tR.", "not a pickle"),
+}
+
+
+@pytest.mark.parametrize("name", RAW)
+def test_raw_programs_are_refused(name: str, tmp_path: Path) -> None:
+    data, message = RAW[name]
+    assert message in refused(data, tmp_path)
+
+
+def test_too_large_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 99)
+    assert "at most 99 can be read" in refused(pickle.dumps(list(range(200))), tmp_path)
+    monkeypatch.undo()
+    monkeypatch.setattr(safe_pickle, "MAX_OPCODES", 99)
+    assert "more than 99 instructions" in refused(pickle.dumps(list(range(200))), tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_damaged_pickles_give_errors_or_plain_data(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(seed)
+    tree = {"a": np.arange(6.0).reshape(2, 3), "b": ["x", 2, {"c": (1.5, None)}], "d": np.float64(2)}
+    data = bytearray(pickle.dumps(tree, rng.choice(list(PROTOCOLS))))
+    for _ in range(rng.randrange(1, 6)):
+        at = rng.randrange(len(data))
+        match rng.randrange(3):
+            case 0:
+                data[at] = rng.randrange(256)
+            case 1:
+                del data[at : at + rng.randrange(1, 9)]
+            case _:
+                data[at:at] = data[rng.randrange(len(data)) :][: rng.randrange(9)]
+        if not data:
+            break
+    with contextlib.suppress(DataError):
+        assert type(load(bytes(data), tmp_path)).__module__ in {"builtins", safe_pickle.__name__}

@@ -1,0 +1,302 @@
+"""The ScenarioNet reader: what it takes over, what it derives, and what it refuses."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers_scenarionet import FAR, STEPS, line, ring, scenario, track, write
+from helpers_sources import off_road, read_error, read_one
+from symphony.data.conformance import check_reader
+from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, SignalState, validate
+from symphony.data.sources import get_reader
+
+LANES = ["right", "left", "on", "end"]
+
+
+def test_tracks(tmp_path: Path) -> None:
+    segment = read_one("scenarionet", write(tmp_path))
+    assert segment.segment_id == "scene-0001"
+    assert segment.group == "nuscenes boston-seaport 2018-08-01"
+    assert (segment.dt, segment.num_steps, segment.ego) == (0.1, STEPS, 1)
+    assert segment.agent_id.tolist() == [0, 1, 2, 3]
+    kinds = [AgentType.VEHICLE, AgentType.VEHICLE, AgentType.OTHER, AgentType.PEDESTRIAN]
+    assert segment.agent_type.tolist() == kinds
+    assert segment.valid[0].tolist() == [k >= 3 for k in range(STEPS)]
+    np.testing.assert_allclose(segment.size[[0, 3]], [(4.5, 2, 1.6), (0.7, 0.6, 1.8)], rtol=1e-6)
+    np.testing.assert_array_equal(segment.origin, (*FAR, 0))
+    np.testing.assert_allclose(segment.position[1, 10], (10, 0, 0.9), rtol=1e-6)
+    np.testing.assert_allclose(segment.velocity[1], np.broadcast_to((10, 0), (STEPS, 2)))
+
+
+def test_numbers_as_names_are_ids(tmp_path: Path) -> None:
+    tree = scenario()
+    tree["tracks"] = {"17": tree["tracks"]["ego"], "4": tree["tracks"]["8f3a"]}
+    tree["metadata"]["sdc_id"] = "17"
+    del tree["metadata"]["date"]
+    segment = read_one("scenarionet", write(tmp_path, tree))
+    assert (segment.agent_id.tolist(), segment.ego) == ([17, 4], 0)
+    assert segment.group == "scene-0001"
+
+
+def test_what_is_derived_of_the_map(tmp_path: Path) -> None:
+    road = read_one("scenarionet", write(tmp_path)).road
+    assert road.successors.tolist() == [[0, 2], [2, 3]]
+    assert road.left_neighbors.tolist() == [[0, 1]]
+    assert road.right_neighbors.tolist() == [[1, 0]]
+    assert road.lane_type.tolist() == [LaneType.SURFACE_STREET] * 4
+    np.testing.assert_allclose(road.lane_width, [4, 4, np.nan, 4], rtol=1e-6)
+    # The 100 km/h of nuScenes' connectors are ScenarioNet's.
+    assert np.isnan(road.speed_limit).all()
+    assert road.mark_type.tolist() == [MarkType.ROAD_LINE]
+    # On the road, beyond both open ends, in the hole, beside the road.
+    spots = np.array([(20, 0), (50, 0), (90, 0), (-9, 3), (50, 4), (20, -3), (20, 7)])
+    assert (off_road(road, spots) < 0).tolist() == [True, True, True, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("points", "succeeds"),
+    [
+        (((40, 0), (60, 0)), True),
+        (((40.3, 0.3), (60, 0)), True),
+        (((40.6, 0), (60, 0)), False),
+        (((40, 0), (50, 10)), True),
+        (((40, 0), (45, 10)), False),
+        (((40, 0), (20, 0.5)), False),
+    ],
+)
+def test_successors_begin_where_a_lane_ends(
+    points: tuple[tuple[float, float], ...], succeeds: bool, tmp_path: Path
+) -> None:
+    tree = scenario()
+    tree["map_features"]["on"]["polyline"] = line(*points)
+    found = read_one("scenarionet", write(tmp_path, tree)).road.successors.tolist()
+    assert ([0, 2] in found) == succeeds
+
+
+def test_what_other_sources_say_about_the_map(tmp_path: Path) -> None:
+    """Links, limits, edges and lights as ScenarioNet has them of the Waymo dataset and of nuPlan."""
+    tree = scenario()
+    tree["metadata"]["dataset"] = "waymo"
+    features = tree["map_features"]
+    for name in ("boundary_0", "boundary_1"):
+        del features[name]
+    features["right"] |= {"exit_lanes": ["left", "gone"], "left_neighbor": [{"feature_id": "left"}]}
+    features["edge"] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": ring((0, -2), (80, -2))}
+    features["zebra"] = {"type": "CROSSWALK", "polygon": ring((38, -2), (40, -2), (40, 6))}
+    features["sign"] = {"type": "STOP_SIGN", "position": FAR + np.array([39, -3])}
+    features["later"] = {"type": "SOMETHING_NEW", "polyline": line((0, 0), (1, 1))}
+    states = 10 * ["LANE_STATE_STOP"] + 5 * ["TRAFFIC_LIGHT_GREEN"] + (STEPS - 15) * [None]
+    tree["dynamic_map_states"] = {
+        "on": {"lane": "on", "state": {"object_state": states}, "stop_point": np.array([*FAR, 1.0])},
+        "end": {"lane": "end", "state": {"object_state": np.array(STEPS * ["LANE_STATE_GO"])}},
+        "gone": {"lane": "gone", "state": {"object_state": states}},
+    }
+    segment = read_one("scenarionet", write(tmp_path, tree))
+    road = segment.road
+    assert road.successors.tolist() == [[0, 1]]
+    assert (road.left_neighbors.tolist(), road.right_neighbors.tolist()) == ([[0, 1]], [])
+    np.testing.assert_allclose(road.speed_limit, [np.nan, np.nan, 100 / 3.6, np.nan], rtol=1e-6)
+    np.testing.assert_allclose(road.boundary.points, [(0, -2, 0), (80, -2, 0)])
+    assert sorted(road.mark_type.tolist()) == [MarkType.ROAD_LINE, MarkType.CROSSWALK, MarkType.STOP_SIGN]
+    assert segment.signal_lane.tolist() == [2, 3]
+    np.testing.assert_allclose(segment.signal_point, [(0, 0, 1), (60, 0, 0)])
+    lights = [SignalState.STOP] * 10 + [SignalState.GO] * 5 + [SignalState.UNKNOWN] * (STEPS - 15)
+    assert segment.signal_state.tolist() == [lights, STEPS * [SignalState.GO]]
+
+
+def test_a_map_without_areas_has_the_width_of_its_lanes(tmp_path: Path) -> None:
+    tree = scenario()
+    for name in ("boundary_0", "boundary_1"):
+        del tree["map_features"][name]
+    road = read_one("scenarionet", write(tmp_path, tree)).road
+    spots = np.array([(50, 0), (50, 1.6), (50, 1.9), (50, -1.9), (30, 5)])
+    assert (off_road(road, spots) < 0).tolist() == [True, True, False, False, True]
+
+
+# What is refused
+
+
+def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    """Set, or with ``...`` remove, what lies under a path of keys."""
+
+    def apply(tree: dict[str, Any]) -> None:
+        *above, last = path.split("/")
+        for key in above:
+            tree = tree[key]
+        if value is ...:
+            del tree[last]
+        else:
+            tree[last] = value
+
+    return apply
+
+
+BROKEN: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
+    "no id": (change("id", ...), "id", "ScenarioNet scenario"),
+    "an id that is none": (change("id", 7), "id", "ScenarioNet scenario"),
+    "no metadata": (change("metadata", ...), "metadata", "expected a dictionary, is NoneType"),
+    "no times": (change("metadata/ts", ...), "metadata: ts", "expected an array"),
+    "uneven times": (change("metadata/ts", np.arange(STEPS) ** 2 * 0.1), "metadata: ts", "uneven"),
+    "no numbers": (change("metadata/ts", np.full(STEPS, np.nan)), "metadata: ts", "uneven"),
+    "another length": (change("length", 7), "metadata: ts", "25 for 7 steps"),
+    "no ego": (change("metadata/sdc_id", "me"), "metadata: sdc_id", "names no track"),
+    "an ego never seen": (change("metadata/sdc_id", "never"), "metadata: sdc_id", "names no track"),
+    "no tracks": (change("tracks", {}), "tracks", "no agents"),
+    "tracks in a list": (change("tracks", []), "tracks", "expected a dictionary, is list"),
+    "short states": (
+        change("tracks/ego/state/heading", np.zeros(3)),
+        "tracks ego: heading",
+        "3 states for 25 steps",
+    ),
+    "flat positions": (
+        change("tracks/ego/state/position", np.zeros((STEPS, 2))),
+        "tracks ego: position",
+        "2 numbers a step, expected 3",
+    ),
+    "no widths": (change("tracks/ego/state/width", ...), "tracks ego: width", "expected an array"),
+    "words": (change("tracks/ego/state/heading", np.array(STEPS * ["a"])), "tracks ego: heading", "numbers"),
+    "not finite": (
+        change("tracks/ego/state/heading", np.full(STEPS, np.inf)),
+        "heading",
+        "not finite",
+    ),
+    "no map": (change("map_features", {}), "map_features", "no lanes"),
+    "a line of words": (change("map_features/on/polyline", ["a"]), "map_features on: polyline", "no"),
+    "lines in lines": (
+        change("map_features/on/polyline", [[[1], [2]]]),
+        "map_features on: polyline",
+        "numbers",
+    ),
+    "a mixed line": (
+        change("map_features/on/polyline", [(1, 2), (1, 2, 3)]),
+        "map_features on: polyline",
+        "of two and of three",
+    ),
+    "a line beyond": (
+        change("map_features/on/polyline", [(1e9, 0)]),
+        "map_features on: polyline",
+        "absurdly",
+    ),
+    "a number beyond": (
+        change("map_features/on/polyline", [(10**400, 0)]),
+        "map_features on: polyline",
+        "out of range",
+    ),
+    "a line that is one number": (
+        change("map_features/on/polyline", 3),
+        "map_features on: polyline",
+        "is int",
+    ),
+    "a light of a colour": (
+        change("dynamic_map_states", {"on": {"lane": "on", "state": {"object_state": STEPS * ["PINK"]}}}),
+        "dynamic_map_states on: object_state",
+        "'PINK'",
+    ),
+    "a short light": (
+        change("dynamic_map_states", {"on": {"lane": "on", "state": {"object_state": ["LANE_STATE_GO"]}}}),
+        "dynamic_map_states on: object_state",
+        "expected 25 states",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_scenarios_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    apply, field, message = BROKEN[name]
+    tree = scenario()
+    apply(tree)
+    error = read_error("scenarionet", write(tmp_path, tree))
+    assert error.field == field
+    assert message in error.message
+    assert error.file == tmp_path / "sd_made.pkl"
+
+
+def test_lists_within_lists_do_not_grow(tmp_path: Path) -> None:
+    """Each level holds the next ten times: written out, more than any memory."""
+    bomb: Any = [1.0, 2.0]
+    for _ in range(12):
+        bomb = [bomb] * 10
+    tree = scenario()
+    tree["map_features"]["on"]["polyline"] = bomb
+    assert "points" in read_error("scenarionet", write(tmp_path, tree)).message
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_conforms(protocol: int, tmp_path: Path) -> None:
+    tree = scenario()
+    tree["tracks"]["more"] = track(-20, 0, 8)
+    report = check_reader(get_reader("scenarionet"), [write(tmp_path, tree, protocol)], flips=24)
+    assert report.segments == 1
+
+
+def mutated(tree: Any, rng: random.Random) -> Any:
+    """The tree with one value somewhere in it replaced, dropped or moved."""
+    nasty = [
+        None,
+        -1,
+        1e308,
+        float("nan"),
+        "x",
+        [],
+        {},
+        (),
+        b"",
+        [[]],
+        np.zeros((2, 0)),
+        np.array("a"),
+        2**80,
+        True,
+    ]
+    node, steps = tree, rng.randrange(1, 5)
+    for _ in range(steps):
+        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+        if not keys:
+            return tree
+        key = rng.choice(keys)
+        if isinstance(node[key], dict | list) and node[key] and rng.random() < 0.8:
+            node = node[key]
+            continue
+        match rng.randrange(3):
+            case 0:
+                node[key] = rng.choice(nasty)
+            case 1:
+                node[key] = copy.deepcopy(node[rng.choice(keys)])
+            case _:
+                del node[key]
+        break
+    return tree
+
+
+@pytest.mark.parametrize("seed", range(120))
+def test_mutated_scenarios_give_errors_or_valid_segments(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(seed)
+    tree = scenario()
+    tree["dynamic_map_states"] = {"on": {"lane": "on", "state": {"object_state": STEPS * ["LANE_STATE_GO"]}}}
+    for _ in range(rng.randrange(1, 4)):
+        tree = mutated(tree, rng)
+    path = tmp_path / "sd_made.pkl"
+    path.write_bytes(pickle.dumps(tree))
+    (item,) = get_reader("scenarionet").read(path)
+    if isinstance(item, RunSegment):
+        validate(item)
+    else:
+        assert item.message
+        assert item.file == path
+
+
+@pytest.mark.samples
+def test_samples(samples: Path) -> None:
+    files = sorted((samples / "real" / "scenarionet").glob("*.pkl"))
+    if not files:
+        pytest.skip("the ScenarioNet samples are not among the samples")
+    report = check_reader(get_reader("scenarionet"), files, flips=2)
+    assert report.segments == len(files) == 10
+    assert report.numbers["off_road"] < 0.03

@@ -1,0 +1,194 @@
+"""Stores that changed on the disk: whoever reads what changed is told where, and nothing else is."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers_segments import crossing, straight_road
+from helpers_store import files, fill, unlike
+from symphony.cli import main
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store_format import MAPS, SEGMENTS
+from symphony.errors import DataError
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    fill(tmp_path / "store", [crossing(seed=1), straight_road(seed=2), crossing(seed=3)])
+    return tmp_path / "store"
+
+
+def change(path: Path, offset: int, data: bytes) -> None:
+    with path.open("r+b") as file:
+        file.seek(offset)
+        assert file.read(len(data)) != data
+        file.seek(offset)
+        file.write(data)
+
+
+def test_one_float_that_changed_is_noticed_where_it_is_read(folder: Path) -> None:
+    begin = int(SegmentStore(folder)._segments[1]["begin"][SEGMENTS.axes["states"]])
+    change(folder / "columns" / "position.bin", 12 * begin, np.float32(1.5).tobytes())
+    store = SegmentStore(folder)
+    for sound in (0, 2):
+        assert isinstance(store[sound], RunSegment)
+    for read in (lambda: store[1], lambda: pickle.loads(pickle.dumps(store))[1], store.verify):  # noqa: S301
+        with pytest.raises(DataError, match="does not match its hash") as caught:
+            read()
+        assert (caught.value.file, caught.value.segment) == (folder, "straight-2")
+
+
+def test_a_map_that_changed_is_noticed(folder: Path) -> None:
+    change(folder / "columns" / "lane_type.bin", 0, b"\x01")
+    with pytest.raises(DataError, match="does not match its hash"):
+        SegmentStore(folder)[0]
+
+
+def test_what_was_read_once_is_not_looked_at_again(folder: Path) -> None:
+    store = SegmentStore(folder)
+    assert isinstance(store[0], RunSegment)
+    change(folder / "columns" / "heading.bin", 0, np.float32(1.25).tobytes())
+    assert isinstance(store[0], RunSegment)  # views of the file: a check costs as much as the reading
+    with pytest.raises(DataError):
+        store.verify()
+
+
+def test_every_changed_byte_is_noticed(tmp_path: Path) -> None:
+    fill(tmp_path / "store", unlike(3))
+    rng = np.random.default_rng(0)
+    for path in files(tmp_path / "store"):
+        good = path.read_bytes()
+        for bit in rng.integers(0, 8 * len(good), 25 if good else 0).tolist():
+            damaged = bytearray(good)
+            damaged[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(damaged)
+            with pytest.raises(DataError) as caught:
+                SegmentStore(tmp_path / "store").verify()
+            assert caught.value.file is not None, path
+        path.write_bytes(good)
+    SegmentStore(tmp_path / "store").verify()
+
+
+def rehash(folder: Path) -> None:
+    """Give what is in a store the hashes it has now, as who wants to deceive would."""
+    from symphony.data.segment import content_hash
+
+    store = SegmentStore(folder, check=False)
+    index = SEGMENTS.index_path(folder)
+    records = np.fromfile(index, SEGMENTS.record)
+    for k in range(len(records)):
+        records[k]["hash"] = np.frombuffer(bytes.fromhex(content_hash(store[k])), np.uint8)
+    index.write_bytes(records.tobytes())
+
+
+@pytest.mark.parametrize(
+    ("column", "data", "field"),
+    [
+        ("heading", np.float32(np.nan).tobytes(), "heading"),
+        ("velocity", np.float32(3e38).tobytes(), "velocity"),
+        ("agent_type", b"\x77", "agent_type"),
+        ("lanes.points", np.float32(1e30).tobytes(), "road.lanes"),
+        ("lanes.offsets", np.int64(7).tobytes(), "road.lanes"),
+        ("successors", np.int32(-5).tobytes(), "road.successors"),
+    ],
+)
+def test_what_breaks_the_schema_is_refused_whatever_its_hash(
+    folder: Path, column: str, data: bytes, field: str
+) -> None:
+    change(folder / "columns" / f"{column}.bin", 0, data)
+    rehash(folder)
+    with pytest.raises(DataError) as caught:
+        SegmentStore(folder)[0]
+    assert (caught.value.file, caught.value.segment, caught.value.field) == (folder, "crossing-1", field)
+
+
+@pytest.mark.parametrize("column", ["segment_id", "source", "file", "tags"])
+def test_texts_that_are_none(folder: Path, column: str) -> None:
+    fill(folder.with_name("b"), [straight_road(file="a.xml")])
+    with StoreWriter(folder.with_name("b"), append=True) as writer:
+        writer.append(crossing(file="b.xml"), tags={"a": "b"})
+    path = folder.with_name("b") / "columns" / f"{column}.bin"
+    change(path, path.stat().st_size - 1, b"\xff")
+    store = SegmentStore(folder.with_name("b"))
+    with pytest.raises(DataError, match="not UTF-8") as caught:
+        (store.tags if column == "tags" else store.__getitem__)(1)
+    assert caught.value.field == column
+    assert caught.value.segment == ("number 1" if column == "segment_id" else "crossing-0")
+    if column == "segment_id":
+        with pytest.raises(DataError, match="segment number 1, field segment_id"):
+            _ = store.ids
+
+
+def test_tags_that_are_no_json(folder: Path) -> None:
+    with StoreWriter(folder, append=True) as writer:
+        writer.append(straight_road(seed=9), tags={"a": 1})
+    change(folder / "columns" / "tags.bin", 0, b"[")
+    with pytest.raises(DataError, match=r"segment straight-9, field tags: not JSON"):
+        SegmentStore(folder).tags(3)
+    with pytest.raises(DataError, match="field tags"):
+        SegmentStore(folder).verify()
+
+
+WRONG = [(field, value) for field in ("steps", "map", "ego", "count") for value in (2**62, -1, 2**63 - 1)]
+
+
+@pytest.mark.parametrize(("field", "value"), [*WRONG, ("steps", 0), ("count", 0), ("begin", 0)])
+def test_records_that_contradict_themselves(folder: Path, field: str, value: int) -> None:
+    index = SEGMENTS.index_path(folder)
+    records = np.fromfile(index, SEGMENTS.record)
+    records[2][field] = value
+    index.write_bytes(records.tobytes())
+    with pytest.raises(DataError):
+        SegmentStore(folder).verify()
+
+
+def test_maps_that_contradict_themselves(folder: Path) -> None:
+    index = MAPS.index_path(folder)
+    good = index.read_bytes()
+    for axis in ("lanes", "lanes.offsets", "marks"):
+        records = np.frombuffer(good, MAPS.record).copy()
+        records[-1]["count"][MAPS.axes[axis]] = 0
+        index.write_bytes(records.tobytes())
+        with pytest.raises(DataError, match="contradicts itself"):
+            SegmentStore(folder)
+
+
+def test_an_index_that_was_cut_short_is_recognised(folder: Path) -> None:
+    with StoreWriter(folder, append=True) as writer:
+        writer.write_report({"converted": 3})
+    assert len(SegmentStore(folder)) == 3
+    for size in (2 * SEGMENTS.record.itemsize, 2 * SEGMENTS.record.itemsize + 5):
+        os.truncate(SEGMENTS.index_path(folder), size)
+        with pytest.raises(DataError, match="cut short") as caught:
+            SegmentStore(folder)
+        assert caught.value.file == SEGMENTS.index_path(folder)
+
+
+def test_the_command_verifies(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "verify", str(folder)]) == 0
+    assert "3 segments are what was written" in capsys.readouterr().out
+    change(folder / "columns" / "heading.bin", 0, np.float32(1.25).tobytes())
+    assert main(["data", "verify", str(folder)]) == 1
+    found = capsys.readouterr().err
+    assert f"file {folder}, segment crossing-1: content does not match its hash" in found
+    assert main(["data", "info", str(folder)]) == 1
+    assert "crossing-1" in capsys.readouterr().err
+
+
+def test_the_command_gives_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "verify", str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == {"path": str(folder), "segments": 3, "checksum": SegmentStore(folder).checksum()}
+
+
+@pytest.mark.parametrize("command", [["info"], ["verify"], ["quality"]])
+def test_the_root_is_no_store(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", *command, "/"]) == 1
+    assert "not a segment store" in capsys.readouterr().err
