@@ -43,6 +43,7 @@ test-lowest:  ## run the tests with the lowest versions that pyproject.toml prom
 
 lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, file lengths
 	$(BIN)/ruff check
+	$(BIN)/ruff check --preview --select DOC102 src  # arguments that are described but not there
 	$(BIN)/ruff format --check
 	$(BIN)/codespell $(SPELLED)
 	$(BIN)/mypy

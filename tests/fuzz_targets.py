@@ -105,7 +105,7 @@ def absurd(s: RunSegment) -> str:
 
 def _use(segment: RunSegment, folder: Path) -> None:
     """What becomes of a good segment: resampled, chosen from, stored, read, and made a scene with routes."""
-    from symphony.data.parts import Recipe
+    from symphony.data.parts import Preparation
     from symphony.data.sources import get_reader
     from symphony.data.sources.base import UnexpectedError
     from symphony.data.store import SegmentStore, StoreWriter
@@ -114,7 +114,7 @@ def _use(segment: RunSegment, folder: Path) -> None:
 
     if zlib.crc32(segment.position.tobytes()) % 3:  # it takes the most time: one in three will do
         return
-    recipe = Recipe(get_reader("commonroad"), 0.2, 0.3, 1)
+    recipe = Preparation(get_reader("commonroad"), 0.2, 0.3, 1)
     prepared = recipe._prepared(segment, "a")
     if not isinstance(prepared, RunSegment):
         if f"{UnexpectedError.__name__}" in prepared.message or "can't be read:" in prepared.message:

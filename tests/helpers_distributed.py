@@ -13,24 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from symphony.training.learner import Learner
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from helpers_runs import tiny
+from helpers_runs import pieces, tiny
 from symphony import keys
 from symphony.agents.choice import choose
-from symphony.agents.networks import build_networks, dynamics_of
 from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, ValidationConfig
-from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.training import learner as learning
-from symphony.training import train
-from symphony.training.processes import Processes, processes
+from symphony.recipes import RECIPES, train
+from symphony.simulation import SceneDataset
+from symphony.training import Processes, Trainer, processes
 
 WORLD = 2
-LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "judge": "judge_loss"}
+LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "judge": "realism_loss"}
 TRAINED = ("bc", "bc_ts_h", "mgail_ts")
 CPU = torch.device("cpu")
 
@@ -42,30 +38,31 @@ def config(method: Any, store: Path, out: Path) -> TrainConfig:
         store,
         out,
         steps=6,
-        validation=ValidationConfig(store, segments=1, rollouts=1),
+        validation=ValidationConfig(data=store, segments=1, rollouts=1),
         discriminator=DiscriminatorConfig(hidden=8, head=8, states=8, instance_noise=0.1),
         mgail=MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5),
     )
 
 
-def fresh(method: str, store: Path, dataset: SceneDataset) -> Learner:
-    """Networks that are the same at every call."""
-    settings = tiny(method, store, Path())
-    torch.manual_seed(0)
-    return Learner(settings, build_networks(settings), dataset, CPU)
+def fresh(method: str, store: Path, world: Processes) -> Trainer:
+    """Networks and losses that are the same at every call."""
+    return RECIPES[method](tiny(method, store, store.parent / "nowhere"), world)
 
 
-def batch_for(kind: str, learner: Learner) -> TensorDictBase:
+def batch_for(kind: str, trainer: Trainer) -> TensorDictBase:
     """A batch that is the same at every call, whose first half has far fewer entries that count."""
-    rng, dataset, sees = torch.Generator().manual_seed(1), learner.dataset, learner.sees
+    rng, data, sees = torch.Generator().manual_seed(1), trainer.data, trainer.agent.observation
     if kind == "goals":
-        batch = dataset.sample_goals([0, 1], 32, sees, rng)
+        batch = data.sample_goals([0, 1], 32, sees, rng)
     elif kind == "judge":
-        batch = learner._both_kinds(learner._search(0, rng), rng)
+        replay = pieces(trainer)["replay"]
+        trainer.rng.manual_seed(1)
+        replay.refresh(0)
+        batch = replay.both_kinds(rng)
         # Simulated states come before logged ones.
         batch = batch[torch.arange(len(batch)).reshape(2, 2, -1).transpose(0, 1).flatten()]
     else:
-        batch = dataset.sample_states([0, 1], 32, sees, rng)
+        batch = data.sample_states([0, 1], 32, sees, rng)
         if kind == "distillation":
             batch.set(keys.ROLLOUT, torch.rand(32, 1, generator=rng) < 0.5)
     valid = batch.get(keys.VALID)
@@ -73,26 +70,26 @@ def batch_for(kind: str, learner: Learner) -> TensorDictBase:
     return batch.set(keys.VALID, valid & (torch.rand(valid.shape, generator=rng) < chance))
 
 
-def descended(learner: Learner, loss: Any, batch: TensorDictBase) -> tuple[dict[str, Tensor], Tensor]:
+def descended(trainer: Trainer, kind: str, batch: TensorDictBase) -> tuple[dict[str, Tensor], Tensor]:
     """What a loss reports, and its gradient."""
+    loss = pieces(trainer)[LOSSES[kind]]
     values = loss(batch)
     next(values[key] for key in loss.out_keys if key.startswith("loss_")).backward()
-    parameters = [p for module in learner.networks.present().values() for p in module.parameters()]
+    parameters = [p for module in trainer.agent.modules.values() for p in module.parameters()]
     grads = [p.grad.flatten() for p in parameters if p.grad is not None]
     return {name: value.detach() for name, value in values.items()}, torch.cat(grads)
 
 
-def compare(kind: str, store: Path, dataset: SceneDataset, world: Processes) -> dict[str, Any]:
+def compare(kind: str, store: Path, world: Processes) -> dict[str, Any]:
     """The loss of one half of a batch in each process beside that of all of it in one."""
     method = {"bc": "bc", "distillation": "bc_ts", "goals": "bc_h", "judge": "bc_ts"}[kind]
-    alone, together = fresh(method, store, dataset), fresh(method, store, dataset)
+    alone, together = fresh(method, store, Processes(CPU)), fresh(method, store, world)
     batch = batch_for(kind, alone)
     half = len(batch) // WORLD
     own = batch[world.rank * half : (world.rank + 1) * half]
-    values, gradient = descended(alone, getattr(alone, LOSSES[kind]), batch)
-    _, lone_gradient = descended(alone, getattr(alone, LOSSES[kind]), own)
-    world.share(together)
-    part, shared_gradient = descended(together, getattr(together, LOSSES[kind]), own)
+    values, gradient = descended(alone, kind, batch)
+    _, lone_gradient = descended(alone, kind, own)
+    part, shared_gradient = descended(together, kind, own)
     shared = world.mean(part)
     return {
         "counts": int(own.get(keys.VALID).sum()),
@@ -104,23 +101,28 @@ def compare(kind: str, store: Path, dataset: SceneDataset, world: Processes) -> 
     }
 
 
-def of_run(method: str, store: Path, out: Path, dataset: SceneDataset, rank: int) -> dict[str, Any]:
+def of_run(method: str, store: Path, out: Path, rank: int) -> dict[str, Any]:
     """Train, and take the last updates up again; with what this process drew, and where its weights got to."""
-    drawn, at_end = [], []
-    draw, descend = SceneDataset.draw, learning.Learner._descend
+    drawn, at_end, begun = [], [], []
+    draw, descend, update = SceneDataset.draw, Trainer._descend, Trainer._update
 
     def spy(self: SceneDataset, count: int, rng: torch.Generator) -> list[int]:
-        drawn.append(rng.initial_seed())
+        if begun:  # what is drawn to build a run is not learned from
+            drawn.append(rng.initial_seed())
         return draw(self, count, rng)
 
-    def watch(self: Learner, *args: Any) -> dict[str, Tensor]:
+    def watch(self: Trainer, *args: Any) -> dict[str, Tensor]:
         record = descend(self, *args)
-        at_end[:] = [float(p.detach().double().sum()) for p in self.networks.policy.parameters()]
+        at_end[:] = [float(p.detach().double().sum()) for p in self.agent.modules["policy"].parameters()]
         return record
 
-    SceneDataset.draw, learning.Learner._descend = spy, watch  # type: ignore[method-assign]
+    def begin(self: Trainer, step: int) -> dict[str, Tensor]:
+        begun.append(step)
+        return update(self, step)
+
+    SceneDataset.draw, Trainer._descend, Trainer._update = spy, watch, begin  # type: ignore[method-assign]
     settings = config(method, store, out / method)
-    train(settings, dataset)
+    train(settings)
     found = {"drawn": list(drawn), "weights": list(at_end)}
     if rank == 0:
         shutil.copytree(settings.out, out / f"{method}-part")
@@ -128,17 +130,13 @@ def of_run(method: str, store: Path, out: Path, dataset: SceneDataset, rank: int
     resumed = replace(settings, out=out / f"{method}-part", resume=True)
     with processes(CPU) as world:
         world.wait()
-    train(resumed, dataset)
-    SceneDataset.draw, learning.Learner._descend = draw, descend  # type: ignore[method-assign]
+    train(resumed)
+    SceneDataset.draw, Trainer._descend, Trainer._update = draw, descend, update  # type: ignore[method-assign]
     return {**found, "resumed": list(at_end)}
 
 
 def main(rank: int, store: Path, out: Path) -> None:
     """What one process does."""
-    sets = {
-        method: SceneDataset(SegmentStore(store), 2, dynamics_of(config(method, store, out)), routes=True)
-        for method in ("bc", "mgail")
-    }
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     found: dict[str, Any] = {}
     with processes(CPU) as world:
@@ -154,11 +152,8 @@ def main(rank: int, store: Path, out: Path) -> None:
                 }
             ).items()
         }
-        found["losses"] = {kind: compare(kind, store, sets["bc"], world) for kind in LOSSES}
-        found["runs"] = {
-            method: of_run(method, store, out, sets["mgail" if "mgail" in method else "bc"], rank)
-            for method in TRAINED
-        }
+        found["losses"] = {kind: compare(kind, store, world) for kind in LOSSES}
+        found["runs"] = {method: of_run(method, store, out, rank) for method in TRAINED}
     (out / f"rank{rank}.json").write_text(json.dumps(found))
 
 

@@ -206,6 +206,7 @@ def test_the_logged_route_is_where_the_vehicle_drove(seed: int) -> None:
             for g in range(len(table.count))
         ]
         # Chords of 3 m cut an arc of 10 m radius by at most 0.11 m.
+        assert table.right[table.logged]
         assert away[table.logged] < 0.12
         assert away[table.logged] <= min(away) + 0.12
         if abs(segment.heading[agent, -1] - segment.heading[agent, 0]) > 1:
@@ -396,3 +397,21 @@ def test_clearance_changes_no_flag(dynamics: Any) -> None:
         assert torch.equal(a[key], b[key])
     assert 0 < a[keys.OFFROAD].float().mean() < 1
     assert a.get(keys.GAP, None) is None
+
+
+def test_tied_routes_are_drawn_evenly_and_by_segment_and_agent_alone():
+    """The place of a route among the tied ones must not decide: the first are those that turn right."""
+    graph, drawn = None, []
+    for seed in range(60):
+        segment = crossing(4, seed=seed, steps=3)
+        graph = LaneGraph(segment.road)
+        for agent in range(segment.num_agents):
+            table = route_table(segment, graph, agent)
+            again = route_table(segment, LaneGraph(segment.road), agent)
+            assert table.logged == again.logged
+            tied = np.flatnonzero(table.right)
+            if len(tied) > 1:
+                assert table.logged in tied
+                drawn.append(tied.tolist().index(table.logged) / (len(tied) - 1))
+    assert len(drawn) > 40
+    assert abs(np.mean(drawn) - 0.5) < 4 * 0.5 / np.sqrt(len(drawn))

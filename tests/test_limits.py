@@ -269,7 +269,7 @@ def test_journals_that_are_none(tmp_path: Path) -> None:
 
 
 def test_generations_that_are_none(tmp_path: Path) -> None:
-    pytest.importorskip("sumo", reason="SUMO is not installed (pip install 'symphony[sumo]')")
+    pytest.importorskip("sumo", reason="SUMO is not installed (pip install 'symphony-traffic[sumo]')")
     plan = Plan(3)
     with StoreWriter(tmp_path / "out") as writer:
         for found in (3, {"networks": "x"}, {"reasons": []}, {"complete": 1}):

@@ -67,7 +67,7 @@ def observed(*batch, agents=3, seed=0, points=40):
 
 def policy(seed=0, **kwargs):
     torch.manual_seed(seed)
-    return displacement_policy(SELF_FEATURES, GROUPS, hidden=16, head=(16,), **kwargs)
+    return displacement_policy(SELF_FEATURES, GROUPS, **{"dt": 0.2, "hidden": 16, "head": (16,), **kwargs})
 
 
 @given_bounds

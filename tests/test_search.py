@@ -18,56 +18,48 @@ from torchrl.envs.utils import step_mdp
 
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
-from symphony.agents.agent import Agent
-from symphony.agents.networks import build_networks, observation_config
+from symphony.agents import Agent, build_agent
 from symphony.collectors import BeamSearchResult, KeepAll, KeepBest
-from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle, DrivingEnv, scene
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
-from symphony.evaluation.evaluator import simulated
 from symphony.modules import SeededNoise
 from symphony.simulation import simulate
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.rollouts import (
-    ENDED,
-    Rollouts,
-    draw_goals,
-    flag_score,
-    rollouts_of,
-    search,
-)
+from symphony.simulation.driving import simulated
+from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of
+from symphony.simulation.search import ENDED, flag_score, search
 
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=3)
 KINDS = ("none", "tree", "oracle", "best")
 
 
-def make_agent(seed: int = 0, method: Any = "bc_ts_h", judge: int = 0) -> Agent:
-    """A tiny untrained agent; ``judge`` is the seed of the discriminator alone."""
-    config = TrainConfig(
-        method,
-        data=Path(),
-        out=Path(),
+def make_agent(seed: int = 0, judge: int = 0, **changes: Any) -> Agent:
+    """A tiny untrained agent that follows routes; ``judge`` is the seed of the discriminator alone."""
+    spec = AgentSpec(
+        action_space="bicycle",
+        dt=0.2,
+        goals=True,
         agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
         discriminator=DiscriminatorConfig(hidden=8, head=8),
+        searches=True,
         search=SEARCH,
     )
+    spec = replace(spec, **changes)
     torch.manual_seed(seed)
-    networks = build_networks(config)
+    agent = build_agent("tiny", spec)
     torch.manual_seed(judge)
-    other = build_networks(config)
-    return Agent(
-        "tiny",
-        networks.policy,
-        Bicycle(),
-        observation_config(config),
-        goals=networks.goals,
-        discriminator=other.discriminator,
-        search=SEARCH,
-    )
+    return replace(agent, discriminator=build_agent("tiny", spec).discriminator)
+
+
+def searching(agent: Agent, **changes: Any) -> Agent:
+    """The same agent, trained with another search."""
+    assert agent.spec is not None
+    return replace(agent, spec=replace(agent.spec, search=replace(agent.search, **changes)))
 
 
 SEGMENTS = [
@@ -235,9 +227,9 @@ def _module(inner: torch.nn.Module) -> Any:
     return inner
 
 
-@pytest.mark.parametrize(("method", "kind"), [("bc_ts", "tree"), *(("bc_ts_h", kind) for kind in KINDS[1:])])
-def test_no_rollout_depends_on_the_batch(store: SegmentStore, kind: Any, method: Any) -> None:
-    agent = make_agent(method=method)
+@pytest.mark.parametrize(("goals", "kind"), [(False, "tree"), *((True, kind) for kind in KINDS[1:])])
+def test_no_rollout_depends_on_the_batch(store: SegmentStore, kind: Any, goals: bool) -> None:
+    agent = make_agent(goals=goals)
     one, three = (
         evaluate(agent, store, EvaluateConfig(search=kind, rollouts=4, trees=2, batch=b)).metrics.rows()
         for b in (1, 3)
@@ -303,10 +295,8 @@ def test_the_evaluation_decides_the_pruning(
     dataset: SceneDataset, agent: Agent, changes: dict[str, Any]
 ) -> None:
     scenes, config = dataset.scenes(range(4)), EvaluateConfig(search="tree", rollouts=4)
-    agent = replace(
-        agent, search=replace(agent.search, rule="systematic" if "temperature" in changes else "best")
-    )
-    trained = replace(agent, search=replace(agent.search, **changes))
+    agent = searching(agent, rule="systematic" if "temperature" in changes else "best")
+    trained = searching(agent, **changes)
     found = simulated(agent, scenes, replace(config, **changes))
     assert same(found, simulated(trained, scenes, config))
     assert not same(found, simulated(agent, scenes, config))
@@ -453,7 +443,7 @@ def blocked() -> RunSegment:
 
 
 def test_the_oracle_lowers_what_it_judges() -> None:
-    agent, scenes = make_agent(method="bc_ts"), scene(blocked(), [0, 1])
+    agent, scenes = make_agent(goals=False), scene(blocked(), [0, 1])
 
     def bad(kind: Any) -> tuple[float, float]:
         """Share of rollouts with a collision, and of agent-steps with a collision or off the road."""

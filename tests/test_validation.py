@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shutil
 from collections.abc import Callable
@@ -13,23 +14,22 @@ import pytest
 import torch
 from torch import nn
 
-from helpers_runs import same_weights, tiny, weights
+from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import Best, choose, split_name
-from symphony.agents.networks import build_networks
 from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.evaluation.evaluator import judge
+from symphony.evaluation.evaluator import evaluate_dataset
+from symphony.recipes import train
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.training import train
 from symphony.training.logging import read_metrics
-from symphony.training.validation import METRICS, Validator
+from symphony.training.validation import METRICS
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(store: Path, out: Path, held_out: Path | None, method: Any = "bc", **changes: Any) -> TrainConfig:
-    return tiny(method, store, out, **{"validation": ValidationConfig(held_out, rollouts=2), **changes})
+    return tiny(method, store, out, **{"validation": ValidationConfig(data=held_out, rollouts=2), **changes})
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
 
     def script(*values: float) -> None:
         left = iter(values)
-        monkeypatch.setattr("symphony.training.validation.judge", lambda *_: Found(next(left)))
+        monkeypatch.setattr("symphony.training.validation.evaluate_dataset", lambda *_: Found(next(left)))
 
     return script
 
@@ -169,7 +169,7 @@ def test_what_is_judged_stays_the_same_when_a_run_goes_on(
     # A run that was not judged so far may be from now on.
     plain = config(store, tmp_path / "plain", None, steps=2)
     train(plain)
-    train(replace(plain, resume=True, steps=4, validation=ValidationConfig(held_out, rollouts=1)))
+    train(replace(plain, resume=True, steps=4, validation=ValidationConfig(data=held_out, rollouts=1)))
     assert choose(plain.out, "best").name.endswith("4")
 
 
@@ -178,7 +178,9 @@ def test_segments_are_spread_over_the_store(store: Path, held_out: Path, tmp_pat
 
     def indices(count: int) -> list[int]:
         some = replace(settings, validation=replace(settings.validation, segments=count))
-        return Validator(some, build_networks(some), torch.device("cpu")).dataset.indices
+        validator = build(some).validator
+        assert validator is not None
+        return validator.dataset.indices
 
     assert [indices(count) for count in (1, 2, 3, 9)] == [[0], [0, 2], [0, 1, 2], [0, 1, 2, 3]]
 
@@ -187,9 +189,9 @@ def test_networks_and_random_numbers_are_left_as_they_were(
     store: Path, held_out: Path, tmp_path: Path
 ) -> None:
     settings = config(store, tmp_path, held_out, "bc_ts")
-    networks = build_networks(settings)
-    validator = Validator(settings, networks, torch.device("cpu"))
-    modules = networks.present()
+    trainer = build(settings)
+    validator, modules = trainer.validator, trainer.agent.modules
+    assert validator is not None
     modules["discriminator"].eval()
     before = {name: [t.clone() for t in m.state_dict().values()] for name, m in modules.items()}
     state = torch.get_rng_state()
@@ -215,7 +217,7 @@ def test_an_agent_is_judged_without_its_folder(store: Path, held_out: Path, run:
     agent = load_agent(str(run))
     dataset = SceneDataset(SegmentStore(held_out), 2, Bicycle(), [1])
     done: list[tuple[int, int]] = []
-    found = judge(agent, dataset, EvaluateConfig(rollouts=2), lambda *at: done.append(at))
+    found = evaluate_dataset(agent, dataset, EvaluateConfig(rollouts=2), lambda *at: done.append(at))
     assert done == [(1, 1)]
     rows = evaluate(str(run), held_out, EvaluateConfig(rollouts=2)).metrics.rows()
     assert found.metrics.rows() == [rows[1]]
@@ -233,13 +235,15 @@ def test_stores_that_cannot_be_used_are_found_before_training(store: Path, tmp_p
 
 
 def test_settings_that_do_not_fit_are_refused(store: Path, held_out: Path, tmp_path: Path) -> None:
+    many = ValidationConfig(data=held_out, rollouts=3)
     with pytest.raises(
         ConfigError, match=r"validation\.every \(3\) must be a multiple of checkpoint-every \(2\)"
     ):
-        config(store, tmp_path, held_out, validation=ValidationConfig(held_out, every=3))
+        config(store, tmp_path, held_out, validation=ValidationConfig(data=held_out, every=3))
     with pytest.raises(ConfigError, match=r"must not exceed search\.test-branches \(2\)"):
-        config(store, tmp_path, held_out, "bc_ts", validation=ValidationConfig(held_out, rollouts=3))
-    config(store, tmp_path, held_out, "bc", validation=ValidationConfig(held_out, rollouts=3))
+        build(config(store, tmp_path / "a", held_out, "bc_ts", validation=many))
+    build(config(store, tmp_path / "b", held_out, "bc", validation=many))
+    assert not list(tmp_path.iterdir())
     for bad in ({"segments": 0}, {"rollouts": 0}, {"every": -1}):
         with pytest.raises(ConfigError):
             ValidationConfig(**bad)
@@ -248,7 +252,7 @@ def test_settings_that_do_not_fit_are_refused(store: Path, held_out: Path, tmp_p
 def made(folder: Path, best: dict[int, Best | None]) -> Path:
     """A run's folder with empty checkpoints, each of which knows the best so far."""
     for step, known in best.items():
-        extra = {"best": None if known is None else known.plain()}
+        extra = {"best": None if known is None else dataclasses.asdict(known)}
         save_checkpoint(folder / "checkpoints", step=step, modules={"m": nn.Linear(1, 1)}, extra=extra)
     return folder
 

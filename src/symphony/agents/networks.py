@@ -35,14 +35,14 @@ def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
     return DYNAMICS[spec.action_space]
 
 
-def observation_of(spec: AgentSpec, *, judged: bool = True) -> ObservationConfig:
+def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> ObservationConfig:
     """What the networks see.
 
     Args:
         spec: of the agent.
-        judged: whether the discriminator looks too; clearances are costly, and only it reads them.
+        discriminator: whether the discriminator looks too; clearances are costly, and only it reads them.
     """
-    features = spec.discriminator.features if judged and spec.discriminator is not None else "paper"
+    features = spec.discriminator.features if discriminator and spec.discriminator is not None else "paper"
     return ObservationConfig(
         num_objects=spec.agent.num_objects,
         num_points=spec.agent.num_points,

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from symphony.files import write_json
 from symphony.cli.wosac_files import ScenarioScore, score_files, summary
 from symphony.errors import ConfigError
+from symphony.files import write_json
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ class TrainConfig(RunConfig):
         dt: float,
         *,
         goals: bool = False,
-        judged: bool = False,
+        discriminator: bool = False,
         searches: bool = False,
     ) -> AgentSpec:
         """What the agent is that a recipe trains.
@@ -185,7 +185,7 @@ class TrainConfig(RunConfig):
             action_space: its own.
             dt: seconds per step of what it learns from.
             goals: whether it follows routes.
-            judged: whether it has a discriminator.
+            discriminator: whether it has one.
             searches: whether it is simulated with search.
         """
         return AgentSpec(
@@ -194,7 +194,7 @@ class TrainConfig(RunConfig):
             duration=self.duration,
             goals=goals,
             agent=self.agent,
-            discriminator=self.discriminator if judged else None,
+            discriminator=self.discriminator if discriminator else None,
             searches=searches,
             search=self.search,
         )

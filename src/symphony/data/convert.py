@@ -17,7 +17,18 @@ from symphony.data import store_format
 from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.engine import Engine
 from symphony.data.overlaps import TAG
-from symphony.data.parts import ODD, Outcome, Recipe, Stored, Task, divide, elsewhere, here, skip, tags_of
+from symphony.data.parts import (
+    ODD,
+    Outcome,
+    Preparation,
+    Stored,
+    Task,
+    divide,
+    elsewhere,
+    here,
+    skip,
+    tags_of,
+)
 from symphony.data.report import Report, Skip
 from symphony.data.resample import MAX_SIGMA
 from symphony.data.sources import Reader, get_reader
@@ -103,7 +114,9 @@ def convert(
         report = draft.report
         try:
             if not draft.finished:
-                recipe = Recipe(reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius)
+                recipe = Preparation(
+                    reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius
+                )
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:
                 draft.finish(report)
@@ -173,7 +186,9 @@ def _nothing(report: Report) -> DataError:
 class _Run:
     """Collects what the files give, in their order, whoever converts them."""
 
-    def __init__(self, draft: Draft, paths: list[str], recipe: Recipe, progress: Progress | None) -> None:
+    def __init__(
+        self, draft: Draft, paths: list[str], recipe: Preparation, progress: Progress | None
+    ) -> None:
         self.draft, self.report, self.progress, self.total = draft, draft.report, progress, len(paths)
         parts = divide([size for _, size in draft.job.files])
         tasks = [Task(recipe, tuple(paths[p.start : p.stop]), p.start, draft.parts) for p in parts]

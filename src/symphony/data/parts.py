@@ -58,7 +58,7 @@ Outcome = RunSegment | Stored | Skip | None
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Preparation:
     """How the records of a file become segments.
 
     Attributes:
@@ -151,7 +151,7 @@ class Task:
         folder: where parts lie.
     """
 
-    recipe: Recipe
+    recipe: Preparation
     files: tuple[str, ...]
     start: int
     folder: Path
@@ -199,7 +199,7 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
 
 
 def open_part(path: Path) -> list[Iterator[Outcome]]:
-    """For each file of a part, what :meth:`Recipe.outcomes` gave."""
+    """For each file of a part, what :meth:`Preparation.outcomes` gave."""
     store = SegmentStore(path)
 
     def outcome(entry: Any) -> Outcome:

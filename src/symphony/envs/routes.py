@@ -19,10 +19,11 @@ from symphony.geometry.frames import rotate
 from symphony.roadgraph import (
     LaneGraph,
     feasible_routes,
-    ground_truth_route,
+    ground_truth_routes,
     route_polyline,
     starting_lanes,
 )
+from symphony.streams import stream_of
 
 SPACING = 3.0
 """Metres between the points of a route."""
@@ -43,11 +44,13 @@ class RouteTable:
     Attributes:
         points: [G, K, 2] float32, :data:`SPACING` apart from beside the vehicle on; past the end the last one again.
         count: [G] int64 points before the end.
-        logged: the route nearest to the logged trajectory, -1 where the vehicle is on no lane.
+        right: [G] bool the routes nearest to the logged trajectory; several where they part beyond its end.
+        logged: one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane.
     """
 
     points: NDArray[np.float32]
     count: NDArray[np.int64]
+    right: NDArray[np.bool_]
     logged: int
 
 
@@ -57,7 +60,9 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int) -> RouteTable
     position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
     choices = feasible_routes(graph, position, heading)
     if not choices:
-        return RouteTable(np.zeros((0, POINTS, 2), np.float32), np.zeros(0, np.int64), -1)
+        return RouteTable(
+            np.zeros((0, POINTS, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1
+        )
     along = dict(starting_lanes(graph, position, heading))
     # A route that begins with a lane change starts on the neighbour, beside the lane the vehicle is on.
     default = next(iter(along.values()), 0.0)
@@ -75,7 +80,10 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int) -> RouteTable
         points[k, len(line) :] = line[-1]
         count[k] = len(line)
     path, valid = segment.position[agent, :, :2], segment.valid[agent]
-    return RouteTable(points, count, ground_truth_route(graph, choices, path, valid))
+    right = ground_truth_routes(graph, choices, path, valid)
+    tied = np.flatnonzero(right)
+    draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
+    return RouteTable(points, count, right, int(tied[draw]))
 
 
 def route_ahead(

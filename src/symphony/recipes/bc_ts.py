@@ -26,7 +26,7 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
     data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
 
     # Networks.
-    spec = config.spec("bicycle", data.dt, judged=True, searches=True)
+    spec = config.spec("bicycle", data.dt, discriminator=True, searches=True)
     policy, discriminator = policy_network(spec), discriminator_network(spec)
     agent = Agent(str(config.out), policy, spec, discriminator=discriminator).to(device)
 
@@ -52,7 +52,7 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
 
     # The order of updates.
     def update(step: int) -> Updates:
-        items, sees = data.draw(config.segments, rng), observation_of(spec, judged=False)
+        items, sees = data.draw(config.segments, rng), observation_of(spec, discriminator=False)
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
         experts = data.sample_states(items, config.states, sees, rng, device)

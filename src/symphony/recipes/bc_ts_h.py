@@ -26,7 +26,7 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     data = SceneDataset(store, config.agent.interactive, dynamics, routes=True, duration=config.duration)
 
     # Networks.
-    spec = config.spec("bicycle", data.dt, goals=True, judged=True, searches=True)
+    spec = config.spec("bicycle", data.dt, goals=True, discriminator=True, searches=True)
     policy, goals, discriminator = policy_network(spec), goal_network(spec), discriminator_network(spec)
     agent = Agent(str(config.out), policy, spec, goals, discriminator).to(device)
 
@@ -53,7 +53,7 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
 
     # The order of updates.
     def update(step: int) -> Updates:
-        items, sees = data.draw(config.segments, rng), observation_of(spec, judged=False)
+        items, sees = data.draw(config.segments, rng), observation_of(spec, discriminator=False)
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
         experts = data.sample_states(items, config.states, sees, rng, device)

@@ -26,7 +26,7 @@ def mgail(config: TrainConfig, processes: Processes) -> Trainer:
     data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
 
     # Networks.
-    spec = config.spec("displacement", data.dt, judged=True)
+    spec = config.spec("displacement", data.dt, discriminator=True)
     policy, discriminator = policy_network(spec), discriminator_network(spec)
     agent = Agent(str(config.out), policy, spec, discriminator=discriminator).to(device)
 
@@ -72,7 +72,7 @@ def mgail(config: TrainConfig, processes: Processes) -> Trainer:
             losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
         yield "policy", losses
 
-    sees, begin = observation_of(spec, judged=False), config.mgail.regression
+    sees, begin = observation_of(spec, discriminator=False), config.mgail.regression
     slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
     phases = [
         Phase(begin, regression, cosine(rates, begin)),

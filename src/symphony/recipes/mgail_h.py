@@ -26,7 +26,7 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
     data = SceneDataset(store, config.agent.interactive, dynamics, routes=True, duration=config.duration)
 
     # Networks.
-    spec = config.spec("displacement", data.dt, goals=True, judged=True)
+    spec = config.spec("displacement", data.dt, goals=True, discriminator=True)
     policy, goals, discriminator = policy_network(spec), goal_network(spec), discriminator_network(spec)
     agent = Agent(str(config.out), policy, spec, goals, discriminator).to(device)
 
@@ -79,7 +79,7 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "policy", losses
         yield from goals_of(items)
 
-    sees, begin = observation_of(spec, judged=False), config.mgail.regression
+    sees, begin = observation_of(spec, discriminator=False), config.mgail.regression
     slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
     phases = [
         Phase(begin, regression, cosine(rates, begin)),

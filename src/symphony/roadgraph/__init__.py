@@ -8,7 +8,7 @@ from symphony.roadgraph.graph import LaneGraph, Regions
 from symphony.roadgraph.routes import (
     Route,
     feasible_routes,
-    ground_truth_route,
+    ground_truth_routes,
     route_errors,
     route_polyline,
     routes,
@@ -19,7 +19,7 @@ __all__ = [
     "Regions",
     "Route",
     "feasible_routes",
-    "ground_truth_route",
+    "ground_truth_routes",
     "lane_of",
     "route_errors",
     "route_polyline",

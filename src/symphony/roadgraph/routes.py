@@ -152,13 +152,17 @@ def route_errors(
     return np.array([distance[[row[lane] for lane in route]].min(0).mean() for route in choices])
 
 
-def ground_truth_route(
+def ground_truth_routes(
     graph: LaneGraph, choices: Sequence[Route], trajectory: NDArray[Any], valid: NDArray[np.bool_]
-) -> int:
-    """Index of the feasible route with the smallest displacement error to the logged trajectory.
+) -> NDArray[np.bool_]:
+    """The feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
 
-    The error is that of :func:`route_errors`. The first route wins where errors are within a millimetre, as for
-    routes that part beyond the trajectory's end, and where no step is valid.
+    The error is that of :func:`route_errors`. Routes whose errors are within a millimetre are equally right: those
+    that part beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place
+    would bias what is learned of choices.
+
+    Returns:
+        [G] whether a route is one of them.
 
     Raises:
         ValueError: there are no routes.
@@ -167,8 +171,8 @@ def ground_truth_route(
         raise ValueError("no routes to choose from")
     errors = route_errors(graph, choices, trajectory, valid)
     if np.isnan(errors).all():
-        return 0
-    return int(np.flatnonzero(errors <= errors.min() + _TIE)[0])
+        return np.ones(len(choices), np.bool_)
+    return errors <= errors.min() + _TIE
 
 
 def route_polyline(

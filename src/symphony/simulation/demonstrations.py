@@ -190,8 +190,8 @@ class SceneDataset:
         """A training batch for the goal policy: experts at their first state, their routes and the one they took.
 
         Returns:
-            TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK`` and ``GOAL``
-            (-1 for vehicles on no lane).
+            TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK``, ``GOAL``
+            (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally right.
         """
         each = self.experts.many(items)
         found = [(i, expert, k) for i, expert in enumerate(each) for k in range(len(expert.agent))]
@@ -201,8 +201,10 @@ class SceneDataset:
         tables = [e.routes[k] for _, e, k in chosen]
         most = max(1, *(len(table.count) for table in tables))
         points, counts = np.zeros((count, most, POINTS, 2), np.float32), np.zeros((count, most), np.int64)
+        right = np.zeros((count, most), np.bool_)
         for row, table in enumerate(tables):
             points[row, : len(table.count)], counts[row, : len(table.count)] = table.points, table.count
+            right[row, : len(table.count)] = table.right
         state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
             device
         )
@@ -223,6 +225,8 @@ class SceneDataset:
         batch.set(keys.ROUTES, features)
         batch.set(keys.ROUTES_MASK, mask)
         batch.set(keys.GOAL, torch.tensor([[table.logged] for table in tables], device=device))
+        # A route of one point is no choice (see `route_choices`).
+        batch.set(keys.GOAL_SET, torch.from_numpy(right)[:, None].to(device) & mask)
         return batch
 
     def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor]:

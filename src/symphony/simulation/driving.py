@@ -87,7 +87,7 @@ def simulation(
         settings = config.pruning(agent.search)
         judge = None
         if config.search != "oracle" and agent.discriminator is not None:
-            judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator")
+            judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
             result = search(
                 env,

@@ -45,7 +45,9 @@ class FiniteWatch:
         self.env = env
         self._first: dict[str, Tensor] = {}
 
-    def watched(self, module: TensorDictModuleBase, out_keys: Sequence[keys.Key], what: str) -> Watched:
+    def watched(
+        self, module: TensorDictModuleBase, out_keys: Sequence[keys.Key], what: str, *, scores: bool = False
+    ) -> Watched:
         """A module whose output is watched.
 
         Args:
@@ -53,8 +55,10 @@ class FiniteWatch:
             out_keys: floating-point entries [*b, N, ...] that must be finite for valid agents; absent ones are not
                 looked at.
             what: its name in the error.
+            scores: whether it judges states, the last of a scene among them; others act in those before. Past a
+                scene's end there is only the padding of its batch.
         """
-        return Watched(module, out_keys, lambda tensordict, value: self._see(tensordict, value, what))
+        return Watched(module, out_keys, lambda tensordict, value: self._see(tensordict, value, what, scores))
 
     def check(self) -> None:
         """Raise NotFiniteError for the first scene in which something was not finite."""
@@ -64,16 +68,16 @@ class FiniteWatch:
                 row = int(bad[0])
                 raise NotFiniteError(what, row, int(first[row]))
 
-    def _see(self, tensordict: TensorDictBase, value: Tensor, what: str) -> None:
+    def _see(self, tensordict: TensorDictBase, value: Tensor, what: str, scores: bool) -> None:
         valid = tensordict.get(keys.VALID)
         finite = value.isfinite()
         finite = finite.flatten(valid.ndim).all(-1) if finite.ndim > valid.ndim else finite
-        bad = (valid & ~finite).any(-1)
-        step = torch.where(bad, tensordict.get(keys.STEP).squeeze(-1), _NEVER)
+        scene, step = tensordict.get(keys.SCENE).squeeze(-1), tensordict.get(keys.STEP).squeeze(-1)
+        bad = (valid & ~finite).any(-1) & (step < self.env.scenes.last_step[scene] + scores)
+        step = torch.where(bad, step, _NEVER)
         first = self._first.get(what)
         if first is None:
             first = torch.full((len(self.env.scenes),), _NEVER, dtype=step.dtype, device=step.device)
-        scene = tensordict.get(keys.SCENE).squeeze(-1)
         # Branches of a scene share its row: the earliest of them counts.
         self._first[what] = first.scatter_reduce(0, scene.flatten(), step.flatten(), "amin")
 

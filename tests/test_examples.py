@@ -1,0 +1,62 @@
+"""Every example runs, tiny, and stays short."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+ELSEWHERE = {"beam_search_torchrl"}
+"""Run by tests/test_collectors_beam_search.py."""
+CARS = ("envs", "data", "roadgraph", "geometry", "simulation", "agents", "modules", "metrics")
+
+
+@pytest.fixture(name="example")
+def _example(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module
+
+
+def test_examples_fit_on_a_page_and_all_are_tested() -> None:
+    here, names = Path(__file__).read_text(), sorted(path.stem for path in EXAMPLES.glob("*.py"))
+    assert len(names) >= 4
+    for name in names:
+        assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 100, name
+        assert name in ELSEWHERE or f'example("{name}")' in here or f"import {name}" in here, name
+
+
+def test_ppo_driving(example: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    metres = example("ppo_driving").main(batches=2, rows=4, steps=12, hidden=8)
+    assert len(metres) == 2
+    assert all(0 < driven < 4 * 12 * 10 for driven in metres)
+    assert "m per crash" in capsys.readouterr().out
+
+
+def test_gail_pendulum_has_nothing_to_do_with_cars() -> None:
+    """Nor do collectors and losses, which it uses, load anything of them."""
+    code = (
+        f"import sys; sys.path.insert(0, {str(EXAMPLES)!r}); import gail_pendulum;"
+        "result = gail_pendulum.main(iterations=2, rows=2, branches=4, updates=2);"
+        "print('result:', result); print('loaded:', *(m for m in sys.modules if m.startswith('symphony')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *_, result, loaded = done.stdout.splitlines()
+    ours = set(loaded.split()[1:])
+    assert {"symphony.collectors", "symphony.objectives"} <= ours
+    assert not [module for module in ours if module.split(".")[1:2] and module.split(".")[1] in CARS]
+    costs = [float(cost) for cost in result.removeprefix("result: ").strip("[]").split(",")]
+    assert len(costs) == 4
+    assert all(0 < cost < math.pi**2 + 7 for cost in costs)
+
+
+@pytest.mark.slow
+def test_several_processes(example: Any) -> None:
+    costs = example("several_processes").main(iterations=2, branches=2, workers=2, updates=1)
+    assert len(costs) == 3
+    assert all(0 < cost < math.pi**2 + 7 for cost in costs)

@@ -1,0 +1,85 @@
+"""The scene knows its time step; whoever learned another one refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from helpers_runs import tiny
+from helpers_segments import crossing, straight_road
+from symphony.cli import main
+from symphony.config import EvaluateConfig
+from symphony.data.resample import resample
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import DrivingEnv, collate, scene
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation import evaluate
+from symphony.recipes import train
+from symphony.simulation import SceneDataset
+
+
+def store_at(folder: Path, dt: float) -> Path:
+    """The same two logs, by steps of `dt` seconds."""
+    with StoreWriter(folder) as writer:
+        for log in (straight_road(4, steps=61, dt=0.1), crossing(4, steps=61, dt=0.1)):
+            writer.append(resample(log, dt))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
+    folder = tmp_path_factory.mktemp("data")
+    return {dt: store_at(folder / str(round(10 * dt)), dt) for dt in (0.1, 0.2)}
+
+
+def test_constant_velocity_is_as_far_off_at_any_rate(stores: dict[float, Path]) -> None:
+    found = {dt: evaluate("constant_velocity", store).numbers() for dt, store in stores.items()}
+    assert found[0.2]["ade"] > 0.5
+    # The mean is over steps, and the finer ones lie between the coarser.
+    assert found[0.1]["ade"] == pytest.approx(found[0.2]["ade"], rel=0.1)
+
+
+def test_an_environment_steps_as_its_scenes_do(stores: dict[float, Path]) -> None:
+    for dt, path in stores.items():
+        data = SceneDataset(SegmentStore(path))
+        assert data.dt == pytest.approx(dt)
+        env = DrivingEnv(data)
+        env.reset()
+        assert env.dt == pytest.approx(dt)
+
+
+def test_agents_refuse_another_rate_than_they_learned(
+    stores: dict[float, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = train(tiny("bc", stores[0.2], tmp_path / "run", steps=2))
+    assert evaluate(str(run), stores[0.2], EvaluateConfig(rollouts=1)).metrics.compute()["segments"] == 2
+    with pytest.raises(
+        ConfigError, match=r"learned steps of 0\.2 s and can't drive in steps of 0\.1 s.*--rate 5"
+    ):
+        evaluate(str(run), stores[0.1])
+    assert main(["evaluate", str(run), "--data", str(stores[0.1])]) == 1
+    assert "--rate 5" in capsys.readouterr().err
+
+
+def test_validation_at_another_rate_is_refused_before_the_first_update(
+    stores: dict[float, Path], tmp_path: Path
+) -> None:
+    config = tiny("bc", stores[0.2], tmp_path / "run", steps=2)
+    config = replace(config, validation=replace(config.validation, data=stores[0.1], segments=1, rollouts=1))
+    with pytest.raises(ConfigError, match="learned steps"):
+        train(config)
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_stores_and_batches_of_several_rates_are_refused(tmp_path: Path) -> None:
+    slow, fast = straight_road(3, dt=0.2, seed=1), straight_road(3, dt=0.1, seed=2)
+    with pytest.raises(DataError, match=r"different time steps in one batch: 0\.1 s, 0\.2 s"):
+        collate([scene(slow), scene(fast)])
+    with StoreWriter(tmp_path / "mixed") as writer:
+        writer.append(slow)
+        writer.append(fast)
+    with pytest.raises(DataError, match=r"has steps of 0\.1 s, others of 0\.2 s") as error:
+        train(tiny("bc", tmp_path / "mixed", tmp_path / "run"))
+    assert fast.segment_id in str(error.value)
