@@ -124,4 +124,4 @@ def test_gymnasium_knows_it_without_importing_anything_heavy() -> None:
 def test_the_extra_is_named_where_it_is_missing() -> None:
     code = "import sys; sys.modules['gymnasium'] = None; import symphony.gym"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "symphony[gym]" in done.stderr
+    assert "symphony-traffic[gym]" in done.stderr

@@ -112,7 +112,7 @@ def test_a_film_needs_its_encoder(
     save_rollouts(tmp_path / "sim", ABOUT, pages()[1:2])
     monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
     assert main(["view", str(tmp_path / "sim"), "--out", str(tmp_path / "a.mp4")]) == 1
-    assert "symphony[video]" in capsys.readouterr().err
+    assert "symphony-traffic[video]" in capsys.readouterr().err
     assert not (tmp_path / "a.mp4").exists()
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 try:
     import gymnasium
 except ImportError as error:
-    raise ImportError("Gymnasium is not installed: pip install symphony[gym]") from error
+    raise ImportError("Gymnasium is not installed: pip install 'symphony-traffic[gym]'") from error
 
 ENVIRONMENT = "symphony/Driving-v0"
 

@@ -31,7 +31,7 @@ class View:
     """Folder of saved rollouts."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File to write: a page (.html), a picture (.png, .pdf or .svg), an animation (.gif) or a film (.mp4, which needs
-    `pip install symphony[video]`). By default view.html in the folder."""
+    `pip install 'symphony-traffic[video]'`). By default view.html in the folder."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
     """Only these run segments; of a picture by default the first few."""
     rollouts: int = 0

@@ -32,7 +32,7 @@ def write_film(clips: Sequence[Clip], path: Path, *, columns: int = 3, size: flo
     try:
         import imageio_ffmpeg  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise ConfigError("a film needs an encoder: pip install symphony[video]") from error
+        raise ConfigError("a film needs an encoder: pip install 'symphony-traffic[video]'") from error
     frames, interval = frames_of(clips, columns=columns, size=size)
     # The format wants even sides.
     height, width = (side - side % 2 for side in frames[0].shape[:2])
