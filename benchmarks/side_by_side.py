@@ -1,9 +1,9 @@
 """Measure two versions in turn on one machine, and print a table of ratios.
 
-    python benchmarks/side_by_side.py --before 9eed275 [--rounds 5] [--only simulator ...]
+    python benchmarks/side_by_side.py --before 9eed275 [--rounds 15] [--only simulator ...]
 
-Each figure is the median over rounds; a round is a process of its own, and versions alternate, so that whatever else
-the machine does meets both. The version before is checked out beside this one by ``git worktree``.
+Each figure is the median over rounds in which the versions take turns, each in a process of its own, so that whatever
+else the machine does meets all of them. The version before is checked out beside this one by ``git worktree``.
 """
 
 from __future__ import annotations
@@ -15,20 +15,55 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 YARDSTICKS = ("brute force", "matmul")
 
 
-def run(root: Path, workload: str, *options: str) -> dict[str, float]:
-    """One process of one version."""
+def started(root: Path, program: str, *options: str) -> subprocess.Popen[str]:
+    """A program of this folder with the package of one version."""
     paths = os.pathsep.join([str(root / "src"), str(ROOT / "tests")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-    command = [sys.executable, str(ROOT / "benchmarks" / "workloads.py"), workload, *options]
-    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True, cwd=root)  # noqa: S603
-    return json.loads(done.stdout)
+    command = [sys.executable, str(ROOT / "benchmarks" / program), *options]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, text=True, cwd=root)  # noqa: S603
+
+
+def run(root: Path, program: str, *options: str) -> str:
+    """What a program prints."""
+    process = started(root, program, *options)
+    printed, _ = process.communicate()
+    if process.returncode:
+        raise SystemExit(f"{program} failed with {root}")
+    return printed
+
+
+class Worker:
+    """A workload in a process of its own."""
+
+    def __init__(self, root: Path, *options: str) -> None:
+        self.process = started(root, "workloads.py", *options)
+        self._line()
+
+    def _line(self) -> str:
+        line = self.process.stdout.readline() if self.process.stdout else ""
+        if not line:
+            raise SystemExit(f"{' '.join(map(str, self.process.args))} failed")  # type: ignore[arg-type]
+        return line
+
+    def measure(self) -> dict[str, float]:
+        """One round."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        return json.loads(self._line())
+
+    def close(self) -> None:
+        """End it."""
+        self.process.communicate()
 
 
 def main() -> None:
@@ -37,56 +72,68 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--before", required=True, help="a commit")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--only", nargs="+")
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT / "benchmarks"))
     from workloads import WORKLOADS  # noqa: PLC0415
 
     names = arguments.only or list(WORKLOADS)
+    with checked_out(arguments.before) as old:
+        report(old, names, arguments.rounds)
+
+
+@contextmanager
+def checked_out(commit: str) -> Iterator[Path]:
+    """The files of a commit in a folder of their own."""
     with tempfile.TemporaryDirectory() as folder:
         old = Path(folder) / "before"
         git = ["git", "-C", str(ROOT), "worktree"]
-        subprocess.run([*git, "add", "--detach", str(old), arguments.before], check=True, capture_output=True)  # noqa: S603
+        subprocess.run([*git, "add", "--detach", str(old), commit], check=True, capture_output=True)  # noqa: S603
         try:
-            report(old, names, arguments.rounds)
+            yield old
         finally:
             subprocess.run([*git, "remove", "--force", str(old)], check=True, capture_output=True)  # noqa: S603
 
 
+HEADER = """| workload | agent-steps/s before | after | ratio | memory kept | ratio | page faults | peak MiB |
+| --- | --- | --- | --- | --- | --- | --- | --- |"""
+
+
 def report(old: Path, names: list[str], rounds: int) -> None:
     """Measure and print."""
-    found: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
-    for number in range(rounds):
-        for name in names:
-            found[name, "after"].append(run(ROOT, name))
-            if name not in YARDSTICKS:
-                found[name, "kept"].append(run(ROOT, name, "--keep-memory"))
-                found[name, "before"].append(run(old, name))
-        print(f"round {number + 1} of {rounds}", file=sys.stderr, flush=True)
-
-    def middle(name: str, which: str, what: str) -> float:
-        return statistics.median(one[what] for one in found[name, which])
-
-    print(
-        "| workload | agent-steps/s before | after | ratio | memory kept | ratio | page faults | peak MiB |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(HEADER, flush=True)
     for name in names:
-        steps = found[name, "after"][0]["steps"]
-        after = steps / middle(name, "after", "seconds")
-        if name in YARDSTICKS:
-            print(f"| {name} | | {after:,.0f} | | | | {middle(name, 'after', 'faults'):,.0f} | |")
-            continue
-        before, kept = (steps / middle(name, which, "seconds") for which in ("before", "kept"))
-        faults, peak = (
-            " → ".join(f"{middle(name, which, what):,.0f}" for which in ("before", "after", "kept"))
-            for what in ("faults", "mebibytes")
-        )
-        print(
-            f"| {name} | {before:,.0f} | {after:,.0f} | {after / before:.2f} | {kept:,.0f} | {kept / before:.2f} "
-            f"| {faults} | {peak} |"
-        )
+        once = name.startswith("search")
+        warm = "1" if once else "40"
+        workers = {"after": Worker(ROOT, name, "--warm", warm)}
+        if name not in YARDSTICKS:
+            workers["kept"] = Worker(ROOT, name, "--keep-memory", "--warm", warm)
+            workers["before"] = Worker(old, name, "--warm", "1" if once else "3")
+        found = {which: [] for which in workers}
+        for _ in range(rounds):
+            for which, worker in workers.items():
+                found[which].append(worker.measure())
+        for worker in workers.values():
+            worker.close()
+        print(row(name, found), flush=True)
+
+
+def row(name: str, found: dict[str, list[dict[str, float]]]) -> str:
+    """A line of the table."""
+
+    def middle(which: str, what: str) -> float:
+        return statistics.median(one[what] for one in found[which])
+
+    speed = {which: found[which][0]["steps"] / middle(which, "seconds") for which in found}
+    faults, peak = (
+        " → ".join(f"{middle(which, what):,.0f}" for which in ("before", "after", "kept") if which in found)
+        for what in ("faults", "mebibytes")
+    )
+    if name in YARDSTICKS:
+        return f"| {name} | | {speed['after']:,.0f} | | | | {faults} | {peak} |"
+    ratios = [f"{speed[which]:,.0f} | {speed[which] / speed['before']:.2f}" for which in ("after", "kept")]
+    return f"| {name} | {speed['before']:,.0f} | {' | '.join(ratios)} | {faults} | {peak} |"
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """What is measured, in any version of the package: one round of work as a function, and how many agent-steps it is.
 
-As a program it measures one workload in a process of its own and prints a line of JSON; ``side_by_side.py`` runs it
-on two versions in turn.
+As a program it prepares one workload and answers each line of its input with a round's measurements as JSON;
+``side_by_side.py`` asks two versions in turn.
 
-    python benchmarks/workloads.py simulator --rounds 7
+    yes | head -7 | python benchmarks/workloads.py simulator
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -114,26 +114,54 @@ def builtin(count: int, agents: int = 2) -> SceneBatch:
     return collate([scene(store[k], agents) for k in range(count)])
 
 
-def search() -> Work:
-    """A beam search on 16 built-in segments: 16 branches, 50 steps, 128 points, foresight."""
-    config = ObservationConfig(16, 128, clearance=True, foresight=(0.5, 1.0, 2.0))
+def search(
+    points: int = 128, features: Any = "foresight", *, branches: int = 16, noise: bool = False
+) -> Work:
+    """A beam search on 16 built-in segments, 50 steps, untrained networks.
+
+    Args:
+        points: nearest points that are seen.
+        features: of the discriminator.
+        branches: S.
+        noise: let actions be decided by numbers of their own, so that another version draws the same.
+    """
+    ahead = (0.5, 1.0, 2.0) if features == "foresight" else ()
+    config = ObservationConfig(16, points, clearance=features != "paper", foresight=ahead)
     groups = (
         ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
         ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
     )
     torch.manual_seed(0)
     policy = discrete_policy(SELF_FEATURES, groups)
-    judge = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features="foresight")
+    judge = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features=features)
     env = DrivingEnv(builtin(16), Bicycle(), config)
-    rows = torch.arange(16)[:, None].expand(-1, 16)
-    start = env.start(rows, torch.arange(16).expand(rows.shape))
+    rows = torch.arange(16)[:, None].expand(-1, branches)
+    start = env.start(rows, torch.arange(branches).expand(rows.shape))
     score = KeyScore(keys.SCORE, judge, valid_key=keys.VALID)
 
-    def once() -> Any:
-        kept = [keys.STATE, keys.ACTION]
-        return beam_search(env, policy, score, start, steps=50, prune_every=10, rule=KeepBest(0.5), keep=kept)
+    def act(state: Any) -> Any:
+        if noise:
+            place = torch.arange(env.num_agents) + 1
+            at = 12.9898 * state[keys.STREAM] % 1000 + 78.233 * state[keys.STEP] + 37.719 * place
+            state.set(keys.NOISE, (at.double().sin() * 43758.5453 % 1).float().clamp(1e-6, 1 - 1e-6))
+        return policy(state)
 
-    return once, 16 * 16 * 2 * 50
+    def once() -> Any:
+        kept = [keys.STATE, keys.ACTION, ("next", *keys.COLLISION), ("next", *keys.OFFROAD)]
+        return beam_search(
+            env,
+            act if noise else policy,
+            score,
+            start,
+            steps=50,
+            prune_every=10,
+            rule=KeepBest(0.5),
+            keep=kept,
+            slot_keys=[keys.STREAM] if noise else [],
+            exploration_type=ExplorationType.RANDOM,
+        )
+
+    return once, 16 * branches * env.num_agents * 50
 
 
 def brute_force() -> Work:
@@ -181,42 +209,52 @@ WORKLOADS: dict[str, Callable[[], Work]] = {
 }
 
 
+class Measured:
+    """A workload, ready to be run.
+
+    Args:
+        name: of the workload.
+        warm: rounds before the first that counts. Maps get their grids once they have been asked often enough.
+    """
+
+    def __init__(self, name: str, warm: int) -> None:
+        torch.set_num_threads(1)
+        self.work, self.steps = WORKLOADS[name]()
+        self.prepared = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        for _ in range(warm):
+            self.work()
+
+    def __call__(self) -> dict[str, float]:
+        """CPU seconds and page faults of a round, and MiB by which the peak rose above that of the prepared work."""
+        faults, began = resource.getrusage(resource.RUSAGE_SELF).ru_minflt, time.process_time()
+        self.work()
+        seconds, after = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF)
+        return {
+            "seconds": seconds,
+            "steps": self.steps,
+            "faults": after.ru_minflt - faults,
+            "mebibytes": (after.ru_maxrss - self.prepared) / 1024,
+        }
+
+
 @torch.no_grad()
-def measure(name: str, rounds: int) -> dict[str, float]:
-    """Median CPU seconds and page faults of a round, and MiB by which the peak rose above the prepared work."""
-    torch.set_num_threads(1)
-    work, steps = WORKLOADS[name]()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for _ in range(1 if name.startswith("search") else 25):
-        work()
-    spent, faults = [], resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(rounds):
-        began = time.process_time()
-        work()
-        spent.append(time.process_time() - began)
-    after = resource.getrusage(resource.RUSAGE_SELF)
-    return {
-        "seconds": statistics.median(spent),
-        "steps": steps,
-        "faults": (after.ru_minflt - faults) / rounds,
-        "mebibytes": (after.ru_maxrss - before) / 1024,
-    }
-
-
 def main() -> None:
-    """Measure one workload."""
+    """Measure one workload once for each line that comes in."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("workload", choices=WORKLOADS)
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--warm", type=int, default=40)
     parser.add_argument("--keep-memory", action="store_true", help="as the symphony command does")
     arguments = parser.parse_args()
     if arguments.keep_memory:
         from symphony import allocator  # noqa: PLC0415 - older versions have none
 
         allocator.tune()
-    print(json.dumps(measure(arguments.workload, arguments.rounds)))
+    measured = Measured(arguments.workload, arguments.warm)
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(json.dumps(measured()), flush=True)
 
 
 if __name__ == "__main__":

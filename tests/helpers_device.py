@@ -97,9 +97,9 @@ def pretend() -> Iterator[PretendDevice]:
 def on(device: PretendDevice, given: Any) -> Any:
     """A tensor, TensorDict, tensor class, or in place a module or environment, as it would be on the device."""
 
-    def moved(value: Tensor) -> Tensor:
+    def moved(value: Tensor, graph: bool = True) -> Tensor:
         fake = torch.empty(value.shape, dtype=value.dtype, device=device.device)
-        return fake.requires_grad_(value.requires_grad)
+        return fake.requires_grad_(value.requires_grad) if graph else fake
 
     if isinstance(given, Tensor):
         return moved(given)
@@ -110,7 +110,7 @@ def on(device: PretendDevice, given: Any) -> Any:
         for module in given.modules():
             for name, value in module._parameters.items():
                 if value is not None:
-                    module._parameters[name] = nn.Parameter(moved(value.detach()), value.requires_grad)
+                    module._parameters[name] = nn.Parameter(moved(value, graph=False), value.requires_grad)
             for name, value in module._buffers.items():
                 if value is not None:
                     module._buffers[name] = moved(value)

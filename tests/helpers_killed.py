@@ -58,7 +58,7 @@ def die_at(name: str, count: int, file: str, report: int) -> None:
     left = iter(range(count))
 
     def deadly(*args: Any, **options: Any) -> Any:
-        if not str(args[0]).endswith(file) or next(left, None) is not None:
+        if not str(args[-1] if args else "").endswith(file) or next(left, None) is not None:
             return action(*args, **options)
         if name == "log":
             args[0]._file.write('{"step": 3, "los')

@@ -187,6 +187,13 @@ def test_scenes_on_one_map_share_a_grid_and_old_ones_make_room(fresh_cache: Grid
     assert 0 < fresh_cache.used <= alone
 
 
+def test_maps_asked_for_once_are_forgotten_in_time(fresh_cache: GridCache, monkeypatch: Any) -> None:
+    monkeypatch.setattr(grids, "MAPS", 3)
+    for seed in range(6):
+        assert fresh_cache.get((np.full((2, 2), seed),), "points 1", 1, 10, point_grid) is None
+    assert len(fresh_cache._kept) == 3
+
+
 def test_collisions_are_those_of_all_pairs() -> None:
     scenes = collate([scene(crossing(7), [0, 1, 2]), scene(straight_road(5), [0, 1, 2])])
     rng = torch.Generator().manual_seed(6)

@@ -26,7 +26,8 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
 
     That rules out GymEnv, VmasEnv, SerialEnv, ParallelEnv and whatever wraps a simulator of its own. Environments
     with a batch size of their own are refused at once. Given a state, the environment is also stepped from it twice
-    by the same random numbers, once in its lifetime: if the results differ, it remembers something.
+    by the same random numbers, once in its lifetime: if the results differ, it remembers something. One whose class
+    says ``branchable = True`` is spared that trial, which waits for the device.
 
     Args:
         env: to be branched.
@@ -38,7 +39,7 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     if env.batch_locked or env.batch_size:
         kind = "is batch-locked" if env.batch_locked else f"has a batch size, {list(env.batch_size)}"
         raise ConfigError(_refusal(env, kind))
-    if state is None or env in _PASSED:
+    if state is None or env in _PASSED or getattr(env, "branchable", False):
         return
     one = state[(0,) * state.ndim].unsqueeze(0)
     with torch.no_grad():

@@ -72,6 +72,7 @@ class DrivingEnv(EnvBase):
     """
 
     batch_locked = False
+    branchable = True
     _supports_set_state = True
     _scenes: SceneBatch | None = None
 
@@ -126,8 +127,11 @@ class DrivingEnv(EnvBase):
     @scenes.setter
     def scenes(self, scenes: SceneBatch) -> None:
         self._scenes = scenes
+        # Read here, once: a step or a search must not wait for the device to tell.
         self.dt = float(scenes.dt[0])
         """Seconds per step, that of the scenes."""
+        self.decisions = int(scenes.last_step.max())
+        """Actions until the last logged step of the longest scene."""
 
     def _make_specs(self) -> None:
         n, config, device = self.num_agents, self.observation, self.device

@@ -243,6 +243,7 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> 
         scenes.log_state[:, None, :steps].transpose(2, 3),
         scenes.log_valid[:, None, :steps].transpose(2, 3),
         scenes.box_size[:, None],
+        scenes.agent_type[:, None],
     )
 
 

@@ -57,7 +57,7 @@ def simulate(
         start: as returned by :meth:`DrivingEnv.start`, any batch shape.
         steps: decisions; by default up to the last logged step of the longest scene.
     """
-    steps = decisions_of(env, start) if steps is None else steps
+    steps = env.decisions if steps is None else steps
     now, states, collisions, offroads = start, [start.get(keys.STATE)], [], []
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(steps):
@@ -135,11 +135,6 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
         trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)
     )
     return Rollouts(state, collision, offroad, counted_steps(env, start, collision.shape[-2]))
-
-
-def decisions_of(env: DrivingEnv, start: TensorDictBase) -> int:
-    """Actions until the last logged step of the longest scene."""
-    return int(env.scenes.last_step[start.get(keys.SCENE)].max())
 
 
 def counted_steps(env: DrivingEnv, start: TensorDictBase, steps: int) -> Tensor:

@@ -25,7 +25,6 @@ from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.imports import build_object, load_object
 from symphony.modules import SeededNoise
-from symphony.simulation.rollouts import decisions_of
 from symphony.streams import fold_in, uniform
 
 ENDED = -100.0
@@ -167,7 +166,7 @@ def search(
             ``retry_above``.
         retry_above: that total.
     """
-    steps = decisions_of(env, start)
+    steps = env.decisions
     return beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),

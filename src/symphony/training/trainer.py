@@ -22,7 +22,7 @@ from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoin
 from symphony.agents.choice import Best
 from symphony.config import RunConfig, to_json
 from symphony.errors import ConfigError, DataError
-from symphony.files import naming, write_file
+from symphony.files import write_file
 from symphony.simulation import SceneDataset, SearchReplay
 from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.training.logging import Tracker
@@ -112,10 +112,6 @@ class Trainer:
         self.world.wait()
         if self.world.leads:
             config.out.mkdir(parents=True, exist_ok=True)
-            # What a process left behind that was killed while it wrote.
-            for unfinished in config.out.glob(".new-*"):
-                with naming(unfinished):
-                    unfinished.unlink()
             write_file(config.out / "config.json", to_json(config))
             write_file(config.out / FILE, to_json(self.agent.spec))
         if self.done is not None:

@@ -1,0 +1,149 @@
+"""Search, simulation and every loss on a device that isn't the CPU: nothing mixes devices or waits for it, but what
+is listed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torch._subclasses.fake_tensor import DataDependentOutputException
+
+from helpers_device import NAME, PretendDevice, on, pretend
+from helpers_segments import crossing, straight_road
+from symphony import keys, objectives
+from symphony.agents import build_agent
+from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
+from symphony.envs import DrivingEnv, collate, scene
+from symphony.modules import SeededNoise
+from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.rollouts import simulate, start_states
+from symphony.simulation.search import search
+
+SCENES = collate(
+    [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=6), crossing(6, steps=6))]
+)
+ROWS = 4
+
+
+def spec(space: Any) -> AgentSpec:
+    return AgentSpec(
+        action_space=space,
+        dt=0.2,
+        goals=True,
+        agent=AgentConfig(num_objects=3, num_points=20, hidden=8, head=8),
+        discriminator=DiscriminatorConfig(features="foresight", hidden=8, head=8),
+        searches=True,
+    )
+
+
+@contextmanager
+def world(space: Any = "bicycle") -> Iterator[tuple[PretendDevice, Any, DrivingEnv]]:
+    """A device, and an agent and an environment on it."""
+    agent = build_agent("agent", spec(space))
+    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    with pretend() as device:
+        for module in agent.modules.values():
+            on(device, module)
+        yield device, agent, on(device, env)
+
+
+@pytest.mark.parametrize("space", ["bicycle", "displacement"])
+def test_simulations_stay_on_the_device(space: Any) -> None:
+    with world(space) as (device, agent, env):
+        policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
+
+        def run() -> Any:
+            return simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
+
+        run()
+        device.waits.clear()
+        found = run()
+        assert found.state.shape == (2, 2, 1, 6, 2, 4)
+        assert {part.device.type for part in found} == {NAME}
+        assert device.waits == []
+
+
+@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6), KeepAll(), ReplaceBad(0.0)], ids=repr)
+def test_searches_stay_on_the_device(rule: PruningRule) -> None:
+    with world() as (device, agent, env), torch.no_grad():
+
+        def run() -> Any:
+            start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
+            return search(env, agent.policy, agent.discriminator, start, seed=0, rule=rule, prune_every=2)
+
+        run()
+        device.waits.clear()
+        found = run()
+        assert found.trajectories.shape == (2, 1, 4, 5)
+        assert found.totals.device.type == NAME
+        assert device.waits == []
+
+
+def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
+    return {
+        "bc": BCLoss(agent.policy),
+        "distillation": DistillationLoss(agent.policy, survivors="best"),
+        "goal": GoalLoss(agent.goals),
+        "discriminator": DiscriminatorLoss(agent.discriminator, gradient_penalty=1.0),
+        "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=3),
+    }
+
+
+def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
+    """States with everything that any loss reads."""
+    batch = env.choices(env.with_goals(state))
+    valid = batch.get(keys.VALID)
+    action = torch.zeros_like(valid, dtype=torch.int64)
+    batch.set(
+        keys.ACTION, action if env.dynamics.discrete else action[..., None].expand(*valid.shape, 2) + 0.5
+    )
+    batch.set(keys.ROLLOUT, torch.zeros_like(valid))
+    batch.set(keys.SIMULATED, torch.zeros_like(valid))
+    batch.set(keys.RANK, torch.zeros_like(action))
+    batch.set(keys.GOAL_SET, batch.get(keys.ROUTES_MASK))
+    return batch
+
+
+WAITS: dict[str, type[Exception]] = {"goal": DataDependentOutputException}  # whether a label is feasible
+"""What still waits for the device, by loss. This list only gets shorter."""
+
+
+@pytest.mark.parametrize("name", ["bc", "distillation", "goal", "discriminator", "mgail"])
+def test_losses_and_their_gradients_stay_on_the_device(name: str) -> None:
+    space = "displacement" if name == "mgail" else "bicycle"
+    with world(space) as (device, agent, env):
+        loss = losses(agent, env)[name]
+        row = torch.arange(ROWS, device=device.device) % 2
+        batch = batch_of(env, env.start(row, row))
+
+        def step() -> None:
+            out = loss(batch.exclude(keys.ACTION) if name == "mgail" else batch)
+            total = sum(value for key, value in out.items() if key.startswith("loss"))
+            assert isinstance(total, torch.Tensor)
+            assert total.device.type == NAME
+            total.backward()
+
+        if name in WAITS:
+            with pytest.raises(WAITS[name]):
+                step()
+            return
+        step()
+        device.waits.clear()
+        step()
+        assert device.waits == []
+
+
+def test_every_loss_is_among_them() -> None:
+
+    with world() as (_, agent, env):
+        known = {type(loss) for loss in losses(agent, env).values()}
+    there = [getattr(objectives, name) for name in objectives.__all__ if name.endswith("Loss")]
+    assert known == set(there)
