@@ -18,8 +18,13 @@ from hypothesis import strategies as st
 
 from helpers_saved import played, searched
 from helpers_segments import CAR, LANE_WIDTH, crossing, crossing_road, make_road, make_segment, straight_road
+from helpers_store import fill
 from symphony.cli import main
+from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
+from symphony.data.sources.womd import WomdReader
+from symphony.data.store import SegmentStore
+from symphony.envs.scene import scene
 from symphony.errors import DataError
 from symphony.evaluation.contacts import HORIZON, contacts, time_to_collision
 from symphony.evaluation.driving import red_lights, wrong_way
@@ -27,7 +32,8 @@ from symphony.evaluation.report import Report, add_segment, report, total_number
 from symphony.geometry import box_gap
 from symphony.metrics import CollisionKind
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.driving import playback
+from symphony.simulation.saved import SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutWriter, save_rollouts
 from symphony.simulation.world import World, world_of
 
@@ -305,6 +311,36 @@ def test_contacts_are_those_that_the_simulation_flagged() -> None:
         for k in range(saved.rollouts):
             hit = {e.agent for e in events if e.rollout == k and e.kind == "collision"}
             assert hit == set(saved.agents[(saved.collision[k] & saved.counted[k]).any(0)].tolist())
+
+
+def report_of_the_log(store: SegmentStore, count: int) -> dict[str, Any]:
+    found = Report("log", "interactive")
+    for i in range(count):
+        scenes = scene(store[i], 2)
+        add_segment(found, saved_rollouts(store[i], scenes, playback(scenes)))
+    return found.totals()
+
+
+def assert_orderly(totals: dict[str, Any]) -> None:
+    for name in ("collision_rate", "red_light_rate", "wrong_way_time", "log_distance"):
+        assert totals[name] == 0, name
+    assert totals["progress_ratio"] == pytest.approx(1)
+    assert totals["progress"] > 1
+
+
+def test_logged_driving_breaks_no_rules() -> None:
+    assert_orderly(report_of_the_log(SegmentStore(builtin_store("test")), 6))
+
+
+@pytest.mark.samples
+def test_real_driving_breaks_no_rules(samples: Path, tmp_path: Path) -> None:
+    files = sorted((samples / "real" / "womd").glob("*.tfrecord"))[:4]
+    if not files:
+        pytest.skip("no real WOMD scenarios among the samples")
+    found = [item for file in files for item in WomdReader().read(file)]
+    fill(tmp_path / "store", [item for item in found if isinstance(item, RunSegment)])
+    store = SegmentStore(tmp_path / "store")
+    assert_orderly(report_of_the_log(store, len(store)))
 
 
 def test_moving_and_turning_the_world_changes_nothing() -> None:

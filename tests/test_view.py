@@ -238,6 +238,8 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
     assert out["fates"] == fates.tolist()
     assert out["history"] == trees.slots[0, np.arange(tree.steps) // trees.prune_every, 0].tolist()
     assert out["branch"].startswith("Branch 0, 0.0–")
+    highest = trees.score[0, 0, : trees.prune_every].max()
+    assert f"Highest score: {highest:.2f}, agent " in out["branch"]
 
 
 @pytest.mark.slow

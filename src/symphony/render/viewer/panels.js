@@ -66,7 +66,7 @@ function eventText(r, event) {
   const who = r.ids[event.agent], other = event.other >= 0 ? r.ids[event.other] : "";
   if (event.kind === "collision") {
     const fault = event.fault === null ? "" : event.fault ? " <span class=\"fault\">at fault</span>" : " · not at fault";
-    return `${escapeText(who)} hits ${escapeText(other)}: ${escapeText(event.text)}${fault}`;
+    return `${escapeText(who)} and ${escapeText(other)}: ${escapeText(event.text)}${fault}`;
   }
   return `${escapeText(who)} ${escapeText(event.text)}`;
 }

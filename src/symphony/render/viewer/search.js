@@ -96,9 +96,21 @@ class SearchPanel {
     return p >= 0 && p < this.periods && s >= 0 && s < this.branches ? { p, s } : null;
   }
 
+  // When in a period, and whose, the score of a branch was highest: its most unrealistic moment.
+  peak(tree, p, s) {
+    const r = this.replay, n = r.agents.length;
+    let best = null;
+    for (let i = 0; i < n; i++) for (let t = p * r.prune_every; t < Math.min((p + 1) * r.prune_every, r.steps); t++) {
+      const score = r["tree.score"][((tree * r.branches + s) * n + i) * r.steps + t];
+      if (Number.isFinite(score) && (!best || score > best.score)) best = { score, agent: r.agents[i], step: t + 1 };
+    }
+    return best;
+  }
+
   branch(rollout, p, s) {
-    const tree = this.treeOf(rollout), [fate, why] = this.fate(tree, p, s), end = Math.min((p + 1) * this.replay.prune_every, this.replay.steps);
+    const tree = this.treeOf(rollout), [fate, reason] = this.fate(tree, p, s), peak = this.peak(tree, p, s), end = Math.min((p + 1) * this.replay.prune_every, this.replay.steps);
     const color = BRANCH, from = p * this.replay.prune_every * this.replay.dt;
+    const why = reason + (peak ? ` Highest score: ${peak.score.toFixed(2)}, agent ${this.replay.ids[peak.agent]} at ${(peak.step * this.replay.dt).toFixed(1)} s.` : "");
     return { tree, p, s, steps: this.history(tree, p, s), color, fate, why, title: `Branch ${s}, ${from.toFixed(1)}–${(end * this.replay.dt).toFixed(1)} s` };
   }
 }
