@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import pickle
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any
@@ -128,6 +129,8 @@ def _change(rng: Rng, value: Any, depth: int) -> Any:
 
 def leaf(rng: Rng, value: Any) -> Any:
     """Another value, of the same kind more often than not."""
+    if isinstance(value, np.ndarray) and rng.random() < 0.9:
+        return _array(rng, value)
     if isinstance(value, bool) and rng.random() < 0.5:
         return not value
     if isinstance(value, int | float) and rng.random() < 0.8:
@@ -145,6 +148,63 @@ def leaf(rng: Rng, value: Any) -> Any:
         lambda: True,
     )
     return pick(rng, others)()
+
+
+def _array(rng: Rng, value: Any) -> Any:
+    """An array with some elements changed, of another shape or type."""
+    way = rng.random()
+    if way < 0.6 and value.size and value.dtype.kind in "fiub":
+        copy = value.copy()
+        with np.errstate(all="ignore"):
+            wanted = float(number(rng)) if rng.random() < 0.5 else float(copy.flat[0]) * 1e3
+            safe = wanted if value.dtype.kind == "f" or abs(wanted) < 2**31 else 0.0
+            copy.flat[rng.integers(copy.size, size=int(rng.integers(1, 4)))] = np.float64(safe).astype(
+                copy.dtype
+            )
+        return copy
+    if way < 0.7:
+        return value[: int(rng.integers(len(value) + 1))] if value.ndim else value
+    if way < 0.8:
+        return np.concatenate([value] * int(rng.integers(2, 30))) if value.ndim else value
+    if way < 0.9:
+        return value[..., None] if rng.random() < 0.5 else value.reshape(-1)
+    return (
+        value.astype(pick(rng, ("f4", "f8", "i8", "?", "O", "U8")))
+        if np.isfinite(_plain(value)).all()
+        else value
+    )
+
+
+def _plain(value: Any) -> Any:
+    return value if value.dtype.kind in "fiub" else np.zeros(0)
+
+
+def pickle_(rng: Rng, data: bytes) -> bytes:
+    """A pickled tree with some places changed; at times its bytes."""
+    if rng.random() < 0.25:
+        return bytes_(rng, data)
+    return pickle.dumps(tree(rng, pickle.loads(data)), protocol=int(rng.integers(2, 6)))  # noqa: S301 - made here
+
+
+def csv(rng: Rng, data: bytes) -> bytes:
+    """A table with cells changed, rows gone, repeated or moved, or columns renamed; at times as bytes."""
+    if rng.random() < 0.15:
+        return bytes_(rng, data)
+    rows = [line.split(",") for line in data.decode().splitlines()]
+    for _ in range(int(rng.integers(1, 5))):
+        if not rows:
+            break
+        at, way = int(rng.integers(len(rows))), rng.random()
+        if way < 0.1:
+            del rows[at]
+        elif way < 0.2:
+            rows[at:at] = [list(rows[at]) for _ in range(int(rng.integers(1, 30)))]
+        elif way < 0.3:
+            rows[at] = list(pick(rng, rows))
+        else:
+            row = rows[0 if rng.random() < 0.05 else at]
+            row[int(rng.integers(len(row)))] = _text(rng)
+    return "\n".join(",".join(row) for row in [*rows, []]).encode("utf-8", "surrogatepass")
 
 
 def json_(rng: Rng, data: bytes) -> bytes:

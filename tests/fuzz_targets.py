@@ -191,6 +191,36 @@ def _argoverse2() -> Files:
         return {path.name: path.read_bytes(), city.name: city.read_bytes()}
 
 
+def _written(write: Callable[[Path], Path]) -> Callable[[], Files]:
+    """The files that a function writes into a folder, the one it returns first."""
+
+    def files() -> Files:
+        with tempfile.TemporaryDirectory() as folder:
+            log = write(Path(folder))
+            paths = sorted((p for p in Path(folder).rglob("*") if p.is_file()), key=lambda path: path != log)
+            return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+    return files
+
+
+def _interaction(folder: Path) -> Path:
+    from helpers_interaction import public, walker
+
+    return public(folder, walkers=walker("P1"))
+
+
+def _test_area(folder: Path) -> Path:
+    from helpers_interaction import taf
+
+    return taf(folder)
+
+
+def _scenarionet(folder: Path) -> Path:
+    from helpers_scenarionet import write
+
+    return write(folder)
+
+
 def _parquet(rng: Rng, data: bytes) -> bytes:
     """Values, rows, columns or types changed; at times the bytes."""
     import pyarrow as pa
@@ -231,6 +261,11 @@ BY_SUFFIX: Mapping[str, Callable[[Rng, bytes], bytes]] = {
     "xml": change.xml,
     "json": change.json_,
     "parquet": _parquet,
+    "csv": change.csv,
+    "osm": change.xml,
+    "osm_xy": change.xml,
+    "kml": change.xml,
+    "pkl": change.pickle_,
 }
 
 
@@ -388,6 +423,9 @@ TARGETS: dict[str, Target] = {
     "womd": reader("womd", _womd),
     "commonroad": reader("commonroad", _commonroad),
     "argoverse2": reader("argoverse2", _argoverse2),
+    "interaction": reader("interaction", _written(_interaction)),
+    "test_area": reader("interaction", _written(_test_area)),
+    "scenarionet": reader("scenarionet", _written(_scenarionet)),
     "store": Target(functools.cache(_store), _change_store, _read_store),
     "checkpoint": Target(functools.cache(_checkpoint), _change_checkpoint, _load_checkpoint),
     "configuration": Target(functools.cache(_configuration), _change_one, _read_configuration),

@@ -350,3 +350,22 @@ def test_a_rule_and_an_aggregate_of_ones_own():
         kept = [slot if slot != int(totals.argmax()) else int(totals.argmin()) for slot in range(4)]
         assert parents.tolist() == kept
     assert_close(batch.get(("next", *X)), found.trajectories.get(("next", *X)))
+
+
+def test_a_policy_on_a_device_of_its_own_gets_its_inputs_there():
+    """What it is given is moved, and only what it writes comes back."""
+    seen = []
+
+    class Elsewhere(Policy):
+        def forward(self, tensordict):
+            seen.append(tensordict.device)
+            return super().forward(tensordict)
+
+    batches = []
+    for options in ({}, {"policy_device": "cpu"}):
+        collector = make(policy=Elsewhere(), **options)
+        collector.set_seed(3)
+        seen.clear()
+        batches.append(collector.next())
+        assert set(seen) == {None if not options else torch.device("cpu")}
+    assert_same(batches[0].exclude("collector"), batches[1].exclude("collector"))

@@ -179,3 +179,11 @@ def test_every_public_name_is_in_the_reference(site: Path) -> None:
             missing |= {f"{room}.{name}" for name in names - shown}
     # Where a function has the name of its module, the page needs `::: symphony.ROOM.NAME.NAME`.
     assert missing == set()
+
+
+@needs_mkdocs
+def test_docstrings_are_markdown_in_the_reference(site: Path) -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html"))
+    prose = re.sub(r'<span class="sd">.*?</span>', "", pages)  # without the sources that are shown
+    assert re.findall(r"[^\n]*:(?:class|func|meth|data|mod|attr):[^\n]*", prose) == []
+    assert "[*env.batch_size, T]" in pages  # not the beginning of an emphasis

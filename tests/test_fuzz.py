@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from symphony.data.sources import readers
+
 pytestmark = pytest.mark.skipif(
     not sys.platform.startswith("linux"), reason="memory is limited on Linux only"
 )
@@ -22,10 +24,14 @@ if sys.platform.startswith("linux"):
     from fuzz_targets import TARGETS, Target
 
 NEEDS = {"argoverse2": "pyarrow"}
-INPUTS = 40
+INPUTS = 30
 
 
-@pytest.fixture(params=["womd", "commonroad", "argoverse2", "store", "checkpoint", "configuration"])
+NAMES = ["womd", "commonroad", "argoverse2", "interaction", "test_area", "scenarionet"]
+NAMES += ["store", "checkpoint", "configuration"]
+
+
+@pytest.fixture(params=NAMES)
 def name(request: pytest.FixtureRequest) -> str:
     package = NEEDS.get(request.param)
     if package is not None and importlib.util.find_spec(package) is None:
@@ -34,7 +40,8 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 def test_every_target_is_tested() -> None:
-    assert set(TARGETS) == {"womd", "commonroad", "argoverse2", "store", "checkpoint", "configuration"}
+    assert set(TARGETS) == set(NAMES)
+    assert set(readers()) <= set(TARGETS)
 
 
 def test_good_files_are_good(name: str, tmp_path: Path) -> None:

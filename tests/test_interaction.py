@@ -107,7 +107,8 @@ def test_lights_of_the_test_area(tmp_path: Path) -> None:
     assert segment.segment_id == "k1_001_t0"
     lane = segment.road.lane_id[segment.signal_lane].tolist()
     assert lane == [103, 104]
-    np.testing.assert_allclose(segment.signal_point + segment.origin, [(49, 2, 0), (49, 6, 0)], atol=1e-3)
+    # The stop line that the map names for the first lane, the stop point of the connection for the other.
+    np.testing.assert_allclose(segment.signal_point + segment.origin, [(50, 4, 0), (49, 6, 0)], atol=1e-3)
     assert segment.signal_state[0].tolist() == 20 * [SignalState.STOP] + 81 * [SignalState.GO]
     assert segment.signal_state[1].tolist() == 20 * [SignalState.UNKNOWN] + 81 * [SignalState.STOP]
     later = segments(taf(tmp_path, rows=track(3, steps=range(80))), window=2, stride=3)
@@ -139,6 +140,12 @@ def test_headings_that_are_not_those_of_the_motion(tmp_path: Path) -> None:
     path = public(tmp_path, [row.replace(",0.0,0.0,4.5", ",0.0,3.1,4.5") for row in raw()])
     assert read_error("interaction", path).field == "psi_rad"
     np.testing.assert_allclose(read_one("interaction", path, motion="positions").heading, 0, atol=1e-3)
+    # What stands before it moves is turned as well, and small differences are none.
+    rows = [row.replace("0.0,0.0,4.5", "0.0,2.5,4.5") for row in track(0, speed=0, steps=range(30))]
+    rows += [row.replace("0.0,0.0,4.5", "0.0,0.3,4.5") for row in track(0, x=-30, steps=range(30, 120))]
+    both = read_one("interaction", public(tmp_path, rows), motion="positions").heading[0]
+    np.testing.assert_allclose(both[:30], 0, atol=1e-3)
+    np.testing.assert_allclose(both[30:], 0.3, atol=1e-6)
     # One that stands keeps the heading that was logged.
     stands = [row.replace(",0.0,0.0,4.5", ",0.0,1.25,4.5") for row in track(9, x=20, speed=0)]
     still = read_one("interaction", public(tmp_path, [*raw(), *stands]), motion="positions")
@@ -226,6 +233,8 @@ COMPANIONS: dict[str, tuple[str, str | None, str]] = {
         KML.replace("7, 8", "17, 18").replace(">8<", ">18<"),
         "fits a lane",
     ),
+    "a lane without a name": ("k1_map.kml", KML.replace(">2<", "><", 1), "is not one lane"),
+    "a lane of two names": ("k1_map.kml", KML.replace(">2<", ">2, 3<", 1), "is not one lane"),
     "a group less": ("k1_map.kml", KML.replace("7, 8", "7"), "1 for 2 sinks"),
 }
 

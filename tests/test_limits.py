@@ -17,7 +17,7 @@ from symphony.data import convert as converting
 from symphony.data.convert import convert
 from symphony.data.generate import Plan, generate
 from symphony.data.segment import RunSegment
-from symphony.data.sources import get_reader, tfrecord
+from symphony.data.sources import get_reader, tfrecord, womd
 from symphony.data.sources.base import Item
 from symphony.data.sources.lines import drivable_rings
 from symphony.data.sources.tfrecord import write_records
@@ -66,9 +66,14 @@ def test_files_beyond_all_measure(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_outlines_that_cross_without_end() -> None:
-    outline = np.random.default_rng(0).uniform(0, 100, (4000, 2))
-    with pytest.raises(DataError, match="cross about"):
-        drivable_rings([outline])
+    rng = np.random.default_rng(0)
+    for outlines, message in (
+        ([rng.uniform(0, 100, (4000, 2))], "meet about"),
+        ([rng.uniform(0, 100, (200, 2))], "cross themselves"),
+        ([rng.uniform(0, 100, (4, 2)) for _ in range(400)], r"cross \d+ times, at most 50000"),
+    ):
+        with pytest.raises(DataError, match=message):
+            drivable_rings(outlines)
     angle = np.linspace(0, 2 * np.pi, 4000)
     (ring,) = drivable_rings([100 * np.stack([np.cos(angle), np.sin(angle)], -1)])
     np.testing.assert_allclose(np.hypot(*ring.T), 100, atol=0.02)
@@ -276,3 +281,21 @@ def test_generations_that_are_none(tmp_path: Path) -> None:
             writer.write_report({"settings": plan.settings(), "generation": found})
             with pytest.raises(DataError, match="how far a generation is"):
                 generate(plan, tmp_path / "out")
+
+
+@pytest.mark.parametrize("field", ["exit_lanes", "lane_states", "map_features", "objects_of_interest"])
+def test_womd_lists_without_end(field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = womd_scenario()
+    monkeypatch.setattr(womd, "MAX_LINKS", 1000)
+    monkeypatch.setattr(womd, "MAX_FEATURES", 1000)
+    if field == "exit_lanes":
+        scenario.map_features[0].lane.exit_lanes.extend([11] * 1001)
+    elif field == "lane_states":
+        lights = scenario.dynamic_map_states[0].lane_states
+        lights.extend([lights[0]] * 1001)
+    elif field == "map_features":
+        scenario.map_features.extend([scenario.map_features[0]] * 1001)
+    else:
+        scenario.objects_of_interest.extend([100] * 5001)
+    write_records(tmp_path / "a", [scenario.SerializeToString()])
+    assert "entries, at most" in read_error("womd", tmp_path / "a").message

@@ -24,8 +24,8 @@ from symphony.envs import DrivingEnv, collate, scene
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
 from symphony.simulation.demonstrations import SceneDataset
 
-BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.RANK, keys.NOISE_PLAN, keys.GOAL_SET}
-"""What depends on how batches are put together; the first three must be there, the others are optional."""
+BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.RANK, keys.NOISE_PLAN}
+"""What depends on how batches are put together; the first three must be there, the last is optional."""
 
 
 @pytest.fixture(scope="module")

@@ -41,15 +41,18 @@ def test_agrees_with_shapely(seed: int) -> None:
     # Nearer to each other than they come, so that some overlap.
     segment = segment.replace(position=segment.position * np.float32(0.05))
     drives = (segment.agent_type == AgentType.VEHICLE) & (travel(segment) > 2)
-    expected = set()
+    sure, possible = set(), set()
     for step in range(segment.num_steps):
         there = np.flatnonzero(segment.valid[:, step])
         shapes = boxes(segment, step)
         for i, a in enumerate(there.tolist()):
             for b in there[i + 1 :].tolist():
-                if (drives[a] or drives[b]) and shapes[a].intersection(shapes[b]).area > 1e-6:
-                    expected.add((a, b))
-    assert {tuple(pair) for pair in overlapping(segment).tolist()} == expected
+                if drives[a] or drives[b]:
+                    # Single precision decides about boxes that touch.
+                    possible |= {(a, b)} if shapes[a].distance(shapes[b]) < 1e-4 else set()
+                    sure |= {(a, b)} if shapes[a].intersection(shapes[b]).area > 1e-3 else set()
+    found = {tuple(pair) for pair in overlapping(segment).tolist()}
+    assert sure <= found <= possible
 
 
 def overlapped(seed: int = 0) -> RunSegment:
@@ -95,7 +98,7 @@ def test_a_conversion_counts_and_tells(workers: int, tmp_path: Path) -> None:
         (tmp_path / f"{k}.mixed").write_text(text)
     report = convert(Mixed(), [tmp_path], tmp_path / "all", workers=workers)
     assert (report.converted, report.overlaps) == (5, 2)
-    assert "in 2 of 5 segments (40.0 %)" in report.warning
+    assert "of 2 of 5 segments (40.0 %)" in report.warning
     store = SegmentStore(tmp_path / "all")
     tagged = {store.ids[i] for i in range(5) if store.tags(i).get("overlaps")}
     assert tagged == {"bad-1", "bad-5"}
@@ -133,7 +136,7 @@ def test_the_command_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     out = str(tmp_path / "store")
     assert main(["data", "convert", "commonroad", str(file), "--out", out]) == 0
     shown = capsys.readouterr()
-    assert "boxes overlap in the log" in shown.err
+    assert "--exclude-overlaps leaves them out" in shown.err
     assert "converted with boxes that overlap" in shown.out
     assert main(["data", "info", out]) == 0
     assert "boxes overlap in the log of" in capsys.readouterr().out

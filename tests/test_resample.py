@@ -222,6 +222,19 @@ def test_impossible_windows_are_refused(sigma: float) -> None:
         smooth(straight_road(1), sigma)
 
 
+@pytest.mark.parametrize("every", [1, 2, 3, 5])
+def test_a_light_seen_between_picked_steps_is_not_lost(every: int) -> None:
+    """Against a plain loop: the latest known state since the picked step before, if it is unknown now."""
+    rng = np.random.default_rng(every)
+    segment = crossing(steps=31)
+    state = rng.integers(0, 9, segment.signal_state.shape) * (rng.random(segment.signal_state.shape) < 0.3)
+    found = resample(segment.replace(signal_state=state.astype(np.uint8)), every * segment.dt)
+    for light, row in enumerate(state):
+        for k in range(found.num_steps):
+            known = [x for x in row[max(every * (k - 1) + 1, 0) : every * k + 1] if x]
+            assert found.signal_state[light, k] == (known[-1] if known else 0)
+
+
 @pytest.mark.parametrize("block", [1, 100, 700])
 def test_smoothing_in_blocks_gives_the_same(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     log = hide(crossing(4, steps=91, dt=0.1), 2, slice(20, 31))

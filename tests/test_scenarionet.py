@@ -36,6 +36,16 @@ def test_tracks(tmp_path: Path) -> None:
     np.testing.assert_allclose(segment.velocity[1], np.broadcast_to((10, 0), (STEPS, 2)))
 
 
+def test_an_ego_wider_than_long_is_turned(tmp_path: Path) -> None:
+    tree = scenario()
+    tree["tracks"]["ego"] = track(0, 0, 10, size=(1.73, 4.08, 1.56))
+    tree["tracks"]["8f3a"] = track(12, 4, 9, size=(1.0, 2.0, 1.5))
+    segment = read_one("scenarionet", write(tmp_path, tree))
+    np.testing.assert_allclose(segment.size[segment.ego], (4.08, 1.73, 1.56), rtol=1e-6)
+    # Anybody else is as logged.
+    np.testing.assert_allclose(segment.size[0], (1, 2, 1.5), rtol=1e-6)
+
+
 def test_numbers_as_names_are_ids(tmp_path: Path) -> None:
     tree = scenario()
     tree["tracks"] = {"17": tree["tracks"]["ego"], "4": tree["tracks"]["8f3a"]}

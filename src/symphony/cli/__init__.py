@@ -17,7 +17,20 @@ import tyro
 
 from symphony import allocator
 from symphony._version import __version__
-from symphony.cli import data, demo, evaluate, figure, plot, profiles, table, train, wosac
+from symphony.cli import (
+    data,
+    demo,
+    evaluate,
+    export,
+    figure,
+    plot,
+    profiles,
+    report,
+    table,
+    train,
+    view,
+    wosac,
+)
 from symphony.errors import ConfigError, SymphonyError, printable
 
 __all__ = ["main"]
@@ -37,6 +50,9 @@ app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="table")(table.Table)
 app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
+app.command(name="view")(view.View)
+app.command(name="report")(report.Report)
+app.command(name="export")(export.Export)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="demo")(demo.Demo)
 

@@ -54,8 +54,8 @@ class Convert:
     stride: float | None = None
     """INTERACTION: seconds between the starts of two such segments; without it, one begins where another ends."""
     motion: Literal["logged", "positions"] = "logged"
-    """INTERACTION: take velocities and headings as logged, or compute them from the positions (for files that are
-    refused because theirs don't fit)."""
+    """INTERACTION: take velocities and headings as logged, or from the positions (for files that are refused because
+    theirs don't fit)."""
     radius: float | None = None
     """Keep what comes within so many metres of the ego's path, of map and agents: for sources that give whole
     districts, whose maps would exceed the paper's limit (ScenarioNet)."""

@@ -60,8 +60,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
             )
     most = max(row["rollouts"] for row in rows)
     console.print(
-        f"{first['segments']} run segments, {first['interactive']} interactive agents each, up to {most} "
-        f"rollouts; ± standard error over segments; seed {first['seed']}",
+        f"{first['segments']} run segments of {first['groups']} recordings, {first['interactive']} interactive "
+        f"agents each, up to {most} rollouts; ± standard error over recordings; seed {first['seed']}",
         style="dim",
     )
 

@@ -253,8 +253,9 @@ def _take_rows(values: Tensor, rows: Int[Tensor, "*c"], dims: int) -> Tensor:
 def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) -> Int[Tensor, "*b L T"]:
     """For each leaf and step its place in the flattened tree [*b, S, T]."""
     device, steps = slots.device, sum(periods)
-    lengths = torch.tensor(periods, device=device)
-    slot = slots.transpose(-1, -2).repeat_interleave(lengths, -1, output_size=steps)
+    # All periods are as long as the first, but for the last, which may be shorter.
+    period = torch.arange(steps, device=device) // periods[0]
+    slot = slots.transpose(-1, -2).index_select(-1, period)
     row = torch.arange(slot[..., 0, 0].numel(), device=device).reshape(*slot.shape[:-2], 1, 1)
     return (row * branches + slot) * steps + torch.arange(steps, device=device)
 

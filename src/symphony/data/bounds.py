@@ -47,7 +47,7 @@ MAX_POINTS = 1_000_000
 """Points of a map."""
 MAX_LENGTH = 5e6
 """Metres of all lines of a map."""
-MAX_FILE = 128 << 20
+MAX_FILE = 64 << 20
 """Bytes of a file that is read as a whole (CommonRoad, Argoverse 2)."""
 
 ODD_SPEED = 70.0

@@ -92,8 +92,8 @@ def check_reader(
     it names the file), ``source`` (segments name format and file), ``determinism`` (reading again, in another
     order and from another folder, gives equal content), ``truncated`` (a file cut short gives an error, and nothing
     that the whole file does not give), ``damaged`` (bytes changed: a valid segment or an error) and ``foreign``
-    (emptied, replaced by noise, or a companion missing: nothing but errors). A crash of the interpreter can't be
-    caught, but will not go unnoticed either.
+    (emptied, replaced by noise, or a companion missing that is not optional: nothing but errors). A crash of the
+    interpreter can't be caught, but will not go unnoticed either.
 
     Args:
         reader: the reader; give :meth:`Reader.companions` where files are read together with others.

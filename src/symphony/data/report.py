@@ -84,8 +84,9 @@ class Report:
             return ""
         share = 100 * self.overlaps / self.converted
         return (
-            f"in {self.overlaps} of {self.converted} segments ({share:.1f} %) boxes overlap in the log: there even "
-            "its playback collides; --exclude-overlaps leaves them out"
+            f"in the logs of {self.overlaps} of {self.converted} segments ({share:.1f} %) a moving vehicle's box "
+            "overlaps another: what is judged by collisions there is judged by the tracking's errors, too; "
+            "--exclude-overlaps leaves them out"
         )
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_DT, MIN_DT, check_counts
-from symphony.data.segment import RunSegment, validate
+from symphony.data.segment import RunSegment, SignalState, validate
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]
@@ -29,9 +29,10 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
     """The same segment at another time step, beginning at the same moment.
 
     Where ``dt`` is a whole multiple of the segment's own step (10 Hz to 5 Hz), steps are picked and nothing is
-    computed. Otherwise positions and velocities are interpolated linearly, and headings along the shorter arc,
-    between two neighbouring valid steps; an agent is valid where both are. A light keeps the state of the latest
-    logged step, and ``current_step`` becomes the latest new step not after the old one.
+    computed; a light unknown at a picked step has the latest state known since the one before (some WOMD records
+    have lights at a single step). Otherwise positions and velocities are interpolated linearly, and headings along
+    the shorter arc, between two neighbouring valid steps; an agent is valid where both are. A light keeps the state
+    of the latest logged step, and ``current_step`` becomes the latest new step not after the old one.
 
     Args:
         segment: a valid segment.
@@ -60,9 +61,19 @@ def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
         heading=segment.heading[:, ::every].copy(),
         velocity=segment.velocity[:, ::every].copy(),
         valid=segment.valid[:, ::every].copy(),
-        signal_state=segment.signal_state[:, ::every].copy(),
+        signal_state=_picked_lights(segment.signal_state, every),
         current_step=segment.current_step // every,
     )
+
+
+def _picked_lights(state: NDArray[Any], every: int) -> NDArray[Any]:
+    found = state[:, ::every].copy()
+    for back in range(1, every):
+        # The first picked step has none before it.
+        later = found[:, 1:]
+        before = state[:, every - back :: every][:, : later.shape[1]]
+        later[later == SignalState.UNKNOWN] = before[later == SignalState.UNKNOWN]
+    return found
 
 
 def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:

@@ -8,9 +8,11 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import partial
 from threading import Lock
 from typing import Any
 
+import torch
 from numpy.typing import NDArray
 
 from symphony.geometry.cells import Cells
@@ -77,12 +79,20 @@ class GridCache:
                 self.used -= _size(oldest)
             return kept.grid
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A copy of whatever holds it, here or in another process, uses the cache of its process.
+        return _cache_of_the_process, ()
+
 
 def _size(kept: _Kept) -> int:
     return 0 if kept.grid is None else kept.grid.nbytes
 
 
 CACHE = GridCache()
+
+
+def _cache_of_the_process() -> GridCache:
+    return CACHE
 
 
 class GridSource:
@@ -114,7 +124,7 @@ class GridSource:
     @classmethod
     def points(cls, maps: Sequence[Arrays | None], count: int, stride: int) -> GridSource:
         """Lists of points for the ``count`` nearest; content: points [P, 2]."""
-        return cls(maps, f"points {count}", POINT_QUERIES, lambda p: point_grid(p, count), stride)
+        return cls(maps, f"points {count}", POINT_QUERIES, partial(point_grid, count=count), stride)
 
     @classmethod
     def edges(cls, maps: Sequence[Arrays | None], stride: int) -> GridSource:
@@ -125,6 +135,9 @@ class GridSource:
         """The grids there are, given that so many queries follow; None if there are none."""
         if self.complete:
             return self.cells
+        if torch.is_grad_enabled():
+            # What is simulated once more in the backward pass must take the same way as the first time.
+            queries = max(queries, int(self.worth * max(len(self.maps), 1)) + 1)
         fresh, self.asked = self.asked == 0, self.asked + queries / max(len(self.maps), 1)
         # The cache is looked into at first and when every map is sure to have been asked often enough.
         if fresh or self.asked >= self.worth:

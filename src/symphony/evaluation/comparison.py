@@ -369,7 +369,8 @@ def _way(entry: Entry) -> dict[str, Any]:
 def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     record = entries[0].record
     notes = [
-        f"{record['segments']} run segments of {record['data']['name']} "
+        f"{record['segments']} run segments of {record.get('groups', record['segments'])} recordings in "
+        f"{record['data']['name']} "
         f"({record['data']['checksum'][:12]}); ± standard error over seeds; bold: best of the BC methods and "
         f"of the MGAIL methods"
     ]

@@ -214,8 +214,9 @@ def _add(
         graph = dataset.graph(item)
         regions.append(_curvatures(graph, driven[b], counted[b]))
         regions_log.append(_curvatures(graph, log[b], log_valid[b, 1:]))
+    segments = [dataset.segment(i) for i in items]
     evaluation.metrics.update(
-        [dataset.segment(i).segment_id for i in items],
+        [segment.segment_id for segment in segments],
         collided=rollouts.collision.transpose(2, 3).cpu(),
         offroad=rollouts.offroad.transpose(2, 3).cpu(),
         displacement=away.transpose(2, 3).cpu(),
@@ -224,6 +225,8 @@ def _add(
         curvature=regions,
         curvature_log=regions_log,
         kinds=kinds,
+        # Segments of one recording share its traffic, so errors are over recordings.
+        groups=[segment.group or segment.segment_id for segment in segments],
     )
 
 
@@ -243,6 +246,7 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> 
         scenes.log_state[:, None, :steps].transpose(2, 3),
         scenes.log_valid[:, None, :steps].transpose(2, 3),
         scenes.box_size[:, None],
+        scenes.agent_type[:, None],
     )
 
 

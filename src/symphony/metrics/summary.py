@@ -147,7 +147,7 @@ class RolloutMetrics:
         self.segments.update(other.segments)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per segment, ordered by its id, for paired comparisons.
+        """One row per segment, ordered by its id, for paired comparisons; ``group`` is the recording it is part of.
 
         ``collision_rate`` and ``offroad_time`` in percent, ``ade`` and ``min_sade`` in metres (NaN where the log is
         valid at no step).
@@ -155,6 +155,7 @@ class RolloutMetrics:
         return [
             {
                 "segment": name,
+                "group": s.group or name,
                 "collision_rate": 100.0 * s.collided / s.rollouts,
                 "offroad_time": 100.0 * s.offroad / s.steps if s.steps else math.nan,
                 "ade": s.error.mean() / s.logged if s.logged else math.nan,

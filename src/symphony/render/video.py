@@ -88,9 +88,17 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
         ValueError: no clips, shapes that don't fit together, or steps outside the log.
         ConfigError: a file of another kind.
     """
+    file = picture_path(path, ANIMATIONS)
+    frames, interval = frames_of(clips, columns=columns, size=size)
+    _write(frames, file, interval)
+
+
+def frames_of(
+    clips: Sequence[Clip], *, columns: int = 3, size: float = 3.6
+) -> tuple[list[NDArray[np.uint8]], float]:
+    """The frames [H, W, 3] of :func:`animate_rollouts`, and the seconds between two of them."""
     if not clips:
         raise ValueError("no rollouts to animate")
-    file = picture_path(path, ANIMATIONS)
     panels = [_Panel(clip) for clip in clips]
     figure = _lay_out(panels, min(columns, len(clips)), size)
     canvas = FigureCanvasAgg(figure)
@@ -112,7 +120,7 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
         for part in above:
             canvas.restore_region(part)
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    _write(frames, file, interval)
+    return frames, interval
 
 
 class _Panel:

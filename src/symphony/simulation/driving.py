@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import KeepAll
+from symphony.collectors import BeamSearchResult, KeepAll
 from symphony.config import EvaluateConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
@@ -21,8 +23,39 @@ from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
 
+class Simulation(NamedTuple):
+    """What came of a simulation.
+
+    Attributes:
+        rollouts: [B, K, ...].
+        goal: [B, K, N] number of the route that each agent followed, -1 for none.
+        search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
+    """
+
+    rollouts: Rollouts
+    goal: Tensor
+    search: BeamSearchResult | None
+
+
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
     """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
+
+    Raises:
+        ConfigError, NotFiniteError: as :func:`simulation`.
+    """
+    return simulation(agent, scenes, config).rollouts
+
+
+def simulation(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, *, keep_tree: bool = False
+) -> Simulation:
+    """K rollouts of every scene, and how they came about.
+
+    Args:
+        agent: that drives.
+        scenes: B scenes.
+        config: how.
+        keep_tree: of a search keep the pruned branches, too.
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, or the agent learned another time
@@ -45,6 +78,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
         seed=config.seed,
         logged_goals=config.logged_goals,
     )
+    result = None
     if search_kind(agent, config) == "none":
         policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor)
         found = simulate(env, policy, start)
@@ -67,13 +101,15 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
                 leaves=None if best else taken,
                 retries=0 if best else config.retries,
                 retry_above=config.retry_above,
+                keep_tree=keep_tree and not best,
             )
         found = rollouts_of(env, start, result.trajectories)
         if best:
             order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
-            found = Rollouts(*(_branches(part, order) for part in found))
+            found, result = Rollouts(*(_branches(part, order) for part in found)), None
     watch.check()
-    return Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
+    goal = start.get(keys.GOAL)[:, :, :taken].flatten(1, 2)
+    return Simulation(Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found)), goal, result)
 
 
 def search_kind(agent: Agent, config: EvaluateConfig) -> str:

@@ -27,7 +27,7 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -35,6 +35,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import check_counts
 from symphony.data.segment import Bools, RoadMap, RunSegment
 from symphony.data.sources.base import Item, Reader, to_float32
 from symphony.data.sources.egos import busiest_first
@@ -53,7 +54,7 @@ from symphony.data.sources.interaction_tracks import (
     time_step,
 )
 from symphony.data.sources.lanelet2 import Projection, read_lanelet2
-from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, successors
+from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, stop_line, successors
 from symphony.data.sources.lines import Doubles
 from symphony.errors import ConfigError, DataError
 
@@ -61,8 +62,8 @@ FAR = 200.0
 """Metres between a recording and the box around its map beyond which the two don't belong together."""
 HISTORY = 9
 """The last step of a case's first second."""
-MAX_STEPS, MAX_STATES = 360_000, 20_000_000
-"""Steps of a recording, and agents times steps of a segment: few enough to allocate."""
+MAX_STEPS = 360_000
+"""Steps of a recording, which is cut into windows: ten hours at 10 Hz."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class InteractionReader(Reader):
         window: seconds of a segment. The rest of a recording counts if it is at least half as long.
         stride: seconds between the starts of windows; by default ``window``, so that they don't overlap.
         motion: ``"logged"`` takes velocities and headings as they are, and refuses a file where they are not those of
-            its positions; ``"positions"`` computes both, and takes the mean of states logged twice.
+            its positions; ``"positions"`` computes velocities, replaces headings that are far off the motion, and
+            takes the mean of states logged twice.
 
     Raises:
         ConfigError: a value out of range.
@@ -175,8 +177,7 @@ class InteractionReader(Reader):
         if not len(rows):
             raise DataError("nobody is there", field="track_id")
         ids, row = np.unique(rows.track, return_inverse=True)
-        if len(ids) * steps > MAX_STATES:
-            raise DataError(f"{len(ids)} tracks of {steps} steps, too many to read", field="track_id")
+        check_counts(len(ids), steps, "track_id")
         first = np.unique(row, return_index=True)[1]
         kind = rows.kind[first]
         if (rows.kind != kind[row]).any():
@@ -260,6 +261,13 @@ def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
         lights = read_lights(
             files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection, until
         )
+        # A stop line that the map names is better than the end of a KML lane.
+        lines_of = [(after, stop_line(lanes[before], source.rules)) for before, after in links.tolist()]
+        stops = {lane: line for lane, line in lines_of if line is not None}
+        points = [
+            stops.get(lane, place) for lane, place in zip(lights.lane.tolist(), lights.point, strict=True)
+        ]
+        lights = replace(lights, point=np.array(points))
     reach = np.abs(np.concatenate([lane.ring for lane in lanes]) - origin).max(axis=0)
     away = np.hypot(*np.maximum(np.abs(rows.state[:, :2] - origin) - reach, 0).T)
     if float(np.median(away)) > FAR:

@@ -4,31 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 
-from symphony.data.resample import local_line
+from symphony.data.resample import local_line, wrap
 from symphony.data.segment import Bools
 from symphony.data.sources.lines import Doubles
 
 SIGMA = 0.2
 """Seconds: of the Gaussian weights of the line whose slope is the velocity."""
-WALKING = 0.5
+WALKING = 1.0
 """m/s above which the direction of motion is a heading."""
+OFF = np.deg2rad(45)
+"""Angle to the motion from which on a logged heading does not count."""
 
 
 def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
-    """Velocities as slopes of the positions; headings are left to :func:`headings`.
+    """Velocities as slopes of the positions; headings that don't fit them are left to :func:`headings`.
 
-    A track that never moves keeps the logged heading.
+    A heading is compared with the motion at the nearest step at which the agent moves: trackers give 0 to what stands
+    before it moves. An agent that never moves keeps what was logged; that one drives backwards can't be told.
 
     Args:
-        state: [A, T, 5] x, y, velocity, heading; likewise returned.
+        state: [A, T, 5] x, y, velocity, heading; likewise returned, with NaN for headings.
         valid: [A, T].
         dt: seconds per step.
     """
     _, slope, _ = local_line(state[..., :2], valid, dt, SIGMA)
-    moves = valid & (np.hypot(slope[..., 0], slope[..., 1]) > WALKING)
     found = state.copy()
     found[..., 2:4] = slope
-    found[moves.any(axis=1), :, 4] = np.nan
+    course = _nearest_course(found, valid)
+    found[np.abs(wrap(found[..., 4] - course)) > OFF, 4] = np.nan
     return found
 
 
@@ -38,16 +41,19 @@ def headings(state: Doubles, valid: Bools) -> Doubles:
     One that never moves and has no heading gets 0. Masked states become 0. Arguments as in :func:`from_positions`.
     """
     found = np.where(valid[..., None], state, 0.0)
-    velocity = found[..., 2:4]
-    course = np.arctan2(velocity[..., 1], velocity[..., 0])
+    unknown = np.isnan(found[..., 4])
+    found[unknown, 4] = np.nan_to_num(_nearest_course(found, valid)[unknown])
+    return found
+
+
+def _nearest_course(state: Doubles, valid: Bools) -> Doubles:
+    """[A, T] direction of motion at the step nearest to each at which the agent moves; NaN if it never does."""
+    velocity = state[..., 2:4]
     moves = valid & (np.hypot(velocity[..., 0], velocity[..., 1]) > WALKING)
     steps = np.arange(valid.shape[1])
-    for agent in np.flatnonzero(np.isnan(found[..., 4]).any(axis=1)):
+    course = np.full(valid.shape, np.nan)
+    for agent in np.flatnonzero(moves.any(axis=1)):
         known = np.flatnonzero(moves[agent])
-        unknown = np.isnan(found[agent, :, 4])
-        if len(known):
-            nearest = known[np.abs(steps[unknown, None] - known).argmin(axis=1)]
-            found[agent, unknown, 4] = course[agent, nearest]
-        else:
-            found[agent, unknown, 4] = 0.0
-    return found
+        nearest = known[np.abs(steps[:, None] - known).argmin(axis=1)]
+        course[agent] = np.arctan2(velocity[agent, nearest, 1], velocity[agent, nearest, 0])
+    return course

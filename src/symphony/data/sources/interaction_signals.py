@@ -179,9 +179,10 @@ def read_connections(path: Path, projection: Projection) -> list[Connection]:
             data = {node.get("name"): node.findtext(f"{_KML}value") for node in place.iter(f"{_KML}Data")}
             if line is None or "Source" not in data:
                 continue
-            source, *more = _integers(data["Source"], "Source")
-            if more:
-                raise DataError("more than one", field=f"lane {source}: Source")
+            sources = _integers(data["Source"], "Source")
+            if len(sources) != 1:
+                raise DataError(f"{str(data['Source'])[:40]!r} is not one lane", field="Source")
+            source = sources[0]
             starts[source] = _start(line.text, f"lane {source}", projection)
             sinks, groups = (
                 _integers(data.get(name), f"lane {source}: {name}") for name in ("Sink", "SignalGroup")

@@ -261,7 +261,7 @@ def check_motion(rows: Rows, dt_ms: int) -> None:
             raise DataError(f"points {np.degrees(error):.0f} degrees off the motion{_HINT}", field=name)
 
 
-_HINT = " (motion='positions' computes both from the positions)"
+_HINT = " (motion='positions' takes both from the positions)"
 
 
 def _twice(rows: Rows) -> NDArray[np.int64]:

@@ -8,7 +8,9 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
   nuScenes drive share them), else the id.
 - The ego is the recording vehicle (``sdc_id``). Agents are in file order; their ids are the track's names if all are
   numbers, else their place in the file, as the ego's is. Tracks that are valid at no step are left out.
-- A box size is the median over the valid states. Cones, barriers and other things are of type OTHER.
+- A box size is the median over the valid states. An ego wider than long (ScenarioNet swaps the two for nuScenes) is
+  turned. The position of nuScenes' ego is that of its rear axle, as logged. Cones, barriers and other things are of
+  type OTHER.
 - Coordinates are taken relative to the ego's first position, rounded to metres, z as logged.
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes): see
   :func:`.scenarionet_map.successors` and :func:`.scenarionet_map.neighbors`.
@@ -26,15 +28,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.bounds import MAX_STEPS, check_counts
 from symphony.data.segment import AgentType, Bools, RunSegment, SignalState
 from symphony.data.sources.base import Item, Reader, to_float32
 from symphony.data.sources.lines import Doubles
 from symphony.data.sources.safe_pickle import Array, load_plain
 from symphony.data.sources.scenarionet_map import Features, mapping, points, read_features, road_map
 from symphony.errors import DataError
-
-MAX_STEPS, MAX_STATES = 36_000, 20_000_000
-"""Steps, and agents times steps: few enough to allocate."""
 
 _TYPES = {
     "VEHICLE": AgentType.VEHICLE,
@@ -91,7 +91,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         ego=row,
         agent_id=np.array([int(each) for each in names] if numbers else range(len(names)), np.int64),
         agent_type=np.array(kinds, np.uint8),
-        size=_sizes(states[..., 6:], valid),
+        size=_sizes(states[..., 6:], valid, row),
         position=to_float32(np.where(valid[..., None], states[..., :3] - origin, 0.0)),
         heading=to_float32(states[..., 3]),
         velocity=to_float32(states[..., 4:6]),
@@ -129,8 +129,7 @@ _STATE = (("position", 3), ("heading", 1), ("velocity", 2), ("length", 1), ("wid
 
 def _tracks(tracks: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int], Doubles, Bools]:
     """(names [A], types [A], states [A, T, 9] with 0 where not valid, valid [A, T]) of those valid at some step."""
-    if len(tracks) * steps > MAX_STATES:
-        raise DataError(f"{len(tracks)} tracks of {steps} steps, too many to read", field="tracks")
+    check_counts(len(tracks), steps, "tracks")
     names: list[str] = []
     kinds: list[int] = []
     states: list[Doubles] = []
@@ -169,11 +168,11 @@ def numbers(value: Any, field: str, width: int) -> Doubles:
     return found[:, :width].astype(np.float64)
 
 
-def _sizes(sizes: Doubles, valid: Bools) -> NDArray[np.float32]:
-    """[A, 3] from [A, T, 3]."""
-    return to_float32(
-        np.array([np.median(size[mask], axis=0) for size, mask in zip(sizes, valid, strict=True)])
-    )
+def _sizes(sizes: Doubles, valid: Bools, ego: int) -> NDArray[np.float32]:
+    """[A, 3] from [A, T, 3]; the ego is at least as long as wide."""
+    found = np.array([np.median(size[mask], axis=0) for size, mask in zip(sizes, valid, strict=True)])
+    found[ego, :2] = np.sort(found[ego, :2])[::-1]
+    return to_float32(found)
 
 
 def _signals(

@@ -25,6 +25,8 @@ TURN = np.deg2rad(60)
 """Largest angle between the two there."""
 HALF_WIDTH = 1.75
 """Metres on either side of a centre line that are drivable where the map has no area."""
+MAX_WIDTH = 20.0
+"""Metres on either side of a line in which the edge of its area is looked for."""
 BESIDE = (2.0, 5.5)
 """Metres between the centre lines of neighbours."""
 
@@ -230,12 +232,20 @@ def _side(one: Doubles, two: Doubles) -> int:
 
 
 def _width(lane: Lane) -> float:
+    """Of the area across the middle of the line; NaN where there is no area there."""
     if lane.area is None or len(lane.line) < 2:
         return np.nan
-    length = shapely.LineString(lane.line[:, :2]).length
-    return (
-        float(shapely.area(shapely.make_valid(shapely.Polygon(lane.area))) / length) if length > 1 else np.nan
-    )
+    line = shapely.LineString(lane.line[:, :2])
+    half = line.length / 2
+    if half < 0.1:
+        return np.nan
+    before, middle, after = (np.array(line.interpolate(half + d).coords[0]) for d in (-0.1, 0, 0.1))
+    along = (after - before) / np.hypot(*(after - before))
+    aside = MAX_WIDTH * np.array([-along[1], along[0]])
+    area = shapely.make_valid(shapely.Polygon(lane.area))
+    parts = shapely.get_parts(area.intersection(shapely.LineString([middle - aside, middle + aside])))
+    here = [part.length for part in parts if part.distance(shapely.Point(middle)) < 0.1]
+    return float(max(here, default=np.nan))
 
 
 def _rings(features: Features) -> tuple[Doubles, ...]:

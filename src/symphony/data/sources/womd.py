@@ -27,13 +27,15 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from symphony.data.bounds import check_counts, check_signals
+from symphony.data.bounds import MAX_AGENTS, check_counts, check_signals
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.base import Item, Reader, codes, pairs, to_float32, unexpected
 from symphony.data.sources.tfrecord import read_records
 from symphony.errors import DataError
 
+MAX_FEATURES, MAX_LINKS = 100_000, 1_000_000
+"""Entries of a map, and references between lanes or states of lights: far more than a scenario has."""
 MPS_PER_MPH = 0.44704
 
 _STATE = attrgetter(
@@ -104,6 +106,8 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
     origin = np.round(states[ego, np.argmax(valid[ego]), :3])
     road, lane_index = _road(scenario.map_features, origin)
     signal_lane, signal_point, signal_state = _signals(scenario, steps, lane_index, road, origin)
+    for field in ("tracks_to_predict", "objects_of_interest"):
+        _check_count(len(getattr(scenario, field)), MAX_AGENTS, field)
     tracks = [scenario.tracks[i] for i in kept]
     ids = np.array([track.id for track in tracks], np.int64)
     types = np.array([track.object_type for track in tracks], np.int64)
@@ -133,6 +137,11 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
         predict=np.array([p for p in predict if p >= 0], np.int32),
         file=file,
     )
+
+
+def _check_count(count: int, most: int, field: str) -> None:
+    if count > most:
+        raise DataError(f"{count} entries, at most {most} are read", field=field)
 
 
 def _name(scenario: pb.Scenario) -> str:
@@ -204,6 +213,7 @@ def _polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
 
 def _road(features: Sequence[pb.MapFeature], origin: Doubles) -> tuple[RoadMap, dict[int, int]]:
     """(the map, lane id -> lane index)."""
+    _check_count(len(features), MAX_FEATURES, "map_features")
     lanes: list[tuple[int, Any]] = []
     lines: list[Doubles] = []
     edges: list[Doubles] = []
@@ -228,6 +238,7 @@ def _road(features: Sequence[pb.MapFeature], origin: Doubles) -> tuple[RoadMap, 
     index = {lane_id: k for k, (lane_id, _) in enumerate(lanes)}
 
     def links(references: attrgetter[Any]) -> NDArray[np.int32]:
+        _check_count(sum(len(references(lane)) for _, lane in lanes), MAX_LINKS, "map_features.lane")
         found = ((k, references(lane)) for k, (_, lane) in enumerate(lanes))
         return pairs([(k, index[other]) for k, others in found for other in _ids(others) if other in index])
 
@@ -261,6 +272,7 @@ def _signals(
     logged = scenario.dynamic_map_states
     if logged and len(logged) != steps:
         raise DataError(f"{len(logged)} entries for {steps} steps", field="dynamic_map_states")
+    _check_count(sum(len(now.lane_states) for now in logged), MAX_LINKS, "dynamic_map_states")
     rows: dict[int, int] = {}
     points: list[NDArray[np.float32]] = []
     entries: list[tuple[int, int, int]] = []

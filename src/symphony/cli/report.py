@@ -1,0 +1,72 @@
+"""Judge saved rollouts one by one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Report:
+    """Report what happened in saved rollouts: collisions and whose fault, red lights, progress, comfort and more.
+
+    Writes report.html (one page, worst runs first, each a click away from its replay), report.json and report.csv.
+    """
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SIM")]
+    """Folder of saved rollouts."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Where the report goes; by default the same folder."""
+    judged: Literal["interactive", "ego"] = "interactive"
+    """Which of the driven agents are judged: all, or only the ego."""
+    view: bool = True
+    """Leave the page that plays the rollouts unwritten."""
+
+    def run(self) -> None:
+        """Judge, write, and print the totals."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+        from rich.table import Table
+
+        from symphony.evaluation.report import report
+        from symphony.files import naming, write_file, write_json
+        from symphony.render.report_page import report_page
+        from symphony.render.viewer import view_page
+        from symphony.simulation.saved_files import load_rollouts
+
+        folder, out = load_rollouts(self.folder), self.folder if self.out is None else self.out
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("segments"),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task("Judging", total=len(folder))
+            found = report(
+                folder, self.judged, lambda done, total: bar.update(task, completed=done, total=total)
+            )
+        plain = found.plain()
+        with naming(out):
+            out.mkdir(parents=True, exist_ok=True)
+        write_json(out / "report.json", plain)
+        write_file(out / "report.csv", found.csv())
+        write_file(out / "report.html", report_page(plain, "view.html" if self.view else None))
+        if self.view:
+            replays = ((saved, found.events[saved.segment.segment_id]) for saved in folder)
+            write_file(out / "view.html", view_page(folder.about.agent, replays, folder.about.settings))
+        table = Table(
+            "",
+            "",
+            title=f"{found.agent}: {plain['runs']} runs, {plain['failed_runs']} failed",
+            show_header=False,
+        )
+        for name, value in found.totals().items():
+            if not name.endswith("_se") and isinstance(value, float):
+                error = plain.get(f"{name}_se")
+                table.add_row(name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}"))
+        Console().print(table)
+        Console().print(f"written: {out / 'report.html'}", soft_wrap=True)

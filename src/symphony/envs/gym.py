@@ -1,0 +1,181 @@
+"""The ego of logged scenes as a Gymnasium environment, for planners that learn by themselves (extra ``gym``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+from symphony import keys
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+from symphony.envs.driving import DrivingEnv, Event
+from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.observation import ObservationConfig
+from symphony.envs.scene import scene
+from symphony.errors import ConfigError, DataError
+from symphony.roadgraph import LaneGraph
+
+BOUND = 1000.0
+"""What observations are clipped to; they are scaled to numbers near one."""
+TOP_SPEED = 40.0
+"""m/s that the largest continuous action stands for."""
+
+Observed = dict[str, NDArray[Any]]
+
+
+class DrivingGym(gymnasium.Env[Observed, Any]):
+    """One ego in a logged scene, everyone else played back from the log; an episode is a run segment.
+
+    Observations are what :class:`symphony.envs.driving.DrivingEnv` shows an agent, in its own frame: ``own``,
+    ``objects`` and ``points`` with their masks, ``route`` where asked for (the one the log took). The rest is in
+    ``info``: ``segment`` (its id), ``step``, ``state`` (x, y in metres, heading in radians, speed in m/s),
+    ``collision``, ``offroad``, and ``driven``, metres since the step before.
+
+    Args:
+        data: a store of run segments, or its folder.
+        action: ``discrete``: the kinematic bicycle's joint actions; ``continuous``: the displacement over a step,
+            forward and to the left, where 1 stands for :data:`TOP_SPEED`.
+        observation: what the ego sees.
+        reward: of a step, from the state before and the state after it, as of ``DrivingEnv``; by default -1 where
+            the ego collides or is off the road.
+        ends_on: what ends an episode early.
+        duration: seconds of each segment that are driven; 0 for all.
+
+    ``reset(options={"segment": ID})`` starts a certain segment, by id or number; else one is drawn, of those whose
+    ego is seen at the first step.
+
+    Raises:
+        DataError: the store is empty.
+        ConfigError: an unknown kind of action.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own
+
+    def __init__(
+        self,
+        data: SegmentStore | str | Path,
+        *,
+        action: Literal["discrete", "continuous"] = "discrete",
+        observation: ObservationConfig | None = None,
+        reward: Callable[[TensorDictBase, TensorDictBase], Tensor] | None = None,
+        ends_on: Sequence[Event] = ("collision", "offroad"),
+        duration: float = 0.0,
+    ) -> None:
+        if action not in ("discrete", "continuous"):
+            raise ConfigError(f"action is discrete or continuous, not {action!r}")
+        self.store = data if isinstance(data, SegmentStore) else SegmentStore(data)
+        if len(self.store) == 0:
+            raise DataError("the store holds no run segments", file=self.store.path)
+        self.dynamics: Bicycle | Displacement = Bicycle() if action == "discrete" else Displacement()
+        self.observation = ObservationConfig() if observation is None else observation
+        self.reward, self.ends_on, self.duration = reward, tuple(ends_on), duration
+        number = next((i for i in range(len(self.store)) if _usable(self.store[i])), None)
+        if number is None:
+            raise DataError("the ego is seen at the first step of no segment", file=self.store.path)
+        self._open(number)
+        self.observation_space: spaces.Space[Any] = spaces.Dict(
+            {name: _space(value) for name, value in self._observed(self._start()).items()}
+        )
+        self.action_space: spaces.Space[Any] = (
+            spaces.Discrete(self.dynamics.num_actions)
+            if isinstance(self.dynamics, Bicycle)
+            else spaces.Box(-1.0, 1.0, (2,), np.float32)
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observed, dict[str, Any]]:
+        """Start a segment.
+
+        Raises:
+            DataError: the segment that was asked for is not there, or its ego is not seen at its first step.
+        """
+        super().reset(seed=seed)
+        wanted = (options or {}).get("segment")
+        if wanted is None:
+            number = int(self.np_random.integers(len(self.store)))
+            while not _usable(self.store[number]):
+                number = int(self.np_random.integers(len(self.store)))
+        else:
+            number = self.store.index_of(wanted) if isinstance(wanted, str) else int(wanted)
+            if not _usable(self.store[number]):
+                name = self.store.ids[number]
+                raise DataError("the ego is not seen at the first step", segment=name, field="valid")
+        self._open(number)
+        self._now = self._start()
+        return self._observed(self._now), self._info(0.0)
+
+    def step(self, action: Any) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
+        """Drive one step."""
+        if isinstance(self.dynamics, Bicycle):
+            chosen = torch.tensor([int(action)])
+        else:
+            reach = TOP_SPEED * self.env.dt
+            chosen = torch.as_tensor(np.asarray(action, np.float32) * reach)[None]
+        before = self._now.get(keys.STATE)[0, :2]
+        stepped = self.env.step(self._now.set(keys.ACTION, chosen))
+        after = stepped.get("next")
+        reward = float(after.get(keys.REWARD))
+        ended, cut = bool(after.get("terminated")), bool(after.get("truncated"))
+        self._now = step_mdp(stepped, exclude_reward=True)
+        driven = float((self._now.get(keys.STATE)[0, :2] - before).norm())
+        return self._observed(self._now), reward, ended, cut, self._info(driven)
+
+    def _open(self, number: int) -> None:
+        segment = self.store[number]
+        if self.duration:
+            steps = round(self.duration / segment.dt) + 1
+            timed = ("position", "heading", "velocity", "valid", "signal_state")
+            segment = segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
+        self.segment_id = segment.segment_id
+        graph = LaneGraph(segment.road) if self.observation.route else None
+        self.env = DrivingEnv(
+            scene(segment, [segment.ego], graph, number=number),
+            self.dynamics,
+            self.observation,
+            reward=self.reward,
+            ends_on=self.ends_on,
+        )
+
+    def _start(self) -> TensorDictBase:
+        start = self.env.start(torch.tensor(0))
+        return self.env.with_goals(start) if self.observation.route else start
+
+    def _observed(self, state: TensorDictBase) -> Observed:
+        """What the ego sees, as NumPy arrays."""
+        seen: Observed = {}
+        for name, value in state.get(("agents", "observation")).items():
+            array = value[0].numpy()
+            flags = array.dtype == np.bool_
+            seen[name] = array.astype(np.int8) if flags else array.clip(-BOUND, BOUND).astype(np.float32)
+        return seen
+
+    def _info(self, driven: float) -> dict[str, Any]:
+        return {
+            "segment": self.segment_id,
+            "step": int(self._now.get(keys.STEP)),
+            "state": self._now.get(keys.STATE)[0].numpy().copy(),
+            "collision": bool(self._now.get(keys.COLLISION)),
+            "offroad": bool(self._now.get(keys.OFFROAD)),
+            "driven": driven,
+        }
+
+
+def _usable(segment: RunSegment) -> bool:
+    return bool(segment.valid[segment.ego, 0])
+
+
+def _space(value: NDArray[Any]) -> spaces.Space[Any]:
+    if value.dtype == np.int8:
+        return spaces.MultiBinary(value.shape)
+    return spaces.Box(-BOUND, BOUND, value.shape, np.float32)

@@ -1,0 +1,200 @@
+"""How single rollouts drive: red lights, wrong way, progress, comfort, distance to the log.
+
+Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M judged agents, Q lights.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from symphony.data.segment import RunSegment, SignalState
+from symphony.evaluation.contacts import Bools, Indices, Reals, lane_widths
+from symphony.metrics.kinds import STANDING
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.world import World
+
+RED = (SignalState.STOP, SignalState.ARROW_STOP)
+SAME_WAY = math.pi / 2
+"""Largest angle between an agent and its lane."""
+WRONG_WAY = 2 * math.pi / 3
+"""Smallest angle between an agent and a lane that it drives the wrong way."""
+IN_LANE = 2.0
+"""Metres from a centre line within which an agent is in the lane."""
+_FOLLOWED = 3.0
+"""Metres from a centre line, on average, within which a path follows the lane."""
+
+
+class Lights(NamedTuple):
+    """Lights that were red when agents drove past, all [E]: row of A, state, light."""
+
+    agent: Indices
+    step: Indices
+    light: Indices
+
+
+def red_lights(world: World, judged: Indices, segment: RunSegment, start: int) -> Lights:
+    """Red lights that the judged agents [M] of one rollout ran.
+
+    An agent runs a light if its front crosses the stop point in the direction of the lane, within the lane's width,
+    while the light is red (a plain or arrow stop, not a flashing one), and it follows that lane: of the lanes whose
+    lights it crosses at once the one that its path is nearest to, before the stop point where that lies at the end
+    of the lane, behind it elsewhere.
+
+    Args:
+        world: everyone.
+        judged: [M] rows of A.
+        segment: the lights, with their states in all steps of the log.
+        start: step of the log at which the first state lies.
+    """
+    lanes = [segment.road.lanes[int(lane)][:, :2].astype(np.float64) for lane in segment.signal_lane]
+    usable = np.array([len(np.unique(line, axis=0)) > 1 for line in lanes], bool)
+    if not usable.any():
+        return Lights(*(np.zeros(0, np.int64) for _ in range(3)))
+    stop = segment.signal_point[:, :2].astype(np.float64)
+    lines = [shapely.LineString(line) if ok else None for line, ok in zip(lanes, usable, strict=True)]
+    direction = np.stack([_direction(line, point) for line, point in zip(lines, stop, strict=True)])
+    heading = world.heading[judged]
+    forward = np.stack([np.cos(heading), np.sin(heading)], -1)
+    front = world.position[judged] + 0.5 * world.size[judged, 0, None, None] * forward
+    # [M, U, Q] how far each front is past each stop point, and beside it.
+    away = front[:, :, None] - stop
+    along = (away * direction).sum(-1)
+    across = away[..., 1] * direction[:, 0] - away[..., 0] * direction[:, 1]
+    beside = np.abs(across[:, 1:]) <= 0.5 * lane_widths(segment.road)[segment.signal_lane]
+    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < 15) & beside & usable
+    same = (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
+    passing &= same & (world.valid[judged, 1:] & world.valid[judged, :-1])[..., None]
+    who, step = passing.any(-1).nonzero()
+    found = []
+    # There are few crossings.
+    for m, t in zip(who.tolist(), step.tolist(), strict=True):
+        light = _followed(world, int(judged[m]), t + 1, passing[m, t].nonzero()[0], lines, stop)
+        # One that changes just then is not held against the agent.
+        if light >= 0 and np.isin(segment.signal_state[light, start + t : start + t + 2], RED).all():
+            found.append((int(judged[m]), t + 1, light))
+    return Lights(*np.array(found, np.int64).reshape(-1, 3).T)
+
+
+def _direction(line: shapely.LineString | None, point: Reals) -> Reals:
+    """Unit vector of a lane where it is nearest to a point."""
+    if line is None:
+        return np.zeros(2)
+    at = min(line.project(shapely.Point(point)), line.length - min(1.0, line.length))
+    ends = [np.asarray(line.interpolate(s).coords[0]) for s in (at, at + min(1.0, line.length))]
+    return (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+
+
+def _followed(
+    world: World, agent: int, step: int, lights: Indices, lines: list[shapely.LineString | None], stop: Reals
+) -> int:
+    """Which of the lights is that of the lane an agent follows past a stop point; -1 for none."""
+    path, valid = world.position[agent], world.valid[agent]
+    best, least = -1, _FOLLOWED
+    for light in lights.tolist():
+        line = lines[light]
+        assert line is not None  # noqa: S101 - only usable lanes are passed
+        at_end = line.project(shapely.Point(stop[light])) > 0.5 * line.length
+        part = slice(0, step) if at_end else slice(step, None)
+        points = path[part][valid[part]]
+        driven = np.linalg.norm(points - stop[light], axis=-1)
+        points = points[driven <= line.length]
+        if len(points):
+            distance = float(shapely.distance(line, shapely.points(points)).mean())
+            best, least = (light, distance) if distance < least else (best, least)
+    return best
+
+
+def wrong_way(world: World, judged: Indices, graph: LaneGraph) -> Bools:
+    """[M, U] whether a judged agent drives in a lane that leads the other way, and in none that leads its way."""
+    seen = world.valid[judged] & (np.abs(world.speed[judged]) > STANDING)
+    position, heading = world.position[judged][seen], world.heading[judged][seen]
+    near = graph.index.near(position, IN_LANE)
+    turn = np.abs((near.heading - heading[near.point] + np.pi) % (2 * np.pi) - np.pi)
+    wrong, right = np.zeros((2, len(position)), bool)
+    wrong[near.point[turn > WRONG_WAY]] = True
+    right[near.point[turn < SAME_WAY]] = True
+    out = np.zeros(seen.shape, bool)
+    out[seen] = wrong & ~right
+    return out
+
+
+class Progress(NamedTuple):
+    """Metres [K, M] that judged agents got on, and that the log got on likewise."""
+
+    driven: Reals
+    logged: Reals
+
+
+def progress(saved: SavedRollouts, judged: Indices) -> Progress:
+    """How far judged agents (numbers [M] of the driven ones) got on.
+
+    Along the route that an agent follows, from the place on it nearest to its first state to that nearest to its last
+    one; without a route, the length of its path.
+    """
+    rows, within = saved.agents[judged], slice(saved.start, saved.last + 1)
+    there = np.concatenate([saved.counted[:, :1], saved.counted], 1)[..., judged].swapaxes(1, 2)
+    path = saved.state[:, :, judged, :2].swapaxes(1, 2).astype(np.float64)
+    log = saved.segment.position[rows, within, :2].astype(np.float64)
+    seen = saved.segment.valid[rows, within]
+    goal = saved.goal[:, judged]
+    counts = np.diff(saved.routes.offsets)
+    lines = [
+        shapely.LineString(saved.routes[k][:, :2]) if counts[k] > 1 else None
+        for k in range(len(saved.routes))
+    ]
+    along = np.array([*lines, None], dtype=object)[goal]
+    has = np.array([*(line is not None for line in lines), False])[goal]
+    driven, logged = _length(path, there), np.broadcast_to(_length(log, seen), goal.shape).copy()
+    driven[has] = _advance(along[has], path[has], there[has])
+    number = np.broadcast_to(np.arange(len(judged)), goal.shape)[has]
+    logged[has] = _advance(along[has], log[number], seen[number])
+    return Progress(driven, logged)
+
+
+def _length(path: Reals, valid: Bools) -> Reals:
+    """[...] of paths [..., U, 2]."""
+    strides = np.linalg.norm(np.diff(path, axis=-2), axis=-1)
+    return np.where(valid[..., 1:] & valid[..., :-1], strides, 0).sum(-1)
+
+
+def _advance(lines: NDArray[np.object_], path: Reals, valid: Bools) -> Reals:
+    """Metres [R] along lines [R] from the first to the last valid point of paths [R, U, 2]."""
+    row, last = np.arange(len(path)), valid.shape[1] - 1 - valid[:, ::-1].argmax(1)
+    ends = path[row, valid.argmax(1)], path[row, last]
+    begin, end = (shapely.line_locate_point(lines, shapely.points(point)) for point in ends)
+    return np.where(valid.any(1), end - begin, 0.0)
+
+
+class Comfort(NamedTuple):
+    """Motion of judged agents [K, T, M]; NaN where it is not known: m/s^2, m/s^3, m/s^2."""
+
+    acceleration: Reals
+    jerk: Reals
+    lateral: Reals
+
+
+def comfort(saved: SavedRollouts, judged: Indices) -> Comfort:
+    """Differences of speed, of acceleration, and speed times yaw rate, over one step each, not smoothed."""
+    state, counted = saved.state[:, :, judged].astype(np.float64), saved.counted[:, :, judged]
+    dt = saved.segment.dt
+    state = np.where(np.concatenate([counted[:, :1], counted], 1)[..., None], state, np.nan)
+    speed, heading = state[..., 3], state[..., 2]
+    acceleration = np.diff(speed, axis=1) / dt
+    turn = (np.diff(heading, axis=1) + np.pi) % (2 * np.pi) - np.pi
+    jerk = np.diff(acceleration, axis=1, prepend=np.nan) / dt
+    return Comfort(acceleration, jerk, 0.5 * (speed[:, 1:] + speed[:, :-1]) * turn / dt)
+
+
+def log_distance(saved: SavedRollouts, judged: Indices) -> tuple[Reals, Indices]:
+    """Metres from the log, summed over the steps at which there is one, and their number: both [K]."""
+    rows, within = saved.agents[judged], slice(saved.start + 1, saved.last + 1)
+    log = saved.segment.position[rows, within, :2].swapaxes(0, 1)
+    both = saved.counted[:, :, judged] & saved.segment.valid[rows, within].T
+    away = np.linalg.norm(saved.state[:, 1:, judged, :2].astype(np.float64) - log, axis=-1)
+    return np.where(both, away, 0.0).sum((1, 2)), both.sum((1, 2))

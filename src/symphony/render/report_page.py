@@ -1,0 +1,119 @@
+"""The report of saved rollouts as one page: totals, collisions, and runs with links to their replays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+from urllib.parse import urlencode
+
+from symphony.render.viewer.page import filled, script_json, template
+
+TILES = {
+    "collision_rate": ("collisions", "% of runs"),
+    "at_fault_collision_rate": ("at fault", "% of runs"),
+    "offroad_time": ("off the road", "% of time"),
+    "red_light_rate": ("red lights run", "% of runs"),
+    "wrong_way_time": ("wrong way", "% of time"),
+    "low_ttc_time": ("near collision (TTC < 1 s)", "% of time"),
+    "progress": ("progress", "m"),
+    "progress_ratio": ("progress / log's", ""),
+    "log_distance": ("distance to the log", "m"),
+    "mean_max_acceleration": ("peak acceleration", "m/s²"),
+    "mean_max_braking": ("peak braking", "m/s²"),
+    "mean_max_jerk": ("peak jerk", "m/s³"),
+    "mean_max_lateral_acceleration": ("peak lateral acceleration", "m/s²"),
+}
+"""Numbers on top: their names and units."""
+COLUMNS = {
+    "segment": "segment",
+    "rollout": "rollout",
+    "what": "what",
+    "collisions": "collisions",
+    "red_lights": "red lights",
+    "offroad_time": "off road %",
+    "wrong_way_time": "wrong way %",
+    "min_ttc": "least TTC s",
+    "progress": "progress m",
+    "progress_ratio": "of the log's",
+    "max_braking": "braking m/s²",
+    "max_jerk": "jerk m/s³",
+    "max_lateral_acceleration": "lateral m/s²",
+    "log_distance": "to log m",
+}
+"""Of the table of runs: a number's name and its heading."""
+
+
+def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> str:
+    """One self-contained page.
+
+    Args:
+        found: ``agent``, ``judged``, the totals, ``collisions`` and ``per_run``, as the report writes them.
+        viewer: address of the page that plays the rollouts, relative to this one; None for none.
+    """
+    runs = found["per_run"]
+    parts = {
+        "/*TITLE*/": escape(f"{found['agent']}: report"),
+        "/*STYLE*/": template("report.css"),
+        "/*HEAD*/": _head(found),
+        "/*TILES*/": "".join(_tile(found, name, *text) for name, text in TILES.items()),
+        "/*COLLISIONS*/": _collisions(found["collisions"]),
+        "/*RUNS*/": script_json([_run(row, viewer) for row in runs]),
+        "/*COLUMNS*/": script_json(COLUMNS),
+        "/*SCRIPT*/": template("report.js"),
+    }
+    return filled(template("report.html"), parts)
+
+
+def _head(found: Mapping[str, Any]) -> str:
+    who = "the ego" if found["judged"] == "ego" else "all interactive agents"
+    failed = found["failed_runs"]
+    lost = f', <b class="bad">{failed} failed</b>' if failed else ""
+    return (
+        f"<h1>{escape(found['agent'])}</h1><p>{found['runs']} runs of {found['segments']} segments{lost}; "
+        f"judged: {who}. ± is the standard error over {found['groups']} groups.</p>"
+    )
+
+
+def _tile(found: Mapping[str, Any], name: str, label: str, unit: str) -> str:
+    value, error = found[name], found[f"{name}_se"]
+    number = "–" if value is None else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+    spread = "" if error is None else f"± {error:.2g}"
+    return f"<div><b>{number}</b><span>{escape(label)}</span><small>{unit} {spread}</small></div>"
+
+
+def _collisions(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return "<p>none</p>"
+    lines = "".join(
+        f"<tr><td>{escape(row['kind'])}</td><td>{escape(row['other'])}, "
+        f"{'playback' if row['with_playback'] else 'driven'}</td>"
+        f"<td>{'<b class=bad>yes</b>' if row['at_fault'] else 'no'}</td><td class=n>{row['collisions']}</td></tr>"
+        for row in rows
+    )
+    head = "<tr><th>kind</th><th>with</th><th>at fault</th><th class=n>collisions</th></tr>"
+    return f"<table>{head}{lines}</table>"
+
+
+def _run(row: Mapping[str, Any], viewer: str | None) -> dict[str, Any]:
+    """What the table shows of a run."""
+    shown: dict[str, Any] = {
+        name: round(value, 2) if isinstance(value := row.get(name), float) else value for name in COLUMNS
+    }
+    what = []
+    if row["failed"]:
+        what.append(f"failed: {row['failed']}")
+    elif row["collision"]:
+        what.append("collision, at fault" if row["at_fault_collision"] else "collision, not at fault")
+    if row.get("red_lights"):
+        what.append("red light")
+    if row.get("offroad_time"):
+        what.append("off road")
+    if row.get("wrong_way_time"):
+        what.append("wrong way")
+    shown["what"] = ", ".join(what)
+    # A run of which nothing was saved has no replay.
+    if viewer is not None and row.get("steps") is not None:
+        place = {"segment": row["segment"], "rollout": row["rollout"], "t": row.get("first_event") or 0}
+        shown["link"] = f"{viewer}#{urlencode(place)}"
+    return shown

@@ -1,0 +1,8 @@
+"""Saved rollouts as one page that plays them in a browser, without a network."""
+
+from __future__ import annotations
+
+from symphony.render.viewer.pack import Event, packed, unpacked
+from symphony.render.viewer.page import view_page
+
+__all__ = ["Event", "packed", "unpacked", "view_page"]

@@ -1,0 +1,234 @@
+// The page: what is shown, and what the user does.
+const $ = id => document.getElementById(id);
+const about = JSON.parse($("about").textContent);
+const camera = new Camera(), canvas = $("canvas"), context = canvas.getContext("2d");
+const LAYERS = { log: "log ghosts", routes: "routes, goals", trails: "ways", rollouts: "other rollouts", lights: "lights", labels: "ids" };
+const view = { segment: 0, rollout: 0, t: 0, playing: false, speed: 1, agent: null, follow: null, events: [], branch: null,
+  layers: { log: true, routes: true, trails: true, rollouts: false, lights: true, labels: false } };
+let scene = null, search = null, dirty = true, last = 0;
+const cache = new Map();
+
+async function open(segment, wanted = {}) {
+  view.segment = segment;
+  if (!cache.has(segment)) {
+    if (cache.size > 12) cache.delete(cache.keys().next().value);
+    cache.set(segment, new Scene(new Replay(await unpack(`segment-${segment}`))));
+  }
+  if (view.segment !== segment) return;
+  scene = cache.get(segment);
+  const r = scene.replay;
+  $("segment").value = segment;
+  $("rollout").innerHTML = Array.from({ length: r.rollouts }, (_, k) => `<option value="${k}">${k}${rolloutNote(r, k)}</option>`).join("");
+  $("facts").textContent = `${r.source} · ${(r.steps * r.dt).toFixed(1)} s at ${+(1 / r.dt).toFixed(2)} Hz · ${r.size.length / 2} agents, ${r.agents.length} driven`;
+  $("time").max = r.steps;
+  view.agent = null; view.follow = null; view.branch = null;
+  $("follow").innerHTML = `<option value="">nobody</option>` + Array.from(new Set([r.ego, ...r.agents]), row => `<option value="${row}">${followName(r, row)}</option>`).join("");
+  search = r.branches ? new SearchPanel(r, $("tree")) : null;
+  $("search").hidden = !search;
+  legend(r);
+  resize();
+  fit();
+  choose(Math.min(wanted.rollout || 0, r.rollouts - 1));
+  seek(wanted.step || 0);
+  if (wanted.agent !== undefined) select(wanted.agent);
+}
+
+const followName = (r, row) => `${row === r.ego ? "ego" : r.rank.has(row) ? "interactive" : "agent"} ${escapeText(r.ids[row])}`;
+function rolloutNote(r, k) {
+  const found = r.events.filter(e => e.rollout === k);
+  const hits = found.filter(e => e.kind === "collision");
+  if (r.failed[k]) return " · failed";
+  return hits.length ? (hits.some(e => e.fault) ? " · collision, at fault" : " · collision") : found.length ? ` · ${found[0].label}` : "";
+}
+
+function choose(rollout) {
+  const r = scene.replay;
+  view.rollout = rollout; view.branch = null;
+  view.events = r.events.filter(e => e.rollout === rollout).sort((a, b) => a.step - b.step);
+  $("rollout").value = rollout;
+  $("eventcount").textContent = view.events.length ? `(${view.events.length})` : "";
+  $("events").innerHTML = (r.failed[rollout] ? `<li class="fault">broke off: ${escapeText(r.failed[rollout])}</li>` : "") +
+    (view.events.map((e, i) => `<li tabindex="0" data-event="${i}"><time>${(e.step * r.dt).toFixed(1)} s</time><span>${eventText(r, e)}</span></li>`).join("") || "<span class=hint>none in this rollout</span>");
+  $("ticks").innerHTML = view.events.map(e => `<i class="${e.kind}" style="left:${100 * e.step / r.steps}%"></i>`).join("");
+  $("branch").textContent = "Click a branch to see where it went and what became of it.";
+  if (search) $("searchfacts").textContent = `tree ${search.treeOf(rollout)}: ${r.branches} branches, pruned every ${(r.prune_every * r.dt).toFixed(1)} s`;
+  remember(); dirty = true;
+}
+
+function seek(t) { view.t = Math.min(Math.max(t, 0), scene.replay.steps); dirty = true; }
+function select(row) {
+  view.agent = row;
+  if (row !== null && view.follow !== null) view.follow = row;
+  dirty = true; remember();
+}
+function play(on) {
+  if (on && view.t >= scene.replay.steps) seek(0);
+  view.playing = on; $("play").textContent = on ? "❚❚" : "▶"; last = 0; dirty = true;
+  if (!on) remember();
+}
+function jump(i) {
+  const event = view.events[i];
+  if (!event) return;
+  play(false); seek(event.step); select(event.agent);
+  const state = scene.replay.state(view.rollout, event.agent, event.step);
+  if (state) { camera.x = state.x; camera.y = state.y; camera.scale = Math.max(camera.scale, 9); }
+}
+function remember() {
+  if (!scene) return;
+  const place = new URLSearchParams({ segment: scene.replay.id, rollout: view.rollout, t: (view.t * scene.replay.dt).toFixed(2) });
+  if (view.agent !== null) place.set("agent", scene.replay.ids[view.agent]);
+  history.replaceState(null, "", "#" + place);
+}
+function fit() {
+  const r = scene.replay;
+  let box = [Infinity, -Infinity, Infinity, -Infinity];
+  const add = (x, y, seen) => { for (let i = 0; i < x.length; i++) if (seen[i]) box = [Math.min(box[0], x[i]), Math.max(box[1], x[i]), Math.min(box[2], y[i]), Math.max(box[3], y[i])]; };
+  add(r["sim.x"], r["sim.y"], r["sim.valid"]);
+  if (!Number.isFinite(box[0])) add(r["log.x"], r["log.y"], r["log.valid"]);
+  const m = 22;
+  camera.fit([box[0] - m, box[1] + m, box[2] - m, box[3] + m]);
+  dirty = true;
+}
+function resize() {
+  camera.width = canvas.clientWidth; camera.height = canvas.clientHeight; camera.ratio = window.devicePixelRatio || 1;
+  canvas.width = Math.round(camera.width * camera.ratio); canvas.height = Math.round(camera.height * camera.ratio);
+  dirty = true;
+}
+function legend(r) {
+  const rows = Array.from(new Set([r.ego, ...r.agents])).filter(row => r.rank.has(row));
+  const entries = rows.slice(0, 6).map(row => `<div><b style="background:${r.color(row)}"></b>${row === r.ego ? "ego" : "interactive"} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
+  if (rows.length > 6) entries.push(`<div>and ${rows.length - 6} more driven</div>`);
+  $("legend").innerHTML = entries.join("") + `<div><b style="background:${PLAYBACK}"></b>playback</div><div><b class="dash"></b>log</div>`;
+}
+
+function whoPanel() {
+  const r = scene.replay, row = view.agent;
+  if (row === null) { $("who").innerHTML = `<h2>Agent</h2><p class="hint">Click an agent, or use Tab.</p>`; return; }
+  const color = r.rank.has(row) ? r.color(row) : PLAYBACK;
+  const facts = describeAgent(r, view).map(([a, b]) => `<dt>${a}</dt><dd>${escapeText(b)}</dd>`).join("");
+  if (!$("chart") || $("chart").dataset.row !== String(row)) {
+    $("who").innerHTML = `<h2>Agent</h2><div><b class="swatch" style="background:${color}"></b><strong>${escapeText(r.ids[row])}</strong></div><dl></dl><canvas id="chart" data-row="${row}"></canvas>`;
+  }
+  $("who").querySelector("dl").innerHTML = facts;
+  speedChart($("chart"), r, view);
+}
+
+function scaleBar() {
+  const raw = 110 / camera.scale, power = 10 ** Math.floor(Math.log10(raw)), length = [5, 2, 1].map(k => k * power).find(v => v <= raw);
+  $("scale").querySelector("i").style.width = length * camera.scale + "px";
+  $("scale").querySelector("span").textContent = `${length} m`;
+}
+
+function frame(now) {
+  if (scene) {
+    if (view.playing) {
+      if (last) seek(view.t + (now - last) / 1000 * view.speed / scene.replay.dt);
+      last = now;
+      if (view.t >= scene.replay.steps) play(false);
+    }
+    if (dirty) {
+      dirty = false;
+      const state = view.follow === null ? null : scene.replay.state(view.rollout, view.follow, view.t);
+      if (state) { camera.x = state.x; camera.y = state.y; }
+      scene.draw(context, camera, view);
+      $("time").value = view.t;
+      const r = scene.replay;
+      $("clock").textContent = `${(view.t * r.dt).toFixed(1)} / ${(r.steps * r.dt).toFixed(1)} s`;
+      $("follow").value = view.follow === null ? "" : view.follow;
+      document.querySelectorAll("#events li[data-event]").forEach(li => li.classList.toggle("now", Math.abs(view.events[li.dataset.event].step - view.t) * r.dt < 0.5));
+      whoPanel(); scaleBar();
+      if (search) search.draw(view);
+    }
+  }
+  requestAnimationFrame(frame);
+}
+
+// Mouse and touch: drag, wheel, two fingers, click.
+const pointers = new Map();
+let moved = 0;
+const place = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); pointers.set(event.pointerId, place(event)); moved = 0; canvas.classList.add("dragging"); });
+canvas.addEventListener("pointermove", event => {
+  const before = pointers.get(event.pointerId);
+  if (!before) return;
+  const now = place(event), other = [...pointers].find(([id]) => id !== event.pointerId);
+  if (other) camera.zoom(Math.hypot(now[0] - other[1][0], now[1] - other[1][1]) / Math.max(1, Math.hypot(before[0] - other[1][0], before[1] - other[1][1])), ...other[1]);
+  else { camera.x -= (now[0] - before[0]) / camera.scale; camera.y += (now[1] - before[1]) / camera.scale; }
+  moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
+  if (moved > 4) view.follow = null;
+  pointers.set(event.pointerId, now); dirty = true;
+});
+const release = event => {
+  if (pointers.delete(event.pointerId) && event.type === "pointerup" && moved < 4) select(scene.pick(view, ...camera.toWorld(...place(event))));
+  canvas.classList.remove("dragging");
+};
+canvas.addEventListener("pointerup", release);
+canvas.addEventListener("pointercancel", release);
+canvas.addEventListener("wheel", event => {
+  event.preventDefault();
+  const at = view.follow === null ? place(event) : [camera.width / 2, camera.height / 2];
+  camera.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...at); dirty = true;
+}, { passive: false });
+const zoomBy = factor => { camera.zoom(factor, camera.width / 2, camera.height / 2); dirty = true; };
+$("closer").onclick = () => zoomBy(1.4); $("wider").onclick = () => zoomBy(1 / 1.4); $("fit").onclick = () => { view.follow = null; fit(); };
+
+$("play").onclick = () => play(!view.playing);
+const stepBy = d => { play(false); seek(d > 0 ? Math.floor(view.t + 1e-6) + 1 : Math.ceil(view.t - 1e-6) - 1); remember(); };
+$("back").onclick = () => stepBy(-1); $("forth").onclick = () => stepBy(1);
+$("time").oninput = event => { play(false); seek(+event.target.value); };
+$("time").onchange = remember;
+$("speed").onchange = event => { view.speed = +event.target.value; };
+$("follow").onchange = event => { view.follow = event.target.value === "" ? null : +event.target.value; if (view.follow !== null) { camera.scale = Math.max(camera.scale, 6); select(view.follow); } dirty = true; };
+$("segment").onchange = event => open(+event.target.value).catch(complain);
+const neighbour = d => open((view.segment + d + about.segments.length) % about.segments.length).catch(complain);
+$("previous").onclick = () => neighbour(-1); $("following").onclick = () => neighbour(1);
+$("rollout").onchange = event => choose(+event.target.value);
+$("events").onclick = event => { const li = event.target.closest("[data-event]"); if (li) jump(+li.dataset.event); };
+$("events").onkeydown = event => { if (event.key === "Enter") event.target.click(); };
+$("tree").onclick = event => {
+  const found = search.pick(event.offsetX, event.offsetY);
+  if (!found) return;
+  const same = view.branch && view.branch.p === found.p && view.branch.s === found.s;
+  view.branch = same ? null : search.branch(view.rollout, found.p, found.s);
+  $("branch").innerHTML = same ? "Click a branch to see where it went and what became of it." :
+    `<b style="color:${BRANCH}">${view.branch.title}</b>: ${view.branch.fate}; ${view.branch.why}`;
+  if (!same) { play(false); seek(view.branch.steps.length); }
+  dirty = true;
+};
+$("layers").innerHTML = Object.entries(LAYERS).map(([name, text]) => `<label><input type="checkbox" data-layer="${name}"${view.layers[name] ? " checked" : ""}> ${text}</label>`).join("");
+$("layers").onchange = event => { view.layers[event.target.dataset.layer] = event.target.checked; dirty = true; };
+
+const speeds = Array.from($("speed").options, option => option.value);
+const faster = d => { const i = speeds.indexOf($("speed").value) + d; if (speeds[i]) { $("speed").value = speeds[i]; view.speed = +speeds[i]; } };
+function tab(d) { const rows = Array.from(scene.replay.agents), i = rows.indexOf(view.agent); select(rows[(i + d + rows.length) % rows.length]); }
+const KEYS = { " ": () => play(!view.playing), ArrowRight: () => stepBy(1), ArrowLeft: () => stepBy(-1), "+": () => zoomBy(1.3), "=": () => zoomBy(1.3), "-": () => zoomBy(1 / 1.3),
+  0: () => { view.follow = null; fit(); }, "]": () => faster(1), "[": () => faster(-1), Escape: () => select(null),
+  f: () => { view.follow = view.follow === null ? (view.agent === null ? scene.replay.ego : view.agent) : null; dirty = true; },
+  n: () => jump(view.events.findIndex(e => e.step > view.t + 1e-6)), p: () => jump(view.events.findLastIndex(e => e.step < view.t - 1e-6)) };
+document.addEventListener("keydown", event => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT" || !scene) return;
+  if (event.key === "Tab" && event.target === canvas) { event.preventDefault(); tab(event.shiftKey ? -1 : 1); return; }
+  if (event.target.tagName === "BUTTON" && event.key === " ") return;
+  if (event.target.type === "range" && event.key.startsWith("Arrow")) event.preventDefault();
+  const action = KEYS[event.key];
+  if (action) { action(); event.preventDefault(); }
+});
+new ResizeObserver(() => resize()).observe(canvas);
+
+function complain(error) { $("message").hidden = false; $("message").textContent = `This page can't be shown: ${error.message || error}`; }
+function fromPlace() {
+  const wanted = new URLSearchParams(location.hash.slice(1)), found = about.segments.indexOf(wanted.get("segment"));
+  const segment = Math.max(found, 0);
+  return open(segment, { rollout: +wanted.get("rollout") || 0 }).then(() => {
+    seek((+wanted.get("t") || 0) / scene.replay.dt);
+    const row = scene.replay.ids.indexOf(wanted.get("agent"));
+    if (row >= 0) select(row);
+  });
+}
+document.title = `${about.agent}: rollouts`;
+$("agent").textContent = about.agent;
+$("segment").innerHTML = about.segments.map((name, i) => `<option value="${i}">${escapeText(name)}</option>`).join("");
+window.addEventListener("hashchange", () => fromPlace().catch(complain));
+if (!about.segments.length) complain("it holds no rollouts");
+else fromPlace().then(() => { document.body.dataset.ready = "1"; }).catch(complain);
+requestAnimationFrame(frame);

@@ -1,0 +1,194 @@
+"""What a page holds of each run segment: arrays of small integers, deflated, in base64.
+
+A packed segment is the deflated (zlib) form of: the length of a header (4 bytes, little-endian), the header as JSON,
+the arrays one after the other. The header has ``facts`` and ``arrays``; of each array its ``name``, ``type``,
+``shape``, ``offset`` behind the header, the ``scale`` its integers are multiplied with, and whether they are
+differences along the last axis (``delta``).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import LaneType, Polylines, RunSegment
+from symphony.render.roads import BIKE_WIDTH, DEFAULT_WIDTH
+
+if TYPE_CHECKING:
+    from symphony.simulation.saved import SavedRollouts, SavedTrees
+
+_TYPES = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
+MILLIMETRE = 1e-3
+ANGLE = 1e-4
+"""Radians that headings are rounded to."""
+CENTIMETRE = 1e-2
+"""Metres that sizes, and m/s that speeds are rounded to."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something to be marked in a replay.
+
+    Attributes:
+        rollout: its number.
+        step: the state at which it happens, from 0.
+        agent: row of the log.
+        kind: ``collision``, ``offroad`` or ``redlight``.
+        text: what happened, behind the agent's id (of a collision: its kind).
+        other: row of the other agent of a collision, else -1.
+        fault: of a collision, whether the agent is at fault; None where that is not known.
+        label: short, for a list of rollouts.
+    """
+
+    rollout: int
+    step: int
+    agent: int
+    kind: str
+    text: str
+    other: int = -1
+    fault: bool | None = None
+    label: str = ""
+
+
+class _Packer:
+    def __init__(self) -> None:
+        self.arrays: list[dict[str, Any]] = []
+        self.data: list[bytes] = []
+        self.offset = 0
+
+    def add(self, name: str, kind: str, values: Any, scale: float = 0, *, delta: bool = False) -> None:
+        array = np.asarray(values, np.float64)
+        # Rounded first and then differenced: errors don't add up.
+        whole = np.rint(array / scale) if scale else array
+        if delta:
+            whole = np.diff(whole, axis=-1, prepend=0.0) if whole.size else whole
+        packed_values = np.ascontiguousarray(whole, dtype=_TYPES[kind])
+        if kind != "f32" and not np.array_equal(packed_values, whole):
+            raise ValueError(f"{name}: numbers beyond what {kind} holds")
+        item: dict[str, Any] = {"name": name, "type": kind, "shape": list(array.shape), "offset": self.offset}
+        item |= ({"scale": scale} if scale else {}) | ({"delta": True} if delta else {})
+        self.arrays.append(item)
+        raw = packed_values.tobytes()
+        # Browsers read numbers at multiples of their size only.
+        raw += b"\0" * (-len(raw) % 4)
+        self.data.append(raw)
+        self.offset += len(raw)
+
+    def lines(self, name: str, lines: Polylines) -> None:
+        self.add(f"{name}.offsets", "i32", lines.offsets, delta=True)
+        for axis, letter in enumerate("xy"):
+            self.add(f"{name}.{letter}", "i32", lines.points[:, axis], MILLIMETRE, delta=True)
+
+    def states(self, name: str, state: NDArray[Any]) -> None:
+        """States [..., T, 4], zero where there are none."""
+        heading = np.remainder(state[..., 2].astype(np.float64) + math.pi, 2 * math.pi) - math.pi
+        for axis, letter in enumerate("xy"):
+            self.add(f"{name}.{letter}", "i32", state[..., axis], MILLIMETRE, delta=True)
+        self.add(f"{name}.h", "i16", heading, ANGLE)
+        self.add(f"{name}.s", "i16", state[..., 3], CENTIMETRE)
+
+    def text(self, facts: dict[str, Any]) -> str:
+        header = json.dumps(
+            {"facts": facts, "arrays": self.arrays}, ensure_ascii=False, allow_nan=False
+        ).encode()
+        header += b" " * (-len(header) % 4)
+        block = len(header).to_bytes(4, "little") + header + b"".join(self.data)
+        return base64.b64encode(zlib.compress(block, 9)).decode()
+
+
+def packed(saved: SavedRollouts, events: Sequence[Event] = ()) -> str:
+    """One run segment with its rollouts, as the page holds it."""
+    segment, packer = saved.segment, _Packer()
+    facts: dict[str, Any] = {
+        "id": segment.segment_id,
+        "source": segment.source,
+        "dt": float(segment.dt),
+        "ego": int(segment.ego),
+        "ids": [str(number) for number in segment.agent_id.tolist()],
+        "rollouts": saved.rollouts,
+        "steps": saved.steps,
+        "drivers": list(saved.drivers),
+        "failed": {str(number): reason for number, reason in saved.failed.items()},
+        "events": [asdict(event) for event in events],
+    }
+    _pack_log(packer, segment, slice(saved.start, saved.last + 1))
+    packer.add("agents", "i16", saved.agents)
+    # A state is there if the step to it counts; the first one if the second is.
+    there = np.concatenate([saved.counted[:, :1], saved.counted], 1)
+    packer.states("sim", np.where(there[..., None], saved.state, 0).swapaxes(1, 2))
+    packer.add("sim.valid", "u8", there.swapaxes(1, 2))
+    packer.add("goal", "i16", saved.goal)
+    packer.lines("routes", saved.routes)
+    _pack_road(packer, segment)
+    if saved.trees is not None:
+        facts |= _pack_trees(packer, saved.trees)
+    return packer.text(facts)
+
+
+def _pack_log(packer: _Packer, segment: RunSegment, within: slice) -> None:
+    heading, velocity = segment.heading[:, within], segment.velocity[:, within]
+    speed = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
+    place = segment.position[:, within, :2]
+    packer.states("log", np.concatenate([place, heading[..., None], speed[..., None]], -1))
+    packer.add("log.valid", "u8", segment.valid[:, within])
+    packer.add("size", "i16", segment.size[:, :2], CENTIMETRE)
+    packer.add("type", "u8", segment.agent_type)
+    for axis, letter in enumerate("xy"):
+        packer.add(f"lights.{letter}", "i32", segment.signal_point[:, axis], MILLIMETRE)
+    packer.add("lights.state", "u8", segment.signal_state[:, within])
+
+
+def _pack_road(packer: _Packer, segment: RunSegment) -> None:
+    road = segment.road
+    default = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, DEFAULT_WIDTH)
+    packer.lines("lanes", road.lanes)
+    packer.add(
+        "lanes.width", "i16", np.where(np.isnan(road.lane_width), default, road.lane_width), CENTIMETRE
+    )
+    packer.lines("boundary", road.boundary)
+    packer.lines("marks", road.marks)
+    packer.add("marks.type", "u8", road.mark_type)
+
+
+def _pack_trees(packer: _Packer, trees: SavedTrees) -> dict[str, Any]:
+    # Time last, as everywhere in the page.
+    packer.states("tree", trees.state.swapaxes(2, 3))
+    packer.add("tree.score", "f32", trees.score.swapaxes(2, 3))
+    for name in ("totals", "parents", "slots"):
+        packer.add(f"tree.{name}", "f32" if name == "totals" else "i16", getattr(trees, name))
+    _, periods, branches = trees.parents.shape
+    leaves = trees.slots.shape[-1]
+    return {"periods": periods, "branches": branches, "leaves": leaves, "prune_every": trees.prune_every}
+
+
+def unpacked(text: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Facts and arrays of a packed segment, as the page reads them.
+
+    Raises:
+        ValueError: the text is damaged.
+    """
+    try:
+        block = zlib.decompress(base64.b64decode(text, validate=True))
+        length = int.from_bytes(block[:4], "little")
+        header = json.loads(block[4 : 4 + length])
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise ValueError(f"not a packed segment ({error})") from error
+    found = {}
+    for item in header["arrays"]:
+        count = math.prod(item["shape"])
+        raw = np.frombuffer(block, _TYPES[item["type"]], count, 4 + length + item["offset"]).reshape(
+            item["shape"]
+        )
+        if item.get("delta"):
+            raw = raw.cumsum(-1)
+        found[item["name"]] = raw * item["scale"] if item.get("scale") else raw
+    return header["facts"], found

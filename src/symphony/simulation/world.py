@@ -1,0 +1,53 @@
+"""Everyone in one saved rollout: driven agents where they were driven, all others as logged."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.simulation.saved import SavedRollouts
+
+Reals = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class World(NamedTuple):
+    """Everyone in one rollout. Legend: A agents, U states.
+
+    Attributes:
+        position: [A, U, 2].
+        heading: [A, U].
+        velocity: [A, U, 2].
+        valid: [A, U].
+        size: [A, 2] length, width.
+    """
+
+    position: Reals
+    heading: Reals
+    velocity: Reals
+    valid: Bools
+    size: Reals
+
+    @property
+    def speed(self) -> Reals:
+        """[A, U] along the heading, negative when reversing."""
+        return self.velocity[..., 0] * np.cos(self.heading) + self.velocity[..., 1] * np.sin(self.heading)
+
+
+def world_of(saved: SavedRollouts, rollout: int) -> World:
+    """Everyone in one rollout: driven agents where they were driven, all others as logged."""
+    segment, within = saved.segment, slice(saved.start, saved.last + 1)
+    position, heading = (
+        segment.position[:, within, :2].astype(np.float64),
+        segment.heading[:, within].astype(np.float64),
+    )
+    velocity, valid = segment.velocity[:, within].astype(np.float64), segment.valid[:, within].copy()
+    counted = saved.counted[rollout]
+    there = np.concatenate([counted[:1], counted]).T
+    state = np.where(there[..., None], saved.state[rollout].swapaxes(0, 1), 0).astype(np.float64)
+    direction = np.stack([np.cos(state[..., 2]), np.sin(state[..., 2])], -1)
+    position[saved.agents], heading[saved.agents] = state[..., :2], state[..., 2]
+    velocity[saved.agents], valid[saved.agents] = state[..., 3:] * direction, there
+    return World(position, heading, velocity, valid, segment.size[:, :2].astype(np.float64))

@@ -1,0 +1,90 @@
+"""Saved rollouts for tests: hand-made ones, and those of the included agent with their search."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from symphony.agents import load_agent
+from symphony.config import EvaluateConfig
+from symphony.data.builtin import builtin_store
+from symphony.data.segment import Polylines, RunSegment
+from symphony.data.store import SegmentStore
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.driving import simulation
+from symphony.simulation.saved import SavedRollouts, SavedTrees, saved_rollouts
+from symphony.simulation.saved_files import About
+
+AGENT = "pretrained:bc_ts_h"
+
+
+def played(segment: RunSegment, agents: Any = (0,), rollouts: int = 1, **changes: Any) -> SavedRollouts:
+    """The log itself, as if it had been simulated; any field by name."""
+    rows = np.asarray(agents, np.int64)
+    steps = segment.num_steps - 1
+    velocity, heading = segment.velocity[rows], segment.heading[rows]
+    speed = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
+    state = np.concatenate([segment.position[rows, :, :2], heading[..., None], speed[..., None]], -1)
+    state = np.repeat(state.swapaxes(0, 1)[None], rollouts, 0).astype(np.float32)
+    shape = (rollouts, steps, len(rows))
+    values: dict[str, Any] = {
+        "segment": segment,
+        "agents": rows,
+        "state": state,
+        "counted": np.repeat(segment.valid[rows].T[None, 1:] & segment.valid[rows].T[None, :-1], rollouts, 0),
+        "collision": np.zeros(shape, bool),
+        "offroad": np.zeros(shape, bool),
+        "goal": np.full((rollouts, len(rows)), -1, np.int64),
+        "routes": Polylines.of([]),
+        "drivers": ("made",) * len(rows),
+    }
+    return SavedRollouts(**{**values, **changes})
+
+
+def random_trees(saved: SavedRollouts, branches: int = 4, every: int = 2, seed: int = 0) -> SavedTrees:
+    """One search of numbers that mean nothing."""
+    rng = np.random.default_rng(seed)
+    shape = (1, branches, saved.steps, len(saved.agents))
+    periods = -(-saved.steps // every)
+    return SavedTrees(
+        state=rng.normal(size=(*shape, 4)).astype(np.float32),
+        collision=rng.random(shape) < 0.5,
+        offroad=rng.random(shape) < 0.5,
+        score=rng.normal(size=shape).astype(np.float32),
+        totals=rng.normal(size=(1, periods, branches)).astype(np.float32),
+        parents=rng.integers(0, branches, (1, periods, branches)),
+        slots=rng.integers(0, branches, (1, periods, saved.rollouts)),
+        prune_every=every,
+    )
+
+
+def searched(
+    count: int = 2, rollouts: int = 4, branches: int = 6, duration: int = 4
+) -> tuple[About, list[SavedRollouts]]:
+    """Rollouts of the included agent, leaves of one search each, on the first built-in test segments."""
+    return _searched(count, rollouts, branches, duration)
+
+
+@lru_cache
+def _searched(count: int, rollouts: int, branches: int, duration: int) -> tuple[About, list[SavedRollouts]]:
+    agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
+    indices = range(count)
+    dataset = SceneDataset(store, agent.interactive, agent.dynamics, indices, routes=True, duration=duration)
+    config = EvaluateConfig(rollouts=rollouts, branches=branches)
+    scenes = dataset.scenes(indices)
+    found = simulation(agent, scenes, config, keep_tree=True)
+    saved = [
+        saved_rollouts(
+            dataset.segment(b).replace(group=store.tags(b)["network"]),
+            scenes,
+            found.rollouts,
+            b,
+            goal=found.goal,
+            search=found.search,
+            driver=AGENT,
+        )
+        for b in indices
+    ]
+    return About.of(AGENT, store, config), saved

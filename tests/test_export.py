@@ -1,0 +1,130 @@
+"""Saved rollouts in the formats of other tools: what is read back is what was simulated."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from helpers_saved import played, searched
+from helpers_segments import crossing, hide, straight_road
+from symphony.cli import main
+from symphony.data.segment import AgentType, RunSegment, SignalState
+from symphony.data.sources.commonroad import CommonRoadReader
+from symphony.simulation.export import commonroad
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.saved_files import About, save_rollouts
+from symphony.simulation.world import World, world_of
+
+
+def read_back(saved: SavedRollouts, rollout: int, path: Path) -> RunSegment:
+    file = path / "scenario.xml"
+    file.write_text(commonroad(saved, rollout), encoding="utf-8")
+    (item,) = CommonRoadReader().read(file)
+    assert isinstance(item, RunSegment), item
+    return item
+
+
+def assert_driven(
+    world: World, ids: NDArray[np.int64], found: RunSegment, origin: NDArray[np.float64]
+) -> None:
+    """Every agent is where it was in the rollout, at every step, within a millimetre."""
+    for row in np.flatnonzero(world.valid.any(1)):
+        (k,) = np.flatnonzero(found.agent_id == ids[row])
+        np.testing.assert_array_equal(found.valid[k], world.valid[row])
+        seen = found.valid[k]
+        place = found.position[k, seen, :2] + found.origin[:2]
+        np.testing.assert_allclose(place, world.position[row, seen] + origin[:2], atol=1e-3)
+        np.testing.assert_allclose(found.heading[k, seen], world.heading[row, seen], atol=1e-3)
+        speed = np.linalg.norm(found.velocity[k, seen], axis=-1)
+        np.testing.assert_allclose(speed, np.abs(world.speed[row, seen]), atol=1e-3)
+        np.testing.assert_allclose(found.size[k, :2], world.size[row], atol=1e-5)
+
+
+def test_a_rollout_comes_back_from_commonroad(tmp_path: Path) -> None:
+    _, found = searched()
+    for saved in found:
+        for k in (0, saved.rollouts - 1):
+            again = read_back(saved, k, tmp_path)
+            assert again.dt == saved.segment.dt
+            assert again.num_steps == saved.steps + 1
+            assert_driven(world_of(saved, k), saved.segment.agent_id, again, saved.segment.origin)
+
+
+def test_lanes_widths_limits_and_lights_come_back(tmp_path: Path) -> None:
+    segment = crossing(4, steps=31).replace(origin=np.array([512_000.0, 5_400_000.0, 0.0]))
+    again = read_back(played(segment, [0, 1]), 0, tmp_path)
+    road, other = segment.road, again.road
+    assert len(other.lanes) == len(road.lanes)
+    shift = again.origin[:2] - segment.origin[:2]
+    for k in range(len(road.lanes)):
+        np.testing.assert_allclose(other.lanes[k][:, :2] + shift, road.lanes[k][:, :2], atol=0.01)
+    np.testing.assert_allclose(other.lane_width, road.lane_width, atol=0.01)
+    np.testing.assert_allclose(other.speed_limit, road.speed_limit)
+    np.testing.assert_array_equal(other.lane_type, road.lane_type)
+    assert set(map(tuple, other.successors)) == set(map(tuple, road.successors))
+    order = np.argsort(again.signal_lane)
+    np.testing.assert_array_equal(again.signal_lane[order], segment.signal_lane)
+    np.testing.assert_array_equal(again.signal_state[order], segment.signal_state)
+    np.testing.assert_allclose(again.signal_point[order, :2] + shift, segment.signal_point[:, :2], atol=0.01)
+
+
+def test_neighbours_come_back_and_unknown_widths_are_nominal(tmp_path: Path) -> None:
+    segment = straight_road(3)
+    lost = np.full_like(segment.road.lane_width, np.nan)
+    segment = segment.replace(road=dataclasses.replace(segment.road, lane_width=lost, speed_limit=lost))
+    again = read_back(played(segment), 0, tmp_path)
+    assert set(map(tuple, again.road.left_neighbors)) == set(map(tuple, segment.road.left_neighbors))
+    assert set(map(tuple, again.road.right_neighbors)) == set(map(tuple, segment.road.right_neighbors))
+    np.testing.assert_allclose(again.road.lane_width, 3.6, atol=1e-3)
+    assert np.isnan(again.road.speed_limit).all()
+
+
+def test_agents_that_are_lost_and_odd_ids_stay_apart(tmp_path: Path) -> None:
+    """An agent seen twice is two obstacles; ids that are not positive are shifted."""
+    segment = hide(straight_road(4, steps=21), 2, slice(5, 9))
+    segment = segment.replace(
+        agent_id=np.array([-3, 0, 4, 9]),
+        agent_type=np.array([1, 2, 3, 4], np.uint8),
+        size=np.array([[9, 2, 0], [0.5, 0.5, 0], [1.8, 0.6, 0], [2, 2, 0]], np.float32),
+    )
+    text = commonroad(played(segment), 0)
+    for kind in ("truck", "pedestrian", "bicycle", "unknown"):
+        assert f"<type>{kind}</type>" in text
+    again = read_back(played(segment), 0, tmp_path)
+    assert again.agent_id[:2].tolist() == [1, 4]
+    first, second = (again.valid[again.agent_id == number][0] for number in (8, 14))
+    np.testing.assert_array_equal(first | second, segment.valid[2])
+    assert not (first & second).any()
+    assert AgentType.CYCLIST in again.agent_type
+
+
+def test_the_command_writes_a_file_for_each_rollout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = played(crossing(4, steps=11), [0, 1], 3)
+    saved.collision[1, 4, 1] = True
+    save_rollouts(tmp_path / "sim", About("made"), [saved, played(straight_road())])
+    sim = str(tmp_path / "sim")
+    assert main(["export", sim]) == 0
+    names = [path.name for path in sorted((tmp_path / "sim" / "export").iterdir())]
+    assert names == [*(f"crossing-0-{k}.xml" for k in range(3)), "straight-0-0.xml"]
+    out = tmp_path / "json"
+    arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1"]
+    assert main(["export", sim, *arguments]) == 0
+    (file,) = out.iterdir()
+    found = json.loads(file.read_text())
+    states = np.array(found["agents"][1]["states"])
+    world = world_of(saved, 1)
+    np.testing.assert_array_equal(states[:, 0], np.arange(11))
+    np.testing.assert_allclose(states[:, 1:3], world.position[1], atol=1e-6)
+    np.testing.assert_allclose(states[:, 4], world.speed[1], atol=1e-6)
+    assert found["agents"][1]["collision"] == [5]
+    assert [agent["driver"] for agent in found["agents"]] == ["made", "made", "playback", "playback"]
+    assert found["lights"][0]["states"][0] == SignalState(saved.segment.signal_state[0, 0]).name.lower()
+    assert main(["export", sim, "--rollouts", "1"]) == 1
+    assert "straight-0 has rollouts 0 to 0, not 1" in capsys.readouterr().err

@@ -1,0 +1,127 @@
+"""The Gymnasium environment: what its checker wants, and that it is the driving environment."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers_segments import crossing, hide, straight_road
+from helpers_store import fill
+from symphony import keys
+from symphony.data.store import SegmentStore
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.dynamics import Bicycle
+from symphony.envs.observation import ObservationConfig
+from symphony.envs.scene import scene
+from symphony.errors import ConfigError, DataError
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra 'gym'")
+
+NAME = "symphony.gym:symphony/Driving-v0"
+SMALL = ObservationConfig(num_objects=4, num_points=8)
+WITH_ROUTE = ObservationConfig(num_objects=4, num_points=8, route=True)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    late = hide(straight_road(3, seed=5), 0, slice(0, 2))
+    fill(tmp_path / "store", [late, crossing(4, steps=21), straight_road(4, steps=21)])
+    return tmp_path / "store"
+
+
+@pytest.mark.parametrize("action", ["discrete", "continuous"])
+@pytest.mark.parametrize("observation", [SMALL, WITH_ROUTE], ids=["plain", "route"])
+def test_gymnasiums_checker_is_content(store: Path, action: str, observation: ObservationConfig) -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    env = gymnasium.make(NAME, data=store, action=action, observation=observation)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_it_is_the_driving_environment(store: Path) -> None:
+    env = gymnasium.make(NAME, data=str(store), observation=SMALL, ends_on=())
+    seen, info = env.reset(seed=1, options={"segment": "crossing-0"})
+    segment = SegmentStore(store)[1]
+    other = DrivingEnv(scene(segment, [segment.ego]), Bicycle(), SMALL)
+    now = other.start(torch.tensor(0))
+    rng = np.random.default_rng(0)
+    truncated = False
+    while not truncated:
+        for name, value in now.get(("agents", "observation")).items():
+            np.testing.assert_array_equal(seen[name], value[0].numpy())
+        np.testing.assert_array_equal(info["state"], now.get(keys.STATE)[0].numpy())
+        assert info["collision"] == bool(now.get(keys.COLLISION))
+        action = int(rng.integers(env.action_space.n))
+        seen, reward, terminated, truncated, info = env.step(action)
+        after = other.step(now.set(keys.ACTION, torch.tensor([action]))).get("next")
+        assert reward == float(after.get(keys.REWARD))
+        assert not terminated
+        now = after.exclude(keys.REWARD)
+    assert info["step"] == segment.num_steps - 1
+    assert info["segment"] == "crossing-0"
+
+
+def test_the_ego_is_driven_and_reaches_what_it_hits(store: Path) -> None:
+    """Full displacement to the side leaves the road and ends the episode."""
+    env = gymnasium.make(NAME, data=store, action="continuous", observation=SMALL)
+    _, start = env.reset(seed=0, options={"segment": 2})
+    step = np.array([0.25, -1.0], np.float32)
+    _, reward, terminated, truncated, info = env.step(step)
+    assert info["driven"] == pytest.approx(float(np.hypot(0.25, 1.0)) * 40 * 0.2, rel=1e-4)
+    moved = info["state"][:2] - start["state"][:2]
+    np.testing.assert_allclose(moved, [0.25 * 8, -8], atol=1e-4)
+    assert (reward, terminated, truncated, info["offroad"]) == (-1.0, True, False, True)
+
+
+def test_segments_are_drawn_by_seed_and_only_those_with_an_ego(store: Path) -> None:
+    def drawn(seed: int) -> list[str]:
+        env = gymnasium.make(NAME, data=store, observation=SMALL)
+        return [env.reset(seed=seed if k == 0 else None)[1]["segment"] for k in range(8)]
+
+    assert drawn(3) == drawn(3)
+    assert set(drawn(3) + drawn(4)) == {"crossing-0", "straight-0"}
+    env = gymnasium.make(NAME, data=store, observation=SMALL, duration=1)
+    with pytest.raises(DataError, match="not seen at the first step"):
+        env.reset(options={"segment": "straight-5"})
+    with pytest.raises(DataError, match="no such segment"):
+        env.reset(options={"segment": "nowhere"})
+    env = gymnasium.make(NAME, data=store, observation=SMALL, duration=1)
+    env.reset(options={"segment": 1})
+    ends = [env.step(env.action_space.n // 2)[3] for _ in range(5)]
+    assert ends == [False] * 4 + [True]
+
+
+def test_a_reward_of_ones_own_and_wrong_arguments(store: Path) -> None:
+    def speed(before: Any, after: Any) -> Any:
+        return after.get(keys.STATE)[..., 3]
+
+    env = gymnasium.make(NAME, data=store, observation=SMALL, reward=speed)
+    env.reset(options={"segment": 1})
+    _, reward, *_, info = env.step(0)
+    assert reward == info["state"][3]
+    with pytest.raises(ConfigError, match="discrete or continuous"):
+        gymnasium.make(NAME, data=store, action="jump")
+    fill(store.parent / "empty", [])
+    with pytest.raises(DataError, match="no run segments"):
+        gymnasium.make(NAME, data=store.parent / "empty")
+
+
+def test_gymnasium_knows_it_without_importing_anything_heavy() -> None:
+    code = (
+        "import sys, gymnasium, symphony.gym\n"
+        "print(gymnasium.spec('symphony/Driving-v0').entry_point, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["symphony.envs.gym:DrivingGym", "False"]
+
+
+def test_the_extra_is_named_where_it_is_missing() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None; import symphony.gym"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "symphony-traffic[gym]" in done.stderr

@@ -1,0 +1,366 @@
+"""The report of saved rollouts, on scenes whose answers are known."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers_saved import played, searched
+from helpers_segments import CAR, LANE_WIDTH, crossing, crossing_road, make_road, make_segment, straight_road
+from symphony.cli import main
+from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
+from symphony.errors import DataError
+from symphony.evaluation.contacts import HORIZON, contacts, time_to_collision
+from symphony.evaluation.driving import red_lights, wrong_way
+from symphony.evaluation.report import Report, add_segment, report, total_numbers
+from symphony.geometry import box_gap
+from symphony.metrics import CollisionKind
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.saved_files import About, RolloutWriter, save_rollouts
+from symphony.simulation.world import World, world_of
+
+ABOUT = About("made")
+DT = 0.2
+
+
+def driving(
+    *ways: tuple[float, float, float, float], steps: int = 21, lanes: int = 2, **changes: Any
+) -> RunSegment:
+    """Cars at constant velocity: x, y, heading, speed at first; two lanes along +x, at y = 0 and above."""
+    start = np.array(ways, float)
+    time = np.arange(steps) * DT
+    direction = np.stack([np.cos(start[:, 2]), np.sin(start[:, 2])], -1)
+    velocity = np.repeat((start[:, 3:] * direction)[:, None], steps, 1)
+    position = start[:, None, :2] + time[:, None] * velocity
+    x = np.arange(-100, 200, 2.0)
+    road = make_road([np.stack([x, np.full_like(x, k * LANE_WIDTH)], -1) for k in range(lanes)])
+    heading = np.repeat(start[:, 2:3], steps, 1)
+    return make_segment(road, position, heading, velocity, DT, **changes)
+
+
+def touched(segment: RunSegment, agent: int = 0, offroad: bool = False) -> list[tuple[int, str, int, bool]]:
+    """Other, kind, step and fault of each contact of an agent."""
+    world = world_of(played(segment, [agent]), 0)
+    off = np.full(world.valid.shape, offroad)
+    found = contacts(world, np.array([agent]), LaneGraph(segment.road), segment.road, off)
+    return [
+        (other, CollisionKind(kind).name, step, fault)
+        for _, other, step, kind, fault in zip(*(part.tolist() for part in found), strict=True)
+    ]
+
+
+def test_the_one_behind_is_at_fault_and_the_one_ahead_is_not() -> None:
+    # The gap of 10 - 4.6 m closes at 5 m/s within 1.08 s: overlap at the 6th state.
+    segment = driving((0, 0, 0, 12), (10, 0, 0, 7))
+    assert touched(segment, 0) == [(1, "INTO_LEADER", 6, True)]
+    assert touched(segment, 1) == [(0, "REAR_ENDED", 6, False)]
+
+
+def test_a_car_that_stands_is_hit_at_the_fault_of_who_moves() -> None:
+    segment = driving((0, 0, 0, 8), (12, 0, 0, 0))
+    assert touched(segment, 0) == [(1, "INTO_LEADER", 5, True)]
+    assert touched(segment, 1) == [(0, "REAR_ENDED", 5, False)]
+    # Standing across the lane, too.
+    across = driving((0, 0, 0, 8), (12, 0, math.pi / 2, 0))
+    assert [fault for *_, fault in touched(across, 0)] == [True]
+    assert [fault for *_, fault in touched(across, 1)] == [False]
+
+
+def test_who_stopped_is_never_at_fault() -> None:
+    head_on = driving((0, 0, 0, 0), (15, 0, math.pi, 6))
+    assert [(kind, fault) for _, kind, _, fault in touched(head_on)] == [("ONCOMING", False)]
+    assert [(kind, fault) for _, kind, _, fault in touched(head_on, 1)] == [("ONCOMING", True)]
+
+
+def test_a_front_that_hits_a_flank_is_at_fault_and_the_flank_within_its_lane_is_not() -> None:
+    # 0 drives along its lane, 1 comes from the right and hits its flank.
+    segment = driving((0, 0, 0, 10), (7.2, -8.5, math.pi / 2, 8))
+    assert [(kind, fault) for _, kind, _, fault in touched(segment, 0)] == [("CROSSING", False)]
+    assert [(kind, fault) for _, kind, _, fault in touched(segment, 1)] == [("CROSSING", True)]
+
+
+def test_of_two_that_touch_flanks_the_one_out_of_its_lane_is_at_fault() -> None:
+    # 0 keeps its lane; 1 starts in the left one and drifts over.
+    segment = driving((0, 0, 0, 10), (0, LANE_WIDTH, -0.12, 10 / math.cos(0.12)))
+    assert [(kind, fault) for _, kind, _, fault in touched(segment, 0)] == [("SIDESWIPE", False)]
+    assert [(kind, fault) for _, kind, _, fault in touched(segment, 1)] == [("SIDESWIPE", True)]
+    assert [fault for *_, fault in touched(segment, 0, offroad=True)] == [True]
+
+
+def test_each_pair_counts_once_and_the_first_state_does_not() -> None:
+    """A leader at the same speed that overlaps all the time is one contact, at the second state."""
+    segment = driving((0, 0, 0, 8), (4, 0, 0, 8), (30, 0, 0, 0))
+    assert [(other, step) for other, _, step, _ in touched(segment, 0)] == [(1, 1), (2, 16)]
+
+
+def box_ttc(gap: float, closing: float) -> float:
+    segment = driving((0, 0, 0, 10), (gap + CAR[0], 0, 0, 10 - closing))
+    return float(time_to_collision(world_of(played(segment), 0), np.array([0]))[0, 0])
+
+
+@pytest.mark.parametrize(("gap", "closing"), [(10, 4), (3, 8), (0.5, 0.2)])
+def test_time_to_collision_is_gap_over_closing_speed(gap: float, closing: float) -> None:
+    assert box_ttc(gap, closing) == pytest.approx(gap / closing, rel=1e-5)
+
+
+def test_time_to_collision_is_infinite_for_what_does_not_meet() -> None:
+    assert box_ttc(10, 0) == math.inf
+    assert box_ttc(10, -3) == math.inf
+    assert box_ttc(60, 2) == math.inf
+    beside = driving((0, 0, 0, 10), (10, LANE_WIDTH, 0, 2))
+    behind = driving((0, 0, 0, 5), (-10, 0, 0, 15))
+    stopped = driving((0, 0, 0, 0), (10, 0, math.pi, 5))
+    for segment in (beside, behind, stopped):
+        assert np.isinf(time_to_collision(world_of(played(segment), 0), np.array([0]))[0, 0])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.tuples(*[st.floats(-8, 8)] * 2, st.floats(-3, 3), st.floats(1, 12)),
+    st.tuples(st.floats(5, 25), st.floats(-15, 15), st.floats(-3, 3), st.floats(0, 12)),
+)
+def test_time_to_collision_is_when_boxes_meet_that_go_on(one: Any, two: Any) -> None:
+    segment = driving(one, two, steps=2)
+    world = world_of(played(segment), 0)
+    found = float(time_to_collision(world, np.array([0]))[0, 0])
+
+    def gap(time: float) -> float:
+        place = torch.from_numpy(world.position[:, 0] + time * world.velocity[:, 0])
+        heading, size = torch.from_numpy(world.heading[:, 0]), torch.from_numpy(world.size)
+        return float(box_gap(place[0], heading[0], size[0], place[1], heading[1], size[1]))
+
+    away = world.position[1, 0] - world.position[0, 0]
+    if away @ world.velocity[0, 0] <= 0:
+        assert found == math.inf
+        return
+    if found > 0:
+        assert all(gap(time) > -1e-5 for time in np.linspace(0, min(found, HORIZON), 50))
+    if found < math.inf:
+        assert gap(found) <= 1e-5
+
+
+def test_a_known_profile_has_its_acceleration_jerk_and_lateral_acceleration() -> None:
+    """Speed t^3 / 3: acceleration and jerk are differences of it; a circle of 20 m at 10 m/s: 5 m/s^2."""
+    segment = driving((0, 0, 0, 10), steps=11)
+    time = np.arange(11) * DT
+    saved = played(segment)
+    saved.state[0, :, 0, 3] = 5 - time**3 / 3
+    saved.state[0, :, 0, 2] = 0
+    row = rows(saved)[0]
+    speed = 5 - time**3 / 3
+    assert row["max_braking"] == pytest.approx(-np.diff(speed).min() / DT, rel=1e-4)
+    assert row["max_jerk"] == pytest.approx(np.abs(np.diff(speed, 2)).max() / DT**2, rel=1e-3)
+    assert row["max_lateral_acceleration"] == 0
+    turning = played(segment)
+    turning.state[0, :, 0, 2] = 3 + 0.5 * time
+    turning.state[0, :, 0, 3] = 10
+    assert rows(turning)[0]["max_lateral_acceleration"] == pytest.approx(5, rel=1e-4)
+    assert rows(turning)[0]["max_jerk"] == 0
+
+
+def rows(saved: SavedRollouts, judged: Any = "interactive") -> list[dict[str, Any]]:
+    found = Report("made", judged)
+    add_segment(found, saved)
+    return found.rows
+
+
+def test_progress_is_along_the_route_and_relative_to_the_log() -> None:
+    segment = driving((0, 0, 0, 10), steps=11)
+    saved = played(segment, rollouts=3)
+    saved.state[1, :, 0, 0] = 0.5 * saved.state[0, :, 0, 0]
+    saved.state[2, :, 0, :2] = 0
+    for routes in (Polylines.of([]), Polylines.of([np.array([[-50, 0], [300, 0.0]])])):
+        goal = np.full((3, 1), len(routes) - 1)
+        found = rows(dataclasses.replace(saved, routes=routes, goal=goal))
+        assert [row["progress"] for row in found] == pytest.approx([20, 10, 0], abs=1e-4)
+        assert [row["progress_ratio"] for row in found] == pytest.approx([1, 0.5, 0], abs=1e-5)
+    # Driving across the route is no progress along it.
+    aside = played(segment)
+    aside.state[0, :, 0, :2] = aside.state[0, :, 0, 1::-1]
+    goal, routes = np.zeros((1, 1), np.int64), Polylines.of([np.array([[-50, 0], [300, 0.0]])])
+    assert rows(dataclasses.replace(aside, routes=routes, goal=goal))[0]["progress"] == pytest.approx(
+        0, abs=1e-4
+    )
+    assert found[1]["log_distance"] == pytest.approx(0.5 * 2 * np.arange(1, 11).mean(), rel=1e-5)
+
+
+def red(states: Any = SignalState.STOP, **changes: Any) -> list[tuple[int, int]]:
+    """Step and light of every red light that a car runs which comes from the south and goes straight on."""
+    segment = crossing(1, steps=31, seed=0, **changes)
+    path = np.stack([np.full(31, 1.75), -20 + np.arange(31) * 1.2], -1)
+    position = np.pad(path, ((0, 0), (0, 1)))[None].astype("f4")
+    light = np.full((12, 31), SignalState.GO, np.uint8)
+    light[0] = states
+    heading = np.full((1, 31), np.pi / 2, np.float32)
+    segment = segment.replace(position=position, heading=heading, signal_state=light)
+    saved = played(segment)
+    found = red_lights(world_of(saved, 0), np.array([0]), segment, 0)
+    return list(zip(found.step.tolist(), found.light.tolist(), strict=True))
+
+
+def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
+    # The front, 2.3 m ahead of the centre, crosses y = -12 after (20 - 2.3 - 12) / 1.2 steps.
+    assert red() == [(5, 0)]
+    assert red(SignalState.ARROW_STOP) == [(5, 0)]
+    for state in (SignalState.GO, SignalState.CAUTION, SignalState.FLASHING_STOP, SignalState.UNKNOWN):
+        assert red(state) == []
+    early = np.where(np.arange(31) < 5, SignalState.STOP, SignalState.GO)
+    assert red(early) == []
+
+
+def test_a_light_of_another_lane_is_not_the_cars() -> None:
+    """Straight on is green; left and right, from the same stop point, are red."""
+    segment = crossing(1, steps=31)
+    assert len(segment.signal_lane) == 12
+    light = np.full((12, 31), SignalState.STOP, np.uint8)
+    light[0] = SignalState.GO
+    path = np.stack([np.full(31, 1.75), -20 + np.arange(31) * 1.2], -1)
+    segment = segment.replace(
+        position=np.pad(path, ((0, 0), (0, 1)))[None].astype("f4"),
+        heading=np.full((1, 31), np.pi / 2, np.float32),
+        signal_state=light,
+    )
+    assert len(red_lights(world_of(played(segment), 0), np.array([0]), segment, 0).step) == 0
+
+
+def test_wrong_way_is_against_the_only_lane_there() -> None:
+    road = crossing_road()
+    graph = LaneGraph(road)
+    # Southern arm: up at x = 1.75, down at x = -1.75; standing is driving no way.
+    states = [
+        (1.75, np.pi / 2, 5),
+        (1.75, -np.pi / 2, 5),
+        (-1.75, np.pi / 2, 5),
+        (1.75, -np.pi / 2, 0.1),
+        (1.75, 0, 5),
+    ]
+    x, heading, speed = np.array(states).T
+    velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    position = np.stack([x, np.full(5, -60.0)], -1)
+    world = World(
+        position[:, None], heading[:, None], velocity[:, None], np.ones((5, 1), bool), np.ones((5, 2))
+    )
+    assert wrong_way(world, np.arange(5), graph)[:, 0].tolist() == [False, True, True, False, False]
+
+
+def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
+    hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="hit")
+    free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free")
+    writer = RolloutWriter(tmp_path / "sim", ABOUT)
+    writer.add(played(hit.replace(group="north"), rollouts=2))
+    writer.add(played(free.replace(group="south"), rollouts=2, failed={1: "planner raised ValueError"}))
+    writer.fail("lost", 2, "no ego")
+    folder = save_rollouts(tmp_path / "sim", ABOUT, [])
+    found = report(folder)
+    totals = found.totals()
+    assert (totals["runs"], totals["failed_runs"], totals["segments"], totals["groups"]) == (6, 3, 3, 2)
+    assert totals["collision_rate"] == pytest.approx(100 * 2 / 3)
+    # Groups of 2 and 1 runs, all and none of which collided.
+    residual = (np.array([2, 0]) - 2 / 3 * np.array([2, 1])) / 1.5
+    assert totals["collision_rate_se"] == pytest.approx(100 * np.sqrt((residual**2).sum() / 2))
+    assert [row["segment"] for row in found.worst()[:3]] == ["free", "lost", "lost"]
+    assert found.worst()[3]["at_fault_collision"]
+    assert found.breakdown() == [
+        {"kind": "into leader", "other": "vehicle", "at_fault": True, "with_playback": True, "collisions": 2}
+    ]
+    assert totals["offroad_time"] == 0
+    assert totals["max_jerk"] == pytest.approx(0, abs=1e-3)
+
+
+def test_the_ego_alone_is_judged_on_request() -> None:
+    segment = driving((-30, LANE_WIDTH, 0, 5), (0, 0, 0, 12), (10, 0, 0, 7))
+    saved = played(segment, [0, 1])
+    assert rows(saved)[0]["collision"]
+    assert not rows(saved, "ego")[0]["collision"]
+    with pytest.raises(DataError, match="ego was not driven"):
+        rows(played(segment, [1]), "ego")
+
+
+def test_runs_that_are_none_have_no_totals() -> None:
+    totals = total_numbers([])
+    assert totals["runs"] == 0
+    assert totals["collision_rate"] is None
+    assert Report("made", "interactive").csv().startswith("segment,rollout,group,failed,collision")
+
+
+def test_contacts_are_those_that_the_simulation_flagged() -> None:
+    """Of the included agent, and of the log: no collision of the flags is missing or made up."""
+    _, found = searched()
+    for saved in [*found, played(straight_road(6), [0, 1]), played(crossing(4), [0, 2])]:
+        report_ = Report("made", "interactive")
+        add_segment(report_, saved)
+        events = report_.events[saved.segment.segment_id]
+        for k in range(saved.rollouts):
+            hit = {e.agent for e in events if e.rollout == k and e.kind == "collision"}
+            assert hit == set(saved.agents[(saved.collision[k] & saved.counted[k]).any(0)].tolist())
+
+
+def test_moving_and_turning_the_world_changes_nothing() -> None:
+    segment = driving((0, 0, 0, 12), (10, 0, 0, 7), (5, LANE_WIDTH, 0, 9))
+    angle, shift = 0.7, np.array([150.0, -80, 0], np.float32)
+    turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+    def moved(points: Any) -> Any:
+        return (points @ turn + shift).astype(np.float32)
+
+    road = dataclasses.replace(
+        segment.road, lanes=Polylines(moved(segment.road.lanes.points), segment.road.lanes.offsets)
+    )
+    other = segment.replace(
+        position=moved(segment.position),
+        heading=segment.heading + np.float32(angle),
+        velocity=(segment.velocity @ turn[:2, :2]).astype(np.float32),
+        road=road,
+    )
+    one, two = rows(played(segment, [0, 1]))[0], rows(played(other, [0, 1]))[0]
+    for name, value in one.items():
+        assert two[name] == (pytest.approx(value, abs=2e-2) if isinstance(value, float) else value), name
+
+
+def test_the_command_writes_page_numbers_and_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="a&b <i>")
+    types = np.array([AgentType.VEHICLE, AgentType.CYCLIST], np.uint8)
+    free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free", agent_type=types)
+    save_rollouts(tmp_path / "sim", ABOUT, [played(hit), played(free)])
+    assert main(["report", str(tmp_path / "sim")]) == 0
+    found = json.loads((tmp_path / "sim" / "report.json").read_text())
+    wanted = {
+        "runs": 2,
+        "failed_runs": 0,
+        "collision_rate": 50.0,
+        "at_fault_collision_rate": 50.0,
+        "offroad_time": 0.0,
+    }
+    assert {name: found[name] for name in wanted} == wanted
+    assert found["progress"] == pytest.approx((12 * 4 + 7 * 4) / 2, rel=1e-4)
+    assert found["max_jerk"] == pytest.approx(0, abs=1e-3)
+    table = list(csv.DictReader(io.StringIO((tmp_path / "sim" / "report.csv").read_text())))
+    assert [row["segment"] for row in table] == ["a&b <i>", "free"]
+    page = (tmp_path / "sim" / "report.html").read_text()
+    assert "view.html#segment=a%26b+%3Ci%3E&rollout=0&t=1.2" in page
+    assert "<i>" not in page.split("<body>")[1].split("<script>")[0]
+    assert "src=" not in page
+    assert "http" not in page
+    assert (tmp_path / "sim" / "view.html").is_file()
+    assert main(["report", str(tmp_path / "sim"), "--no-view", "--out", str(tmp_path / "other")]) == 0
+    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == [
+        "report.csv",
+        "report.html",
+        "report.json",
+    ]
+    assert main(["report", str(tmp_path / "nothing")]) == 1
+    assert "no folder of rollouts" in capsys.readouterr().err

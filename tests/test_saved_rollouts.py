@@ -1,0 +1,255 @@
+"""Saved rollouts: what is read is what was written, or an error says where it is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import save
+
+from helpers_saved import AGENT, played, random_trees, searched
+from helpers_segments import crossing, segments, straight_road
+from symphony.agents import load_agent
+from symphony.config import EvaluateConfig
+from symphony.data.builtin import builtin_store
+from symphony.data.segment import Polylines, RunSegment, content_hash
+from symphony.data.store import SegmentStore
+from symphony.errors import DataError
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.saved_files import (
+    About,
+    RolloutFolder,
+    RolloutWriter,
+    load_rollouts,
+    save_rollouts,
+)
+from symphony.simulation.saved_tensors import KEY, read_tensors, tensors_of
+from symphony.simulation.saving import save_simulation
+
+ABOUT = About("made", 3, {"interactive": "made", "others": "playback"}, {"rollouts": 2}, {"checksum": "ab"})
+
+
+def assert_same(one: SavedRollouts, two: SavedRollouts) -> None:
+    assert content_hash(one.segment) == content_hash(two.segment)
+    for item in dataclasses.fields(SavedRollouts):
+        a, b = getattr(one, item.name), getattr(two, item.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+        elif isinstance(a, Polylines):
+            np.testing.assert_array_equal(a.points, b.points)
+            np.testing.assert_array_equal(a.offsets, b.offsets)
+        elif item.name == "trees" and a is not None:
+            for part in dataclasses.fields(a):
+                np.testing.assert_array_equal(getattr(a, part.name), getattr(b, part.name))
+        elif item.name != "segment":
+            assert a == b
+
+
+@settings(max_examples=40, deadline=None)
+@given(segment=segments(), rollouts=st.integers(1, 3), seed=st.integers(0, 99), data=st.data())
+def test_reading_is_the_inverse_of_writing(
+    segment: RunSegment, rollouts: int, seed: int, data: st.DataObject
+) -> None:
+    rows = data.draw(st.lists(st.integers(0, segment.num_agents - 1), unique=True, max_size=3))
+    rng = np.random.default_rng(seed)
+    routes = [rng.normal(size=(k, 2)).astype("f4") for k in (3, 5)]
+    saved = played(segment, rows, rollouts)
+    shape = saved.counted.shape
+    saved = dataclasses.replace(
+        saved,
+        state=rng.normal(0, 50, saved.state.shape).astype("f4"),
+        collision=rng.random(shape) < 0.5,
+        offroad=rng.random(shape) < 0.5,
+        counted=rng.random(shape) < 0.5,
+        goal=rng.integers(-1, 2, saved.goal.shape),
+        routes=Polylines.of(routes),
+        drivers=tuple(f"driver {row}" for row in rows),
+        failed={0: "no plan\nfound"},
+    )
+    if data.draw(st.booleans()):
+        saved = dataclasses.replace(saved, trees=random_trees(saved, seed=seed))
+    arrays, facts = tensors_of(saved)
+    bytes_ = save(arrays, {KEY: json.dumps(facts)})
+    assert_same(saved, read_tensors(bytes_, Path("x"), segment.segment_id))
+
+
+def test_a_search_is_kept_with_its_leaves_and_goals(tmp_path: Path) -> None:
+    about, found = searched()
+    folder = save_rollouts(tmp_path / "sim", about, found)
+    assert load_rollouts(tmp_path / "sim").about == about
+    assert folder.ids == [saved.segment.segment_id for saved in found]
+    for saved, again in zip(found, folder, strict=True):
+        assert_same(saved, again)
+        trees = again.trees
+        assert trees is not None
+        every, steps = trees.prune_every, np.arange(again.steps)
+        # A leaf is what its slots simulated, one period after the other.
+        for k in range(again.rollouts):
+            history = trees.state[0, trees.slots[0, steps // every, k], steps]
+            np.testing.assert_array_equal(history, again.state[k, 1:])
+        assert (trees.copies.sum(-1) == trees.parents.shape[-1]).all()
+        assert (again.goal >= 0).any()
+        first = again.routes[int(again.goal.max())][0, :2]
+        assert np.linalg.norm(again.state[:, 0, :, :2] - first, axis=-1).min() < 10
+
+
+def test_an_interrupted_folder_is_continued(tmp_path: Path) -> None:
+    found = [played(straight_road(seed=k)) for k in range(3)]
+    whole = save_rollouts(tmp_path / "whole", ABOUT, found)
+    writer = RolloutWriter(tmp_path / "cut", ABOUT)
+    writer.add(found[0])
+    writer.fail(found[1].segment.segment_id, 2, "out of memory")
+    assert [entry.failed for entry in load_rollouts(tmp_path / "cut").failures] == ["out of memory"]
+    with (tmp_path / "cut" / "index.jsonl").open("a") as index:
+        index.write('{"segment": "straight-2", "roll')
+    again = save_rollouts(tmp_path / "cut", ABOUT, found)
+    assert sorted(again.ids) == sorted(whole.ids)
+    assert again.failures == []
+    for name in whole.ids:
+        assert_same(whole.of(name), again.of(name))
+    with pytest.raises(DataError, match="there already"):
+        RolloutWriter(tmp_path / "cut", ABOUT).add(found[0])
+
+
+def test_another_simulation_or_folder_is_refused(tmp_path: Path) -> None:
+    save_rollouts(tmp_path / "sim", ABOUT, [played(straight_road())])
+    with pytest.raises(DataError, match="another simulation, which differs in seed"):
+        RolloutWriter(tmp_path / "sim", dataclasses.replace(ABOUT, seed=4))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("mine")
+    with pytest.raises(DataError, match="refusing"):
+        RolloutWriter(tmp_path / "other", ABOUT)
+    with pytest.raises(DataError, match="no folder of rollouts"):
+        load_rollouts(tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", ["..", "a b", "Ü" * 190, ".hidden", "a%2Fb", "x" * 200])
+def test_any_name_of_a_segment_is_a_file_of_the_folder(name: str, tmp_path: Path) -> None:
+    folder = save_rollouts(tmp_path / "sim", ABOUT, [played(straight_road(segment_id=name))])
+    assert (tmp_path / "sim" / folder.entries[0].file).resolve().parent == tmp_path / "sim" / "segments"
+    assert folder[0].segment.segment_id == name
+
+
+def changed(field: str, change: Any) -> bytes:
+    saved = played(crossing(3, steps=9), (0, 1), 2)
+    saved = dataclasses.replace(saved, trees=random_trees(saved))
+    arrays, facts = tensors_of(saved)
+    if field in facts:
+        facts[field] = change
+    elif change is None:
+        del arrays[field]
+    else:
+        arrays[field] = np.ascontiguousarray(change(arrays[field].copy()))
+    return save(arrays, {KEY: json.dumps(facts)})
+
+
+def put(value: Any) -> Any:
+    def change(array: Any) -> Any:
+        array.reshape(-1)[-1] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "message"),
+    [
+        ("state", None, "missing"),
+        ("state", put(np.nan), "not finite"),
+        ("state", lambda a: a.astype("f8"), "dtype"),
+        ("state", lambda a: a[:, :-1], "states for"),
+        ("counted", lambda a: a[..., :1], "expected"),
+        ("agents", put(3), "outside"),
+        ("agents", put(0), "twice"),
+        ("goal", put(0), "outside"),
+        ("start", 1, "outside"),
+        ("start", "0", "wrong type"),
+        ("drivers", ["one"], "agents"),
+        ("failed", {"2": "why"}, "outside"),
+        ("log.valid", None, "missing"),
+        ("log.position", put(np.inf), "not finite"),
+        ("road.successors", lambda a: a[:, :1], "shape"),
+        ("road.lanes.offsets", put(0), "offsets"),
+        ("tree.score", put(np.inf), "infinite"),
+        ("tree.parents", put(9), "outside"),
+        ("tree.slots", lambda a: a[..., :1], "not 2 rollouts"),
+        ("prune_every", 3, "periods"),
+        ("dt", 0.0, "positive"),
+    ],
+)
+def test_what_breaks_the_format_is_named(field: str, change: Any, message: str) -> None:
+    with pytest.raises(DataError, match=message) as caught:
+        read_tensors(changed(field, change), Path("sim/file"), "crossing-0")
+    error = caught.value
+    assert str(error.file) == "sim/file"
+    assert error.segment == "crossing-0"
+    assert error.field is not None
+    assert field.removeprefix("log.").removesuffix(".offsets") in error.field or field == "prune_every"
+
+
+def test_what_breaks_the_format_is_not_written(tmp_path: Path) -> None:
+    saved = played(straight_road())
+    saved.state[0, 3] = np.nan
+    with pytest.raises(DataError, match="not finite"):
+        save_rollouts(tmp_path / "sim", ABOUT, [saved])
+    assert len(load_rollouts(tmp_path / "sim")) == 0
+
+
+def test_damage_is_found_and_named(tmp_path: Path) -> None:
+    folder = save_rollouts(tmp_path / "sim", ABOUT, [played(straight_road(seed=k)) for k in range(3)])
+    files = [tmp_path / "sim" / entry.file for entry in folder.entries]
+    data = bytearray(files[0].read_bytes())
+    data[-5] ^= 1
+    files[0].write_bytes(data)
+    files[1].write_bytes(files[1].read_bytes()[:-100])
+    files[2].unlink()
+    for k, message in enumerate(["damaged", "damaged", "can't be read"]):
+        with pytest.raises(DataError, match=message) as caught:
+            RolloutFolder(tmp_path / "sim")[k]
+        assert caught.value.file == files[k]
+        assert caught.value.segment == f"straight-{k}"
+    (tmp_path / "sim" / "index.jsonl").write_text('{"segment": 3}\n')
+    with pytest.raises(DataError, match="line 1"):
+        load_rollouts(tmp_path / "sim")
+    (tmp_path / "sim" / "manifest.json").write_text('{"format": 9}')
+    with pytest.raises(DataError, match="format 1"):
+        load_rollouts(tmp_path / "sim")
+
+
+def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path: Path) -> None:
+    agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
+
+    def dataset(count: int) -> SceneDataset:
+        return SceneDataset(store, agent.interactive, agent.dynamics, range(count), routes=True, duration=2)
+
+    config = EvaluateConfig(rollouts=2, branches=4, batch=2)
+    done: list[tuple[int, int]] = []
+    save_simulation(tmp_path / "cut", agent, dataset(1), config)
+    cut = save_simulation(
+        tmp_path / "cut",
+        agent,
+        dataset(3),
+        dataclasses.replace(config, batch=3),
+        progress=lambda *at: done.append(at),
+    )
+    whole = save_simulation(tmp_path / "whole", agent, dataset(3), config)
+    assert done == [(3, 3)]
+    assert cut.ids == whole.ids == store.ids[:3]
+    for one, two in zip(cut, whole, strict=True):
+        assert_same(one, two)
+        assert one.trees is not None
+        assert one.drivers == (AGENT, AGENT)
+    log = save_simulation(tmp_path / "log", load_agent("playback"), dataset(1), config)
+    np.testing.assert_allclose(log[0].state[0, :, 0, :2], store[0].position[log[0].agents[0], :11, :2])
+    assert log[0].drivers == ("playback", "playback")
+    bare = save_simulation(tmp_path / "bare", agent, dataset(1), config, keep_tree=False)
+    assert bare[0].trees is None
+    np.testing.assert_array_equal(bare[0].state, whole[0].state)

@@ -1,0 +1,253 @@
+"""The page that plays saved rollouts: it holds the right numbers, loads nothing, and works in a browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from helpers_saved import played, random_trees, searched
+from helpers_segments import crossing, hide, random_segment, straight_road
+from symphony.cli import main
+from symphony.evaluation.report import Report, add_segment
+from symphony.render.viewer import Event, packed, unpacked, view_page
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.saved_files import About, save_rollouts
+
+ABOUT = About("made", settings={"note": "</script><b>"})
+
+
+def blocks(page: str) -> list[str]:
+    return re.findall(r'<script type="text/plain" id="segment-\d+">([^<]*)</script>', page)
+
+
+def pages() -> list[SavedRollouts]:
+    tracks = hide(crossing(5, steps=21), 3, slice(4, 9))
+    turned = tracks.replace(heading=tracks.heading + np.float32(4 * np.pi))
+    saved = played(turned, [0, 2], 3, failed={2: "broke <b>off</b>"})
+    saved = dataclasses.replace(saved, trees=random_trees(saved, branches=5))
+    lost = random_segment("odd name", seed=3, agents=4, steps=6, lights=2, marks=3)
+    return [saved, played(straight_road(2)), played(lost, [1])]
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_a_packed_segment_holds_its_numbers(number: int) -> None:
+    saved = pages()[number]
+    event = Event(0, 3, 0, "collision", "into leader", 1, True, "collision")
+    facts, arrays = unpacked(packed(saved, [event]))
+    segment, there = saved.segment, np.concatenate([saved.counted[:, :1], saved.counted], 1)
+    assert facts["id"] == segment.segment_id
+    assert (facts["rollouts"], facts["steps"], facts["dt"]) == (saved.rollouts, saved.steps, segment.dt)
+    assert facts["ids"] == [str(i) for i in segment.agent_id]
+    assert facts["events"] == [dataclasses.asdict(event)]
+    np.testing.assert_array_equal(arrays["sim.valid"].swapaxes(1, 2), there)
+    np.testing.assert_array_equal(arrays["log.valid"], segment.valid)
+    np.testing.assert_array_equal(arrays["lights.state"], segment.signal_state)
+    np.testing.assert_array_equal(arrays["goal"], saved.goal)
+    for axis, letter in enumerate("xy"):
+        near = {"rtol": 0, "atol": 0.0006}
+        state = np.where(there, saved.state[..., axis], 0).swapaxes(1, 2)
+        np.testing.assert_allclose(arrays[f"sim.{letter}"], state, **near)
+        np.testing.assert_allclose(arrays[f"log.{letter}"], segment.position[..., axis], **near)
+        for name in ("lanes", "boundary", "marks"):
+            lines = getattr(segment.road, name)
+            np.testing.assert_allclose(arrays[f"{name}.{letter}"], lines.points[:, axis], **near)
+            np.testing.assert_array_equal(arrays[f"{name}.offsets"], lines.offsets)
+    turn = np.where(there, saved.state[..., 2], 0).swapaxes(1, 2) - arrays["sim.h"]
+    np.testing.assert_allclose(np.cos(turn), 1, atol=1e-7)
+    np.testing.assert_allclose(arrays["size"], segment.size[:, :2], atol=0.006)
+    if saved.trees is not None:
+        np.testing.assert_allclose(arrays["tree.x"].swapaxes(2, 3), saved.trees.state[..., 0], atol=6e-4)
+        np.testing.assert_array_equal(arrays["tree.totals"], saved.trees.totals)
+        np.testing.assert_array_equal(arrays["tree.parents"], saved.trees.parents)
+
+
+def test_damaged_text_is_refused() -> None:
+    text = packed(pages()[1])
+    for damaged in (text[:-8], "?" + text, ""):
+        with pytest.raises(ValueError, match="packed"):
+            unpacked(damaged)
+
+
+def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:
+    found = pages()
+    save_rollouts(tmp_path / "sim", ABOUT, found)
+    assert main(["view", str(tmp_path / "sim")]) == 0
+    page = (tmp_path / "sim" / "view.html").read_text(encoding="utf-8")
+    assert [unpacked(block)[0]["id"] for block in blocks(page)] == [s.segment.segment_id for s in found]
+    about = re.search(r'<script type="application/json" id="about">(.*?)</script>', page)
+    assert about is not None
+    assert json.loads(about[1])["settings"] == {"note": "</script><b>"}
+    assert "http" not in re.sub(r'id="segment-\d+">[^<]*', "", page)
+    assert not re.search(r"\b(src|href)\s*=|@import|url\(|fetch\(|XMLHttpRequest|import\(", page)
+    assert "/*" not in re.sub(r"/\*.*?\*/", "", page, flags=re.S)
+
+
+def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_rollouts(tmp_path / "sim", ABOUT, pages()[:2])
+    sim, page = str(tmp_path / "sim"), tmp_path / "one.html"
+    assert main(["view", sim, "--segments", "straight-0", "--out", str(page)]) == 0
+    assert [unpacked(block)[0]["id"] for block in blocks(page.read_text())] == ["straight-0"]
+    for name in ("a.png", "a.gif"):
+        assert main(["view", sim, "--out", str(tmp_path / name)]) == 0
+        with Image.open(tmp_path / name) as image:
+            assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 50)
+    assert main(["view", sim, "--out", str(tmp_path / "a.doc")]) == 1
+    assert ".mp4" in capsys.readouterr().err
+    assert main(["view", sim, "--segments", "nothing"]) == 1
+    assert "no rollouts of this segment" in capsys.readouterr().err
+
+
+def test_a_film_needs_its_encoder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_rollouts(tmp_path / "sim", ABOUT, pages()[1:2])
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    assert main(["view", str(tmp_path / "sim"), "--out", str(tmp_path / "a.mp4")]) == 1
+    assert "symphony-traffic[video]" in capsys.readouterr().err
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_a_film_is_written(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    save_rollouts(tmp_path / "sim", ABOUT, [played(straight_road(2, steps=6))])
+    assert main(["view", str(tmp_path / "sim"), "--out", str(tmp_path / "a.mp4")]) == 0
+    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+# In a browser.
+
+
+@lru_cache
+def chromium() -> str:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip("no Chromium is installed")
+    return found
+
+
+def browse(page: Path, *options: str, place: str = "") -> str:
+    """What a browser without a network makes of a page."""
+    options = (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+        "--window-size=1200,800",
+        "--host-resolver-rules=MAP * ~NOTFOUND",
+        f"--user-data-dir={page.parent / 'profile'}",
+        *options,
+    )
+    done = subprocess.run(
+        [chromium(), *options, page.as_uri() + place], capture_output=True, text=True, check=True, timeout=120
+    )
+    return done.stdout
+
+
+def driven_page(tmp_path: Path, script: str, found: list[SavedRollouts]) -> str:
+    """The page's text after it was ready and a script, the body of an async function, wrote to its title."""
+    report = Report("made", "interactive")
+    for saved in found:
+        add_segment(report, saved)
+    page = view_page("made <i>", [(saved, report.events[saved.segment.segment_id]) for saved in found])
+    test = """<script>(async () => {
+      const wait = () => new Promise(done => setTimeout(done, 50));
+      while (!document.body.dataset.ready) await wait();
+      const out = {};
+      try { %s } catch (error) { out.error = String(error.stack); }
+      document.body.dataset.out = JSON.stringify(out);
+    })();</script>"""
+    file = tmp_path / "page.html"
+    file.write_text(page.replace("</body>", test % script + "</body>"), encoding="utf-8")
+    dom = browse(file, "--virtual-time-budget=8000", "--dump-dom")
+    out = re.search(r'data-out="([^"]*)"', dom)
+    assert out is not None, dom[-3000:]
+    return out[1].replace("&quot;", '"')
+
+
+def crash() -> SavedRollouts:
+    """Agent 0 runs into agent 1 after 2 s in rollout 1."""
+    segment = straight_road(2, steps=31, num_lanes=1)
+    saved = played(segment, [0], 2)
+    ahead = segment.position[1, :, 0] - 4
+    saved.state[1, 10:, 0, 0] = ahead[10:]
+    saved.state[1, :10, 0, 0] = np.linspace(saved.state[1, 0, 0, 0], ahead[9] - 2, 10)
+    return saved
+
+
+@pytest.mark.slow
+def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
+    saved = crash()
+    _, (tree, *_) = searched()
+    script = """
+      const r = scene.replay, n = 0;
+      out.segments = Array.from($("segment").options, o => o.textContent);
+      out.notes = Array.from($("rollout").options, o => o.textContent);
+      out.x = Array.from(r["sim.x"]); out.h = Array.from(r["sim.h"]);
+      choose(1); out.events = $("events").textContent;
+      document.querySelector("#events li").click(); frame(0);
+      out.jumped = view.t; out.agent = view.agent; out.who = $("who").textContent; out.hash = location.hash;
+      seek(4.5); out.between = r.simulated(0, 0, 4.5).x;
+      const before = camera.scale; zoomBy(2); out.zoomed = camera.scale / before;
+      play(true); for (let i = 0; i < 6; i++) { frame(1000 + 100 * i); } out.played = view.t; play(false);
+      view.follow = 0; dirty = true; frame(0); out.followed = [camera.x, r.simulated(1, 0, view.t).x];
+      const there = r.logged(1, view.t), at = camera.toScreen(there.x, there.y);
+      out.picked = scene.pick(view, ...camera.toWorld(...at));
+      const maps = scene.map.drawn;
+      for (let i = 0; i < 20; i++) { seek(i / 2); frame(0); }
+      out.redrawn = scene.map.drawn - maps;
+      await open(1); out.periods = search.periods;
+      out.fates = Array.from({length: search.branches}, (_, s) => search.fate(0, 0, s)[0]);
+      out.history = search.history(0, search.periods - 1, search.slot(0, search.periods - 1, 0));
+      const box = $("tree").getBoundingClientRect(), l = search.layout();
+      const where = { clientX: box.left + l.left + 2, clientY: box.top + l.top + 2, bubbles: true };
+      $("tree").dispatchEvent(new MouseEvent("click", where));
+      out.branch = $("branch").textContent;
+    """
+    out = json.loads(driven_page(tmp_path, script, [saved, tree]))
+    assert "error" not in out
+    assert out["segments"] == [saved.segment.segment_id, tree.segment.segment_id]
+    assert out["notes"] == ["0", "1 · collision, at fault"]
+    np.testing.assert_allclose(out["x"], saved.state[..., 0, 0].ravel(), atol=6e-4)
+    np.testing.assert_allclose(out["h"], saved.state[..., 0, 2].ravel(), atol=6e-5)
+    assert "2.0 s" in out["events"]
+    assert "into leader at fault" in out["events"]
+    assert (out["jumped"], out["agent"]) == (10, 0)
+    assert "vehicle" in out["who"]
+    assert "rollout=1" in out["hash"]
+    assert out["between"] == pytest.approx(saved.state[0, 4:6, 0, 0].mean(), abs=1e-3)
+    assert out["zoomed"] == pytest.approx(2)
+    # Half a second at 5 Hz.
+    assert out["played"] == pytest.approx(4.5 + 2.5)
+    assert out["followed"][0] == pytest.approx(out["followed"][1])
+    assert out["picked"] == 1
+    assert out["redrawn"] <= 6
+    trees = tree.trees
+    assert trees is not None
+    assert out["periods"] == trees.parents.shape[1]
+    kept, went_on = trees.reaches_leaf[0, 0], trees.copies[0, 0] > 0
+    fates = np.where(kept, "kept", np.where(went_on, "died out", "pruned"))
+    assert out["fates"] == fates.tolist()
+    assert out["history"] == trees.slots[0, np.arange(tree.steps) // trees.prune_every, 0].tolist()
+    assert out["branch"].startswith("Branch 0, 0.0–")
+
+
+@pytest.mark.slow
+def test_what_is_drawn_is_seen(tmp_path: Path) -> None:
+    save_rollouts(tmp_path / "sim", ABOUT, [crash()])
+    assert main(["view", str(tmp_path / "sim")]) == 0
+    shot = tmp_path / "shot.png"
+    page = tmp_path / "sim" / "view.html"
+    browse(page, f"--screenshot={shot}", "--timeout=2500", place="#rollout=1&t=2.4")
+    with Image.open(shot) as image:
+        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
+    for color in ((0x00, 0x72, 0xB2), (0xA9, 0xAE, 0xB5), (0xB3, 0x12, 0x2B), (0xF3, 0xF1, 0xEC)):
+        assert (np.abs(pixels.astype(int) - color).max(-1) < 6).sum() > 40, color
