@@ -42,7 +42,11 @@ class Simulate:
         from symphony.simulation.demonstrations import SceneDataset
         from symphony.simulation.saving import save_simulation
 
-        agent, store, config = load_agent(self.agent, self.config.device), SegmentStore(self.data), self.config
+        agent, store, config = (
+            load_agent(self.agent, self.config.device),
+            SegmentStore(self.data),
+            self.config,
+        )
         chosen = [segment_index(store, name) for name in self.segments]
         dataset = SceneDataset(
             store,

@@ -183,7 +183,11 @@ def evaluate_dataset(
             _add(evaluation, dataset, items, scenes, simulated.rollouts, own)
             if observe is not None and one is agent:
                 segments = [dataset.segment(i) for i in items]
-                observe(EvaluatedBatch(items, segments, scenes.cpu(), simulated.rollouts.cpu(), simulated.goal.cpu()))
+                observe(
+                    EvaluatedBatch(
+                        items, segments, scenes.cpu(), simulated.rollouts.cpu(), simulated.goal.cpu()
+                    )
+                )
         if progress is not None:
             progress(items[-1] + 1, len(dataset))
     found = [dataclasses.replace(one, seconds=spent) for one, spent in zip(found, seconds, strict=True)]

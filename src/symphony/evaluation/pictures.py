@@ -19,9 +19,9 @@ from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.rollouts import Rollouts, start_states
 from symphony.simulation.saved import saved_rollouts
 from symphony.simulation.saved_files import RolloutWriter
-from symphony.simulation.rollouts import Rollouts, start_states
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
 PANELS = 6

@@ -48,7 +48,13 @@ def save_simulation(
         NotFiniteError: a network of the agent puts out a number that is not finite.
     """
     writer = RolloutWriter(
-        path, About.of(agent.name, dataset.store, plain_settings(config, dataset.interactive, dataset.duration), seed=config.seed)
+        path,
+        About.of(
+            agent.name,
+            dataset.store,
+            plain_settings(config, dataset.interactive, dataset.duration),
+            seed=config.seed,
+        ),
     )
     names = [dataset.store.ids[i] for i in dataset.indices]
     todo = [i for i, name in enumerate(names) if not writer.has(name)]
