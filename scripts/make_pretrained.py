@@ -326,7 +326,7 @@ def _scores(name: str, record: dict[str, Any] | None) -> str:
             "",
             f"{record['segments']} run segments of `{standard[0] if standard else test}` (checksum "
             f"`{data['checksum']}`), {how['interactive']} interactive agents each; per segment "
-            f"{ways[how['search']]}; ± standard error over segments; seed {how['seed']}.",
+            f"{ways[how['search']]}; ± standard error over recordings; seed {how['seed']}.",
         ]
     )
 

@@ -22,7 +22,11 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+from torch.utils.backend_registration import (
+    _DummyBackendModule,
+    _DummyPrivateUse1Hook,
+    _setup_privateuseone_for_python_backend,
+)
 
 from symphony.envs import DrivingEnv
 from symphony.geometry import constants
@@ -65,6 +69,10 @@ class _Backend(_DummyBackendModule):
 
     pretended: PretendDevice | None = None
 
+    def is_available(self) -> bool:
+        # Whatever else runs in this process must not find it.
+        return self.pretended is not None
+
     def synchronize(self, *_: Any) -> None:
         if self.pretended is not None:
             self.pretended.waits.append("synchronize")
@@ -73,16 +81,20 @@ class _Backend(_DummyBackendModule):
 BACKEND = _Backend()
 
 
-def _name_the_device() -> None:
-    if torch._C._get_privateuse1_backend_name() != NAME:
-        # Without it PyTorch knows the device, but can't index its tensors.
-        _setup_privateuseone_for_python_backend(NAME, BACKEND)
+class _Hook(_DummyPrivateUse1Hook):
+    def is_available(self) -> bool:
+        return BACKEND.is_available()
+
+
+# Without it PyTorch knows the device, but can't index its tensors. At once, because autograd counts the devices when
+# it first runs in a process.
+if torch._C._get_privateuse1_backend_name() != NAME:
+    _setup_privateuseone_for_python_backend(NAME, BACKEND, _Hook())
 
 
 @contextmanager
 def pretend() -> Iterator[PretendDevice]:
     """Everything made inside is without numbers; what is made on the device is noted to be there."""
-    _name_the_device()
     BACKEND.pretended = device = PretendDevice()
     # Constants without numbers must not be found by what runs later, nor those with numbers by what runs here.
     constants.made.cache_clear()

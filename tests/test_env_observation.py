@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
 import pytest
@@ -90,3 +92,16 @@ def test_tables_follow_the_scenes() -> None:
     one.scenes = two.scenes
     for env in (one, two):
         assert (env.start(torch.tensor([0, 1])) == fresh.start(torch.tensor([0, 1]))).all()
+
+
+@pytest.mark.filterwarnings("ignore:The method <bound method TensorDictBase.__deepcopy__")
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])  # noqa: S301 - our own
+def test_copies_simulate_the_same(copied: Any) -> None:
+    env = make_env(EVERYTHING)
+    start = env.start(torch.tensor([0, 1])).set(keys.ACTION, torch.full((2, 2), 80))
+    after = env.step(start.clone())["next"]
+    twin = copied(env)
+    assert (twin.step(start.clone())["next"] == after).all()
+    kept = [made._kept() for made in (env, twin)]
+    assert kept[0] is not kept[1]
+    assert kept[1].scenes is twin.scenes

@@ -26,6 +26,7 @@ from symphony.cli import (
     plot,
     profiles,
     report,
+    simulate,
     table,
     train,
     view,
@@ -50,6 +51,7 @@ app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="table")(table.Table)
 app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
+app.command(name="simulate")(simulate.Simulate)
 app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)

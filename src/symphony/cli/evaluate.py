@@ -36,6 +36,8 @@ class Evaluate:
     """File to write all numbers to, those of every run segment included."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
+    save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder to keep the very rollouts in that are evaluated (see `symphony view`, `report` and `export`)."""
     keep: bool = True
     """Leave the folder of the run as it is."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -44,15 +46,27 @@ class Evaluate:
         """Evaluate, print the numbers and write them."""
         from symphony.agents import load_agent
         from symphony.data.store import SegmentStore
-        from symphony.evaluation.pictures import PANELS, ClipKeeper, check_picture, draw_clips
+        from symphony.evaluation.pictures import PANELS, ClipKeeper, RolloutKeeper, check_picture, draw_clips
         from symphony.evaluation.records import evaluation_record, keep_evaluation
         from symphony.simulation.demonstrations import evenly_spaced
+        from symphony.simulation.saved_files import About, RolloutWriter
+        from symphony.simulation.saving import plain_settings
 
         if self.figure is not None:
             check_picture(self.figure)
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
-        found = evaluate_with_bar(agent, store, self.config, observe=clips, baselines=True)
+        keepers: list[Callable[[EvaluatedBatch], None]] = [clips]
+        if self.save_rollouts is not None:
+            settings = plain_settings(self.config, agent.interactive, agent.duration)
+            about = About.of(agent.name, store, settings, seed=self.config.seed)
+            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name))
+
+        def observe(batch: EvaluatedBatch) -> None:
+            for keeper in keepers:
+                keeper(batch)
+
+        found = evaluate_with_bar(agent, store, self.config, observe=observe, baselines=True)
         print_evaluation(found, self.data)
         record = evaluation_record(agent, found, store)
         if self.keep:

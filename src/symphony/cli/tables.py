@@ -11,7 +11,7 @@ COLUMNS = (
     ("offroad_time", "off-road\n%", 1),
     ("ade", "ADE\nm", 2),
     ("min_sade", "minSADE\nm", 2),
-    ("curvature_jsd", "curvature\nJSD nats", 3),
+    ("curvature_jsd", "JSD\nnats", 3),
 )
 
 KINDS = (

@@ -38,6 +38,10 @@ class Tables:
     def __init__(self, scenes: SceneBatch, config: ObservationConfig) -> None:
         self.scenes, self.config = scenes, config
 
+    def __reduce__(self) -> tuple[type[Tables], tuple[SceneBatch, ObservationConfig]]:
+        # A copy, or what travels to another process, makes its own when it needs them.
+        return Tables, (self.scenes, self.config)
+
     @cached_property
     def points(self) -> Tensor:
         """[B * P, 23] a point's features, with its position and direction in the frame of the world, in metres, in

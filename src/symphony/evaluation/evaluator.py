@@ -42,12 +42,14 @@ class EvaluatedBatch(NamedTuple):
         segments: the run segments.
         scenes: B scenes, on the CPU.
         rollouts: [B, K, ...], on the CPU.
+        goal: [B, K, N] number of the route that each agent followed, -1 for none.
     """
 
     items: list[int]
     segments: list[RunSegment]
     scenes: SceneBatch
     rollouts: Rollouts
+    goal: Tensor
 
 
 @dataclass(frozen=True)
@@ -174,14 +176,18 @@ def evaluate_dataset(
         for k, (one, evaluation) in enumerate(zip(everyone, found, strict=True)):
             began = time.process_time()
             try:
-                rollouts = driven_by(one, scenes, evaluation.config)
+                simulated = driven_by(one, scenes, evaluation.config)
             except NotFiniteError as error:
                 raise error.named(dataset.segment(items[error.row]).segment_id) from error
             seconds[k] += time.process_time() - began
-            _add(evaluation, dataset, items, scenes, rollouts, own)
+            _add(evaluation, dataset, items, scenes, simulated.rollouts, own)
             if observe is not None and one is agent:
                 segments = [dataset.segment(i) for i in items]
-                observe(EvaluatedBatch(items, segments, scenes.cpu(), rollouts.cpu()))
+                observe(
+                    EvaluatedBatch(
+                        items, segments, scenes.cpu(), simulated.rollouts.cpu(), simulated.goal.cpu()
+                    )
+                )
         if progress is not None:
             progress(items[-1] + 1, len(dataset))
     found = [dataclasses.replace(one, seconds=spent) for one, spent in zip(found, seconds, strict=True)]

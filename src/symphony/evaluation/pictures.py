@@ -20,12 +20,36 @@ from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.rollouts import Rollouts, start_states
+from symphony.simulation.saved import saved_rollouts
+from symphony.simulation.saved_files import RolloutWriter
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
 PANELS = 6
 """Run segments in one picture."""
 SHOWN = 8
 """Rollouts drawn per run segment."""
+
+
+class RolloutKeeper:
+    """Saves rollouts while they are evaluated; see the evaluator's ``observe``.
+
+    Args:
+        writer: of the folder.
+        driver: name of the agent.
+    """
+
+    def __init__(self, writer: RolloutWriter, driver: str) -> None:
+        self.writer, self.driver = writer, driver
+
+    def __call__(self, batch: EvaluatedBatch) -> None:
+        """Save a batch, but for segments that are there already."""
+        for row, segment in enumerate(batch.segments):
+            if not self.writer.has(segment.segment_id):
+                self.writer.add(
+                    saved_rollouts(
+                        segment, batch.scenes, batch.rollouts, row, goal=batch.goal, driver=self.driver
+                    )
+                )
 
 
 class ClipKeeper:

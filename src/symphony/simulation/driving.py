@@ -147,9 +147,14 @@ def _branches(part: Tensor, order: Tensor) -> Tensor:
     return part.gather(2, index)
 
 
-def driven_by(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
-    """What an agent does [B, K, ...]: :func:`playback` of the log, or :func:`simulated`."""
-    return playback(scenes) if agent.policy is None else simulated(agent, scenes, config)
+def driven_by(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, *, keep_tree: bool = False
+) -> Simulation:
+    """What an agent does: :func:`playback` of the log, or a :func:`simulation`."""
+    if agent.policy is not None:
+        return simulation(agent, scenes, config, keep_tree=keep_tree)
+    found = playback(scenes)
+    return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:

@@ -109,7 +109,7 @@ class SearchReplay:
         """First states [K] of survivors, with the random numbers that lead along their histories (``noise_plan``)."""
         first = self.found[..., 0].flatten()
         pick = torch.randperm(len(first), generator=rng)[:count]
-        return self.env.at(first[pick]).set("noise_plan", self.found.get(keys.NOISE).flatten(0, 1)[pick])
+        return self.env.at(first[pick]).set(keys.NOISE_PLAN, self.found.get(keys.NOISE).flatten(0, 1)[pick])
 
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
         scenes = self.env.scenes

@@ -11,9 +11,8 @@ import torch
 
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
-from symphony.envs.scene import SceneBatch
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import Simulation, playback, simulation
+from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.saved import PLAYBACK, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
@@ -49,7 +48,13 @@ def save_simulation(
         NotFiniteError: a network of the agent puts out a number that is not finite.
     """
     writer = RolloutWriter(
-        path, About.of(agent.name, dataset.store, _settings(config, dataset), seed=config.seed)
+        path,
+        About.of(
+            agent.name,
+            dataset.store,
+            plain_settings(config, dataset.interactive, dataset.duration),
+            seed=config.seed,
+        ),
     )
     names = [dataset.store.ids[i] for i in dataset.indices]
     todo = [i for i, name in enumerate(names) if not writer.has(name)]
@@ -58,7 +63,7 @@ def save_simulation(
         items = todo[first : first + config.batch]
         scenes = dataset.scenes(items).to(torch.device(config.device))
         try:
-            found = _simulation(agent, scenes, config, keep_tree)
+            found = driven_by(agent, scenes, config, keep_tree=keep_tree)
         except NotFiniteError as error:
             raise error.named(names[items[error.row]]) from error
         tree = found.search if keep_tree else None
@@ -73,15 +78,8 @@ def save_simulation(
     return RolloutFolder(path)
 
 
-def _settings(config: EvaluateConfig, dataset: SceneDataset) -> dict[str, Any]:
-    """Those that change what is simulated."""
+def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:
+    """Settings that change what is simulated, with the agent's own where the configuration leaves them to it."""
     found = dataclasses.asdict(config)
-    found |= {"interactive": dataset.interactive, "duration": dataset.duration}
+    found |= {"interactive": config.interactive or interactive, "duration": config.duration or duration}
     return {name: value for name, value in found.items() if name not in _MEMORY}
-
-
-def _simulation(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, keep_tree: bool) -> Simulation:
-    if agent.policy is not None:
-        return simulation(agent, scenes, config, keep_tree=keep_tree)
-    found = playback(scenes)
-    return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
