@@ -53,6 +53,7 @@ lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, f
 bench: $(DEV)  ## speed of simulation and search, in CPU time of one thread
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks/test_simulation_benchmark.py --benchmark-timer=time.process_time \
 		--benchmark-columns=median,iqr,rounds --benchmark-sort=name --benchmark-disable-gc
+
 docs: $(DEV)  ## build the pages of docs/ into out/site; broken links are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
