@@ -430,6 +430,8 @@ CHANGES: dict[str, Any] = {
     "interactive": 8,
     "prune_every": 2,
     "temperature": 0.6,
+    "threshold": 2.0,
+    "goals": "branch",
     "retries": 1,
     "retry_above": 2.0,
     "metric": ["my.metrics:jerk"],

@@ -14,7 +14,7 @@ from symphony.keys import OBJECTS, OWN
 ActionSpace = Literal["bicycle", "displacement"]
 Features = Literal["clearance", "paper", "foresight"]
 Survivors = Literal["all", "best"]
-RULES = ("best", "systematic")
+RULES = ("best", "systematic", "replace")
 AGGREGATES = ("max_then_sum", "mean_then_sum")
 
 
@@ -97,12 +97,15 @@ class SearchConfig:
     """Steps between prunings (T_p; 10 in the paper)."""
     rule: str = "systematic"
     """`best`: the better share of the branches survives (the paper); `systematic`: every branch gets copies in
-    proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings; or the
+    proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings; `replace`:
+    only branches above `threshold` make room, for copies of others, of the same goals where there are any; or the
     import path of a pruning rule of your own."""
     keep: float = 0.5
     """Share of the branches that survives a pruning with rule `best`."""
     temperature: float = 0.6
     """Of rule `systematic`: the lower, the stricter."""
+    threshold: float = 1.0
+    """Of rule `replace`: the highest total, in logits of the discriminator, that a branch goes on with."""
     aggregate: str = "max_then_sum"
     """From scores of steps and agents to one per branch: `max_then_sum` (the paper), `mean_then_sum`, or the import
     path of a function of your own."""

@@ -11,6 +11,7 @@ from symphony.config.checks import not_negative, one_of, positive
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "oracle", "best"]
+Goals = Literal["tree", "branch"]
 Setting = Literal["main", "long", "many"]
 """Of the paper's tables: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
 PaperData = Literal["proprietary", "womd"]
@@ -37,6 +38,10 @@ class EvaluateConfig:
     """Steps between prunings; 0: as the agent was trained."""
     temperature: float = 0.0
     """Of rule `systematic`; 0: as the agent was trained."""
+    threshold: float | None = None
+    """Of rule `replace`; by default as the agent was trained."""
+    goals: Goals = "tree"
+    """Who draws goals together: all branches of a `tree`, or each `branch` alone."""
     retries: int = 0
     """How often the steps between two prunings are simulated again for branches that end them with a score above
     `retry-above` (each time costs as much as the whole search)."""
@@ -59,6 +64,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         one_of(self, "search", get_args(Search))
+        one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         positive(self, "rollouts", "batch", "trees")
         if self.rollouts % self.trees:
@@ -75,4 +81,5 @@ class EvaluateConfig:
             rule=trained.rule if self.rule == "agent" else self.rule,
             prune_every=self.prune_every or trained.prune_every,
             temperature=self.temperature or trained.temperature,
+            threshold=trained.threshold if self.threshold is None else self.threshold,
         )

@@ -103,6 +103,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "rule": "",
         "prune_every": 0,
         "temperature": 0.0,
+        "threshold": None,
         "retries": 0,
         "retry_above": 0.0,
     }
@@ -113,6 +114,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         used = config.pruning(settings)
         filled["rule"], filled["prune_every"] = used.rule, used.prune_every
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
+        filled["threshold"] = used.threshold if used.rule == "replace" else None
         filled["retries"] = config.retries
         filled["retry_above"] = config.retry_above if config.retries else 0.0
     return {name: value for name, value in filled.items() if name not in _MEMORY}

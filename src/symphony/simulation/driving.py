@@ -77,8 +77,9 @@ def simulation(
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
+        goals_per=config.goals,
     )
-    result = None
+    result, goal = None, start.get(keys.GOAL)
     if search_kind(agent, config) == "none":
         policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor)
         found = simulate(env, policy, start)
@@ -104,12 +105,15 @@ def simulation(
                 keep_tree=keep_tree and not best,
             )
         found = rollouts_of(env, start, result.trajectories)
+        # A copy of a branch follows the goals of its parent.
+        goal = result.trajectories.get(keys.GOAL)[..., -1, :]
         if best:
             order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
             found, result = Rollouts(*(_branches(part, order) for part in found)), None
+            goal = _branches(goal, order)
     watch.check()
-    goal = start.get(keys.GOAL)[:, :, :taken].flatten(1, 2)
-    return Simulation(Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found)), goal, result)
+    rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
+    return Simulation(rollouts, goal[:, :, :taken].flatten(1, 2), result)
 
 
 def search_kind(agent: Agent, config: EvaluateConfig) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -105,8 +105,9 @@ def start_states(
     branches: int,
     seed: int,
     logged_goals: bool = False,
+    goals_per: Literal["tree", "branch"] = "tree",
 ) -> TensorDictBase:
-    """First states [B, trees, branches] of all scenes; branches of a tree share their goals, trees draw their own.
+    """First states [B, trees, branches] of all scenes.
 
     Args:
         env: the environment.
@@ -115,6 +116,7 @@ def start_states(
         branches: per tree.
         seed: of the goals.
         logged_goals: take the routes nearest to the log instead.
+        goals_per: who draws goals together: all branches of a tree (paper, section IV-B), or each branch alone.
     """
     device, scenes = env.scenes.device, len(env.scenes)
     number = torch.arange(trees * branches, device=device).reshape(trees, branches)
@@ -122,8 +124,11 @@ def start_states(
     start = env.start(scene.expand(-1, trees, branches), number.expand(scenes, -1, -1))
     if goals is None:
         return start
+    chosen = None if logged_goals else goals
+    if goals_per == "branch":
+        return env.with_goals(start, draw_goals(env, chosen, start, seed, number.expand(scenes, -1, -1)))
     tree = torch.arange(trees, device=device).expand(scenes, trees)
-    goal = draw_goals(env, None if logged_goals else goals, start[..., 0], seed, tree)
+    goal = draw_goals(env, chosen, start[..., 0], seed, tree)
     return env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
 
 

@@ -16,11 +16,13 @@ from symphony.collectors import (
     KeepBest,
     KeyScore,
     PruningRule,
+    ReplaceBad,
     Systematic,
     beam_search,
     max_then_sum,
     mean_then_sum,
 )
+from symphony.collectors.rules import takes_groups
 from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.imports import build_object, load_object
@@ -57,6 +59,7 @@ def pruning_rule(config: SearchConfig) -> PruningRule:
     rules: dict[str, Callable[[], PruningRule]] = {
         "best": lambda: KeepBest(config.keep),
         "systematic": lambda: Systematic(config.temperature),
+        "replace": lambda: ReplaceBad(config.threshold),
     }
     return rules[config.rule]()
 
@@ -128,6 +131,7 @@ def collector_settings(config: SearchConfig, seed: int, decisions: int) -> dict[
         "rule_noise": pruning_noise(seed),
         # A copy takes the random numbers of the place it lands in, so that forks part.
         "slot_keys": (keys.STREAM,),
+        "group_key": keys.GOAL if takes_groups(pruning_rule(config)) else None,
         "keep": KEPT,
         "frames_per_batch": config.segments * config.branches * decisions,
         "total_frames": -1,
@@ -180,6 +184,7 @@ def search(
         leaves=leaves,
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
+        group_key=keys.GOAL if takes_groups(rule) else None,
         keep=KEPT,
         keep_tree=keep_tree,
         retries=retries,
