@@ -86,8 +86,15 @@ def main(args: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:
-        return int(stop.code or 0)
+        # Help or a complaint was printed; whoever read it may have gone, say `head`.
+        return _guarded(lambda: None) or int(stop.code or 0)
+    except BrokenPipeError:
+        return _guarded(_gone)
     return _guarded(command.run)
+
+
+def _gone() -> None:
+    raise BrokenPipeError
 
 
 class Terminated(KeyboardInterrupt):
