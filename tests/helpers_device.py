@@ -73,6 +73,13 @@ class _Backend(_DummyBackendModule):
         # Whatever else runs in this process must not find it.
         return self.pretended is not None
 
+    # What forks of the random state ask every device for, long after the pretending is over.
+    def get_rng_state(self, *_: Any) -> Tensor:
+        return torch.get_rng_state()
+
+    def set_rng_state(self, *_: Any) -> None:
+        pass
+
     def synchronize(self, *_: Any) -> None:
         if self.pretended is not None:
             self.pretended.waits.append("synchronize")

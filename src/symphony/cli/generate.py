@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -142,10 +143,13 @@ class Quality:
 
     def run(self) -> None:
         """Measure and print."""
+        from symphony.evaluation.logs import shortfalls
         from symphony.files import write_json
 
         quality = measured(self.store, self.interactive)
         print_quality(quality, title=str(self.store))
+        for missed in shortfalls(quality):
+            sys.stderr.write(f"below what generated sets must reach: {missed}\n")
         if self.json is not None:
             write_json(self.json, quality)
 

@@ -79,11 +79,6 @@ class Regions:
     def __len__(self) -> int:
         return len(self.lane)
 
-    def siblings(self, region: int) -> Indices:
-        """The other regions of the same choice."""
-        same = np.flatnonzero(self.parent == self.parent[region])
-        return same[same != region]
-
 
 class LaneGraph:
     """Lanes, how they connect, and their shapes; built once per map.
