@@ -79,6 +79,15 @@ WAYS = (
     ("learned with resampling too: independent rollouts", "bc-resampled/bc_ts_h-0-none"),
     ("learned with resampling too: one tree, every 0.4 s", "bc-resampled/bc_ts_h-0-often"),
 )
+SEARCH = (
+    ("log playback", "none", "playback"),
+    ("constant velocity", "none", "constant_velocity"),
+    ("no search", "none", ""),
+    ("resampled, goals of the tree", "systematic-tree", ""),
+    ("resampled, goals of each branch", "systematic-branch", ""),
+    ("only the bad replaced, goals of each branch", "replace-branch", ""),
+)
+"""Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
 PLAYBACK = "log playback"
 NGSIM = (
     (PLAYBACK, "ngsim/{}/playback"),
@@ -222,6 +231,20 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {error:.{digits}f}"
 
 
+def searched(data: str) -> Grid:
+    """One agent simulated in several ways: errors over recordings, and CPU seconds per segment."""
+    grid = [["", *(heading for heading, _ in COLUMNS.values()), "CPU s"]]
+    for label, name, part in SEARCH:
+        (record,) = records(f"search/{data}-{name}")
+        row = record[part] if part else record
+        cells = [
+            f"{row[key]:.{digits}f} ± {row[f'{key}_se']:.{digits}f}" for key, (_, digits) in COLUMNS.items()
+        ]
+        cost = "" if part else f"{record['cost']['simulation'] / record['segments']:.2f}"
+        grid.append([label, *cells, cost])
+    return grid
+
+
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
@@ -237,6 +260,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "many": lambda: setting("many"),
     "paper": against_paper,
     "sweep": sweep,
+    "search-town": lambda: searched("town"),
 }
 
 
