@@ -261,6 +261,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "paper": against_paper,
     "sweep": sweep,
     "search-town": lambda: searched("town"),
+    "search-ngsim": lambda: searched("ngsim"),
 }
 
 
