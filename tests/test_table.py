@@ -439,7 +439,7 @@ CHANGES: dict[str, Any] = {
 
 
 def test_names_differ_with_everything_that_changes_results() -> None:
-    same = {"batch", "device"}
+    same = {"batch", "device", "workers", "engine"}
     assert {field.name for field in dataclasses.fields(EvaluateConfig)} == CHANGES.keys() | same
     base = make_record(search="tree", trees=1, branches=16, rule="best")
     others = [base | {"config": base["config"] | {name: value}} for name, value in CHANGES.items()]
@@ -447,8 +447,8 @@ def test_names_differ_with_everything_that_changes_results() -> None:
     others.append(base | {"run": {"named": True, "checkpoint": 50}})
     names = [evaluation_name(record) for record in (base, *others)]
     assert len(set(names)) == len(names)
-    for record in others[0]["config"] | {"batch": 3}, others[0]["config"] | {"device": "cuda"}:
-        assert evaluation_name(others[0] | {"config": record}) == names[1]
+    for change in {"batch": 3}, {"device": "cuda"}, {"workers": 2}, {"engine": "ray"}:
+        assert evaluation_name(others[0] | {"config": others[0]["config"] | change}) == names[1]
 
 
 @given(st.text(max_size=80))

@@ -56,7 +56,7 @@ class Evaluate:
             check_picture(self.figure)
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
-        keepers: list[Callable[[EvaluatedBatch], None]] = [clips]
+        keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
         if self.save_rollouts is not None:
             settings = plain_settings(self.config, agent.interactive, agent.duration)
             about = About.of(agent.name, store, settings, seed=self.config.seed)
@@ -66,7 +66,9 @@ class Evaluate:
             for keeper in keepers:
                 keeper(batch)
 
-        found = evaluate_with_bar(agent, store, self.config, observe=observe, baselines=True)
+        found = evaluate_with_bar(
+            agent, store, self.config, observe=observe if keepers else None, baselines=True
+        )
         print_evaluation(found, self.data)
         record = evaluation_record(agent, found, store)
         if self.keep:

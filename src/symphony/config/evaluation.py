@@ -12,6 +12,7 @@ from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "oracle", "best"]
 Goals = Literal["tree", "branch"]
+Engine = Literal["local", "ray"]
 Setting = Literal["main", "long", "many"]
 """Of the paper's tables: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
 PaperData = Literal["proprietary", "womd"]
@@ -61,12 +62,19 @@ class EvaluateConfig:
     """Run segments simulated at a time (changes memory and speed, not results)."""
     device: str = "cpu"
     """`cpu`, `cuda` or `cuda:N`."""
+    workers: int = 1
+    """Processes that share the batches of run segments, with one thread each (changes speed, not results)."""
+    engine: Engine = "local"
+    """Where they are: on this machine, or on a Ray cluster (at RAY_ADDRESS, else one is started here)."""
 
     def __post_init__(self) -> None:
         one_of(self, "search", get_args(Search))
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
-        positive(self, "rollouts", "batch", "trees")
+        one_of(self, "engine", get_args(Engine))
+        positive(self, "rollouts", "batch", "trees", "workers")
+        if self.engine == "ray" and self.device != "cpu":
+            raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
         not_negative(self, "interactive", "branches", "duration", "prune_every", "temperature", "retries")

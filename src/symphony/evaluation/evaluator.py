@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +28,7 @@ from symphony.simulation.demonstrations import SceneDataset, logged
 from symphony.simulation.driving import driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.rollouts import Rollouts
+from symphony.simulation.workers import batches, naming, shared
 
 BASELINES = ("playback", "constant_velocity")
 """Evaluated beside every agent, on the agents it drives and for as long."""
@@ -112,7 +114,7 @@ def evaluate(
         config: how.
         progress: called with the segments done and their total.
         baselines: evaluate :data:`BASELINES` on the same segments, too.
-        observe: called with every batch of rollouts, to draw or keep them.
+        observe: called with every batch of rollouts in this process, to draw or keep them.
 
     Raises:
         ConfigError: if the agent learned another time step than the store has.
@@ -164,36 +166,78 @@ def evaluate_dataset(
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.
     once = dataclasses.replace(config, rollouts=1, trees=1, search="none")
-    own = {path: load_object(path) for path in config.metric}
+    hows = [config] + [once] * (len(everyone) - 1)
     found = [
         Evaluation(one.name, RolloutMetrics(), how, dataset.interactive, search_kind(one, how))
-        for one, how in zip(everyone, [config] + [once] * len(others), strict=False)
+        for one, how in zip(everyone, hows, strict=True)
     ]
+    for path in config.metric:
+        load_object(path)  # or complain before anything is simulated
     seconds = [0.0] * len(everyone)
-    for first in range(0, len(dataset), config.batch):
-        items = list(range(first, min(first + config.batch, len(dataset))))
-        scenes = dataset.scenes(items).to(torch.device(config.device))
-        for k, (one, evaluation) in enumerate(zip(everyone, found, strict=True)):
-            began = time.process_time()
-            try:
-                simulated = driven_by(one, scenes, evaluation.config)
-            except NotFiniteError as error:
-                raise error.named(dataset.segment(items[error.row]).segment_id) from error
-            seconds[k] += time.process_time() - began
-            _add(evaluation, dataset, items, scenes, simulated.rollouts, own)
-            if observe is not None and one is agent:
-                segments = [dataset.segment(i) for i in items]
-                observe(
-                    EvaluatedBatch(
-                        items, segments, scenes.cpu(), simulated.rollouts.cpu(), simulated.goal.cpu()
-                    )
-                )
-        if progress is not None:
-            progress(items[-1] + 1, len(dataset))
+    judge, done = _Judge(everyone, found, dataset, observe is not None), 0
+    with closing(shared(judge, batches(range(len(dataset)), config), config)) as results:
+        for batch in results:
+            for k, part in enumerate(batch.parts):
+                found[k].metrics.merge(part.metrics)
+                for path, values in part.own.items():
+                    found[k].own.setdefault(path, []).extend(values)
+                seconds[k] += part.seconds
+            if observe is not None and batch.seen is not None:
+                scenes, rollouts, goal = batch.seen
+                segments = [dataset.segment(i) for i in batch.items]
+                observe(EvaluatedBatch(batch.items, segments, scenes, rollouts, goal))
+            done += len(batch.items)
+            if progress is not None:
+                progress(done, len(dataset))
     found = [dataclasses.replace(one, seconds=spent) for one, spent in zip(found, seconds, strict=True)]
     # The evaluated agent itself where it is one of the baselines.
     named = {evaluation.agent: evaluation for evaluation in found}
     return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
+
+
+class _Judged(NamedTuple):
+    """Of a batch: what was found of each agent, and the scenes, rollouts and goals of the first, on the CPU."""
+
+    items: list[int]
+    parts: list[Evaluation]
+    seen: tuple[SceneBatch, Rollouts, Tensor] | None
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Simulates agents on a batch of run segments and compares them with the log.
+
+    Attributes:
+        agents: the first is the one evaluated, the others are baselines.
+        blank: for each, an evaluation without any segments.
+        dataset: the run segments.
+        seen: whether rollouts are asked for, too.
+    """
+
+    agents: list[Agent]
+    blank: list[Evaluation]
+    dataset: SceneDataset
+    seen: bool
+
+    def __call__(self, items: list[int]) -> _Judged:
+        """Evaluate some items."""
+        with naming(self.dataset, items):
+            scenes = self.dataset.scenes(items).to(torch.device(self.blank[0].config.device))
+            parts, seen = [], None
+            for agent, blank in zip(self.agents, self.blank, strict=True):
+                began = time.process_time()
+                try:
+                    found = driven_by(agent, scenes, blank.config)
+                except NotFiniteError as error:
+                    raise error.named(self.dataset.segment(items[error.row]).segment_id) from error
+                seconds = time.process_time() - began
+                part = dataclasses.replace(blank, metrics=RolloutMetrics(), own={}, seconds=seconds)
+                own = {path: load_object(path) for path in blank.config.metric}
+                _add(part, self.dataset, items, scenes, found.rollouts, own)
+                parts.append(part)
+                if self.seen and seen is None:
+                    seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
+            return _Judged(items, parts, seen)
 
 
 def _add(

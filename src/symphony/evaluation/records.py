@@ -28,7 +28,7 @@ FORMAT = 2
 """Version of a kept evaluation."""
 FOLDER = "evaluations"
 
-_MEMORY = ("batch", "device")
+_MEMORY = ("batch", "device", "workers", "engine")
 """Settings that change no result."""
 _NAMED = ("search", "trees", "branches", "rule", "interactive", "rollouts", "duration", "seed")
 _PRUNING = ("prune_every", "temperature")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ def evenly_spaced(total: int, count: int) -> list[int]:
 
 
 class SceneDataset:
-    """Random access to the scenes and experts of a store.
+    """Random access to the scenes and experts of a store. Pickles without what it keeps in memory.
 
     Args:
         store: the run segments.
@@ -65,10 +66,14 @@ class SceneDataset:
         self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
-        self.routes, self.duration = routes, duration
+        self.routes, self.duration, self.keep = routes, duration, keep
         self.scene = lru_cache(keep)(self._scene)
         self.experts = ExpertCache(self._experts, keep)
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        build = partial(SceneDataset, routes=self.routes, duration=self.duration, keep=self.keep)
+        return build, (self.store, self.interactive, self.dynamics, self.indices)
 
     def __len__(self) -> int:
         return len(self.indices)

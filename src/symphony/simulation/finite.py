@@ -21,12 +21,16 @@ class NotFiniteError(SymphonyError):
 
     Attributes:
         row: of the scene, in its batch.
+        name: of the segment, once it is known.
     """
 
     def __init__(self, what: str, row: int, step: int, name: str = "") -> None:
         where = f"segment {name}: " if name else ""
         super().__init__(f"{where}the {what} put out a number that is not finite at step {step}")
-        self.what, self.row, self.step = what, row, step
+        self.what, self.row, self.step, self.name = what, row, step, name
+
+    def __reduce__(self) -> tuple[type[NotFiniteError], tuple[str, int, int, str]]:
+        return NotFiniteError, (self.what, self.row, self.step, self.name)
 
     def named(self, segment: str) -> NotFiniteError:
         """The same error, with the segment's name."""

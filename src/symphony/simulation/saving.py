@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,11 @@ from symphony.config import EvaluateConfig
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
-from symphony.simulation.saved import PLAYBACK, saved_rollouts
+from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
+from symphony.simulation.workers import batches, naming, shared
 
-_MEMORY = ("batch", "device", "metric")
+_MEMORY = ("batch", "device", "metric", "workers", "engine")
 """Settings that change no rollout."""
 
 
@@ -58,24 +61,44 @@ def save_simulation(
     )
     names = [dataset.store.ids[i] for i in dataset.indices]
     todo = [i for i, name in enumerate(names) if not writer.has(name)]
-    driver = PLAYBACK if agent.policy is None else agent.name
-    for first in range(0, len(todo), config.batch):
-        items = todo[first : first + config.batch]
-        scenes = dataset.scenes(items).to(torch.device(config.device))
-        try:
-            found = driven_by(agent, scenes, config, keep_tree=keep_tree)
-        except NotFiniteError as error:
-            raise error.named(names[items[error.row]]) from error
-        tree = found.search if keep_tree else None
-        rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
-        for b, i in enumerate(items):
-            segment = dataset.segment(i)
-            writer.add(
-                saved_rollouts(segment, on_cpu, rollouts, b, goal=found.goal, search=tree, driver=driver)
-            )
-        if progress is not None:
-            progress(len(names) - len(todo) + first + len(items), len(names))
+    done = len(names) - len(todo)
+    with closing(shared(_Drive(agent, dataset, config, keep_tree), batches(todo, config), config)) as results:
+        for saved in results:
+            for one in saved:
+                writer.add(one)
+            done += len(saved)
+            if progress is not None:
+                progress(done, len(names))
     return RolloutFolder(path)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """Simulates an agent on a batch of run segments."""
+
+    agent: Agent
+    dataset: SceneDataset
+    config: EvaluateConfig
+    keep_tree: bool
+
+    def __call__(self, items: list[int]) -> list[SavedRollouts]:
+        """What it did in each."""
+        dataset = self.dataset
+        with naming(dataset, items):
+            scenes = dataset.scenes(items).to(torch.device(self.config.device))
+            try:
+                found = driven_by(self.agent, scenes, self.config, keep_tree=self.keep_tree)
+            except NotFiniteError as error:
+                raise error.named(dataset.segment(items[error.row]).segment_id) from error
+            tree = found.search if self.keep_tree else None
+            rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
+            driver = PLAYBACK if self.agent.policy is None else self.agent.name
+            return [
+                saved_rollouts(
+                    dataset.segment(i), on_cpu, rollouts, b, goal=found.goal, search=tree, driver=driver
+                )
+                for b, i in enumerate(items)
+            ]
 
 
 def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:

@@ -1,0 +1,72 @@
+"""Batches of run segments, shared among processes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import lru_cache
+from typing import Any, TypeVar, cast
+
+from symphony import allocator
+from symphony.config import EvaluateConfig
+from symphony.data.engine import ordered_map
+from symphony.errors import ConfigError, SymphonyError
+from symphony.simulation.demonstrations import SceneDataset
+
+R = TypeVar("R")
+Work = Callable[[list[int]], R]
+"""What is done with a batch of items; a picklable object, with the dataset and the agent inside."""
+
+
+def batches(items: Sequence[int], config: EvaluateConfig) -> list[list[int]]:
+    """Items in their order, ``config.batch`` at a time, however many workers there are."""
+    return [list(items[first : first + config.batch]) for first in range(0, len(items), config.batch)]
+
+
+def shared(work: Work[R], tasks: Sequence[list[int]], config: EvaluateConfig) -> Generator[R, None, None]:
+    """The results of some work on every batch, in the order of the batches, by ``config.workers`` processes.
+
+    One local worker is this very process. ``close`` ends the others.
+
+    Raises:
+        ConfigError: the work can't be sent to another process, or Ray is not installed.
+        SymphonyError: a worker process died; what the work raises comes through unchanged.
+    """
+    if config.workers == 1 and config.engine == "local":
+        yield from map(work, tasks)
+        return
+    try:
+        sent = pickle.dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ConfigError(f"can't be shared among processes: {error}") from error
+    pairs = ((sent, task) for task in tasks)
+    with closing(ordered_map(_done, pairs, workers=config.workers, engine=config.engine)) as results:
+        for result in results:
+            yield cast(R, pickle.loads(result))  # noqa: S301  (from our own worker)
+
+
+@contextmanager
+def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
+    """An unexpected error inside names the run segments at hand; those of this package do so themselves."""
+    try:
+        yield
+    except SymphonyError:
+        raise
+    except Exception as error:
+        names = ", ".join(dataset.store.ids[dataset.indices[i]] for i in items)
+        error.add_note(f"in one of the run segments {names}")
+        raise
+
+
+@lru_cache(1)
+def _opened(sent: bytes) -> Work[Any]:
+    """The work, once per process: it keeps what it prepared from one batch to the next."""
+    allocator.tune()  # this process is ours
+    return cast("Work[Any]", pickle.loads(sent))  # noqa: S301  (from our own parent)
+
+
+def _done(pair: tuple[bytes, list[int]]) -> bytes:
+    # As bytes: tensors of their own would travel through shared memory, of which containers have little.
+    sent, items = pair
+    return pickle.dumps(_opened(sent)(items))

@@ -1,0 +1,250 @@
+"""Run segments shared among processes: the same numbers, pictures, files and errors as in one."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers_segments import crossing, straight_road
+from symphony import keys
+from symphony.config import EvaluateConfig
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.envs import Bicycle
+from symphony.errors import ConfigError
+from symphony.evaluation import EvaluatedBatch, Evaluation, evaluate
+from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.finite import NotFiniteError
+from symphony.simulation.saved_files import About, RolloutWriter
+from symphony.simulation.saving import save_simulation
+from symphony.simulation.workers import _done, batches, naming, shared
+from test_engine import gone
+from test_finite import Spoiled
+from test_finite import agent as make_agent
+
+METRIC = "helpers_workers:travelled"
+CONFIG = EvaluateConfig(rollouts=4, trees=2, batch=1, search="tree", metric=(METRIC,), seed=3)
+ABOUT = About("made", 3, {}, {"rollouts": 4}, {"checksum": "ab"})
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        for k, steps in enumerate((11, 9, 7, 12, 10)):
+            writer.append((straight_road if k % 2 else crossing)(3 + k % 2, seed=k, steps=steps))
+    return SegmentStore(path)
+
+
+class Seen:
+    """What an evaluation gives, and shows on its way."""
+
+    def __init__(self, store: SegmentStore, out: Path, **changes: Any) -> None:
+        self.progress: list[tuple[int, int]] = []
+        self.batches: list[EvaluatedBatch] = []
+        self.clips = ClipKeeper([1, 4], 2)
+        keepers = [self.clips, RolloutKeeper(RolloutWriter(out, ABOUT), "tiny"), self.batches.append]
+
+        def observe(batch: EvaluatedBatch) -> None:
+            for keeper in keepers:
+                keeper(batch)
+
+        def progress(done: int, total: int) -> None:
+            self.progress.append((done, total))
+
+        self.found: Evaluation = evaluate(
+            make_agent(), store, replace(CONFIG, **changes), progress, baselines=True, observe=observe
+        )
+        self.files = files(out)
+
+    def numbers(self) -> list[Any]:
+        everyone = [self.found, *self.found.baselines]
+        return [(one.numbers(), one.metrics.rows(), list(one.metrics.segments), one.own) for one in everyone]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def alone(store: SegmentStore, tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    return Seen(store, tmp_path_factory.mktemp("alone"))
+
+
+def assert_same(one: Seen, two: Seen) -> None:
+    assert repr(one.numbers()) == repr(two.numbers())  # to the last digit, where NaN is like NaN
+    assert one.files == two.files
+    assert len(one.files) >= 5
+    assert [clip.title for clip in one.clips.clips] == [clip.title for clip in two.clips.clips]
+    for a, b in zip(one.batches, two.batches, strict=True):
+        assert a.items == b.items
+        assert [s.segment_id for s in a.segments] == [s.segment_id for s in b.segments]
+        assert torch.equal(a.goal, b.goal)
+        assert all(torch.equal(x, y) for x, y in zip(a.rollouts, b.rollouts, strict=True))
+        assert torch.equal(a.scenes.log_state, b.scenes.log_state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_everything_is_the_same_with_two_workers(
+    alone: Seen, store: SegmentStore, tmp_path: Path, engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if engine == "ray":
+        ray = pytest.importorskip("ray")
+        monkeypatch.delenv("RAY_ADDRESS", raising=False)
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # for its workers
+        monkeypatch.setenv("RAY_worker_niceness", "0")
+    try:
+        together = Seen(store, tmp_path / "out", workers=2, engine=engine)
+    finally:
+        if engine == "ray":
+            ray.shutdown()
+    assert together.progress == alone.progress == [(k, 5) for k in range(1, 6)]
+    assert_same(alone, together)
+    assert together.found.seconds > 0
+    assert len(together.found.own[METRIC]) == 5
+
+
+def test_the_division_into_batches_changes_nothing(alone: Seen, store: SegmentStore) -> None:
+    config = replace(CONFIG, batch=3)
+    other = evaluate(make_agent(), store, config)
+    assert repr(other.metrics.rows()) == repr(alone.found.metrics.rows())
+    assert other.own[METRIC] == pytest.approx(alone.found.own[METRIC])  # its sums are longer by the padding
+
+
+@given(st.integers(0, 70), st.integers(1, 20), st.integers(1, 9))
+def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int, workers: int) -> None:
+    found = batches(range(items), EvaluateConfig(batch=batch, workers=workers))
+    assert [i for part in found for i in part] == list(range(items))
+    assert all(1 <= len(part) <= batch for part in found)
+    assert found == batches(range(items), EvaluateConfig(batch=batch))
+
+
+def spoiled() -> Any:
+    """An agent whose policy fails in the second segment of every batch."""
+    agent = make_agent()
+    return replace(agent, policy=Spoiled(agent.policy, keys.LOGITS, 1, 1))
+
+
+def test_errors_name_the_segment(store: SegmentStore) -> None:
+    name = store.ids[2]
+    config = replace(CONFIG, metric=("helpers_workers:short_scenes_fail",))
+    with pytest.raises(ZeroDivisionError, match="too short for me") as error:
+        evaluate(make_agent(), store, config)
+    assert error.value.__notes__ == [f"in one of the run segments {name}"]
+    with pytest.raises(ConfigError, match="no_such"):
+        evaluate(make_agent(), store, replace(CONFIG, metric=("helpers_workers:no_such",), workers=2))
+
+
+@pytest.mark.slow
+def test_errors_of_workers_are_those_of_one_process(store: SegmentStore) -> None:
+    config = replace(CONFIG, workers=2, metric=(), batch=3)
+    with pytest.raises(NotFiniteError, match=f"segment {store.ids[1]}: the policy put out") as error:
+        evaluate(spoiled(), store, config)
+    with pytest.raises(NotFiniteError) as alone:
+        evaluate(spoiled(), store, replace(config, workers=1))
+    assert str(error.value) == str(alone.value)
+    with pytest.raises(ZeroDivisionError, match="too short for me") as own:
+        evaluate(make_agent(), store, replace(config, metric=("helpers_workers:short_scenes_fail",)))
+    assert own.value.__notes__ == [f"in one of the run segments {', '.join(store.ids[:3])}"]
+
+
+def test_what_is_sent_comes_back_whole(store: SegmentStore) -> None:
+    dataset = SceneDataset(store, 2, Bicycle(), [3, 1], routes=True, duration=1, keep=2)
+    dataset.scene(0)
+    copy = pickle.loads(pickle.dumps(dataset))  # noqa: S301
+    for name in ("interactive", "dynamics", "indices", "routes", "duration", "keep", "dt"):
+        assert getattr(copy, name) == getattr(dataset, name)
+    assert copy.store.path == store.path
+    error = NotFiniteError("policy", 1, 4).named("s")
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301
+    assert (str(again), vars(again)) == (str(error), vars(error))
+
+
+def test_a_worker_opens_the_work_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SYMPHONY_MALLOPT", "0")  # this process is no worker
+    sent = pickle.dumps(Counting())
+    assert [pickle.loads(_done((bytes(sent), [k]))) for k in range(3)] == [1, 2, 3]  # noqa: S301
+
+
+class Counting:
+    """Counts its calls."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, items: list[int]) -> int:
+        self.calls += 1
+        return self.calls
+
+
+def test_what_cannot_be_sent_is_refused(store: SegmentStore) -> None:
+    with pytest.raises(ConfigError, match="can't be shared among processes"):
+        list(shared(lambda items: items, [[0]], EvaluateConfig(workers=2)))
+    assert list(shared(lambda items: items, [[0], [1]], EvaluateConfig())) == [[0], [1]]
+    with pytest.raises(OSError, match="disk") as error, naming(SceneDataset(store, indices=[3, 1]), [1]):
+        raise OSError("disk")
+    assert error.value.__notes__ == [f"in one of the run segments {store.ids[1]}"]
+
+
+@pytest.mark.slow
+def test_simulations_are_saved_the_same(store: SegmentStore, tmp_path: Path) -> None:
+    agent, config = make_agent(), replace(CONFIG, metric=())
+    dataset = SceneDataset(store, 2, agent.dynamics, routes=True)
+    seen: list[int] = []
+    save_simulation(tmp_path / "one", agent, dataset, config)
+    save_simulation(
+        tmp_path / "two", agent, dataset, replace(config, workers=2), progress=lambda k, _: seen.append(k)
+    )
+    assert seen == [1, 2, 3, 4, 5]
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+    assert len(files(tmp_path / "one")) > 5
+
+
+@pytest.mark.parametrize("bad", [{"workers": 0}, {"engine": "dask"}, {"engine": "ray", "device": "cuda"}])
+def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(bad))):
+        EvaluateConfig(**bad)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+@pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_workers_end_with_the_command(store: SegmentStore, tmp_path: Path, how: int, status: int) -> None:
+    (tmp_path / "started").mkdir()
+    command = [sys.executable, "-m", "symphony.cli", "evaluate", "playback", "--data", str(store.path)]
+    options = ["--workers", "2", "--metric", "helpers_workers:waits", "--batch", "1"]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        "STARTED": str(tmp_path / "started"),
+    }
+    with subprocess.Popen(
+        [*command, *options], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        until = time.monotonic() + 120  # generously long, for a busy machine
+        while len(list((tmp_path / "started").iterdir())) < 2 and time.monotonic() < until:
+            assert process.poll() is None
+            time.sleep(0.1)
+        process.send_signal(how)
+        _, errors = process.communicate(timeout=120)
+    workers = [int(path.name) for path in (tmp_path / "started").iterdir()]
+    assert len(workers) == 2
+    assert process.pid not in workers
+    assert gone(workers)
+    assert process.returncode == status
+    assert errors.strip().splitlines()[-1] == "symphony: error: " + (
+        "interrupted" if how == signal.SIGINT else "terminated"
+    )
