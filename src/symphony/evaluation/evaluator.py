@@ -174,8 +174,8 @@ def evaluate_dataset(
     for path in config.metric:
         load_object(path)  # or complain before anything is simulated
     seconds = [0.0] * len(everyone)
-    judge, done = _Judge(everyone, found, dataset, observe is not None), 0
-    with closing(shared(judge, batches(range(len(dataset)), config), config)) as results:
+    evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
+    with closing(shared(evaluator, batches(range(len(dataset)), config), config)) as results:
         for batch in results:
             for k, part in enumerate(batch.parts):
                 found[k].metrics.merge(part.metrics)
@@ -195,7 +195,7 @@ def evaluate_dataset(
     return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
 
 
-class _Judged(NamedTuple):
+class _BatchResult(NamedTuple):
     """Of a batch: what was found of each agent, and the scenes, rollouts and goals of the first, on the CPU."""
 
     items: list[int]
@@ -204,7 +204,7 @@ class _Judged(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Judge:
+class _BatchEvaluator:
     """Simulates agents on a batch of run segments and compares them with the log.
 
     Attributes:
@@ -219,7 +219,7 @@ class _Judge:
     dataset: SceneDataset
     seen: bool
 
-    def __call__(self, items: list[int]) -> _Judged:
+    def __call__(self, items: list[int]) -> _BatchResult:
         """Evaluate some items."""
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(self.blank[0].config.device))
@@ -237,7 +237,7 @@ class _Judge:
                 parts.append(part)
                 if self.seen and seen is None:
                     seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
-            return _Judged(items, parts, seen)
+            return _BatchResult(items, parts, seen)
 
 
 def _add(
