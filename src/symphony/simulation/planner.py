@@ -127,7 +127,8 @@ class Scenario:
 class Planner(Protocol):
     """Drives the ego of one rollout. It is made without arguments.
 
-    A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. One that
+    A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. A copy
+    draws the same random numbers as the one it was made of, if it draws them as :attr:`Scenario.seed` says. One that
     raises an exception, or gives back what is not finite, of another length or a target farther away than
     :data:`MAX_SPEED` allows, makes its run a failed one; the run's later steps don't count.
     """

@@ -13,7 +13,7 @@ from symphony.simulation.planner import MAX_BRAKING, Control, Reals, Scenario, T
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
-_BEFORE, _BEYOND = 50.0, 400.0
+_BEFORE, _BEYOND = 50.0, 10_000.0
 """Metres by which a route goes straight on before its start and past its end."""
 _VIEW = 100.0
 """Metres ahead within which the route's bends and limits are looked at."""
