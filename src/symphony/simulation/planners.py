@@ -111,18 +111,21 @@ class IDMPlanner:
         front = station + 0.5 * self.length
         others = traffic.valid.copy()
         others[traffic.ego] = False
-        centre, _, direction = self.route.project(traffic.position[others])
-        corners = _corners(traffic.position[others], traffic.heading[others], traffic.size[others])
-        along, aside, _ = (part.reshape(-1, 4, *part.shape[1:]) for part in self.route.project(corners))
+        centre, aside, direction = self.route.project(traffic.position[others])
         reach = 0.5 * self.width + self.margin
-        inside = (aside.min(-1, initial=np.inf) < reach) & (aside.max(-1, initial=-np.inf) > -reach)
-        ahead = inside & (centre > station)
-        gaps = np.where(ahead, along.min(-1, initial=np.inf) - front, np.inf)
-        speeds = (traffic.velocity[others] * direction).sum(-1)
+        # Only boxes that could reach into the corridor are looked at by their corners.
+        near = (centre > station) & (np.abs(aside) < reach + 0.5 * np.hypot(*traffic.size[others].T))
+        which = np.flatnonzero(others)[near]
+        corners = _corners(traffic.position[which], traffic.heading[which], traffic.size[which])
+        along, aside, _ = self.route.project(corners)
+        along, aside = along.reshape(-1, 4), aside.reshape(-1, 4)
+        ahead = (aside.min(-1) < reach) & (aside.max(-1) > -reach)
         found = (math.inf, 0.0)
         if ahead.any():
+            gaps = np.where(ahead, along.min(-1) - front, np.inf)
             nearest = int(gaps.argmin())
-            found = (float(gaps[nearest]), max(float(speeds[nearest]), 0.0))
+            speed_along = float((traffic.velocity[which[nearest]] * direction[near][nearest]).sum())
+            found = (float(gaps[nearest]), max(speed_along, 0.0))
         for stop, light in zip(self.stops.tolist(), traffic.lights[self.lights].tolist(), strict=True):
             gap = stop - front
             in_time = gap > speed**2 / (2.0 * self.braking)
