@@ -55,6 +55,13 @@ def test_gail_pendulum_has_nothing_to_do_with_cars() -> None:
     assert all(0 < cost < math.pi**2 + 7 for cost in costs)
 
 
+def test_planner(example: Any, tmp_path: Path) -> None:
+    totals = example("planner").main(segments=2, rollouts=2, out=str(tmp_path / "sim"))
+    assert totals["runs"] == 4
+    assert totals["failed_runs"] == 0
+    assert totals["progress"] > 5
+
+
 @pytest.mark.slow
 def test_several_processes(example: Any) -> None:
     costs = example("several_processes").main(iterations=2, branches=2, workers=2, updates=1)

@@ -16,6 +16,11 @@ STEP: Key = "step"
 STREAM: Key = "stream"
 """[..., 1] int64: identity of the rollout, from which all its random numbers derive."""
 
+PLANNER: Key = "planner"
+"""[..., 1] int64: number of the planner that drives the ego of the rollout."""
+PLANNED: Key = "planned"
+"""[..., 4] float: x, y, heading, speed that a planner gives the ego at the next step."""
+
 VALID: Key = ("agents", "valid")
 """[..., N] bool: False for padding."""
 STATE: Key = ("agents", "state")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from symphony.config import EvaluateConfig
+
+if TYPE_CHECKING:
+    from symphony.simulation.saved_files import RolloutFolder
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,9 @@ class Simulate:
     """Folder of the rollouts."""
     segments: tuple[str, ...] = ()
     """Ids of the run segments, or their numbers in the store; by default all."""
+    planner: str = ""
+    """Drives the ego, the agent the other interactive agents: `idm`, `log`, or the import path of one of your own,
+    such as `my.planner:Planner`. With `playback` as the agent all others play back the log."""
     tree: bool = True
     """Leave out the branches that a search pruned."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -47,16 +53,38 @@ class Simulate:
             SegmentStore(self.data),
             self.config,
         )
+        # Beside log playback nobody else is simulated.
+        others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = [segment_index(store, name) for name in self.segments]
         dataset = SceneDataset(
             store,
-            config.interactive or agent.interactive,
+            config.interactive or others,
             agent.dynamics,
             chosen or None,
-            routes=agent.goals is not None,
+            routes=agent.goals is not None or bool(self.planner),
             duration=config.duration or agent.duration,
             keep=config.batch,
         )
         with segments_bar(f"simulating {agent.name}") as advance:
-            found = save_simulation(self.out, agent, dataset, config, keep_tree=self.tree, progress=advance)
-        Console().print(f"{len(found)} run segments in {self.out}: symphony view {self.out}", soft_wrap=True)
+            found = save_simulation(
+                self.out,
+                agent,
+                dataset,
+                config,
+                keep_tree=self.tree,
+                planner=self.planner,
+                progress=advance,
+            )
+        console = Console()
+        console.print(f"{len(found)} run segments in {self.out}: symphony view {self.out}", soft_wrap=True)
+        if self.planner:
+            for line in failed_runs(found):
+                console.print(line, soft_wrap=True, markup=False)
+
+
+def failed_runs(folder: RolloutFolder) -> list[str]:
+    """How many runs failed, and why the first of them did; nothing if all are well."""
+    why = [f"{saved.segment.segment_id}, {reason}" for saved in folder for reason in saved.failed.values()]
+    why += [f"{entry.segment}, {entry.failed}" for entry in folder.failures for _ in range(entry.rollouts)]
+    runs = sum(entry.rollouts for entry in [*folder.entries, *folder.failures])
+    return [f"{len(why)} of {runs} runs failed, the first: {why[0]}"] if why else []

@@ -281,11 +281,15 @@ class DrivingEnv(EnvBase):
         scene, step, stream, state, valid, goal = self._read(tensordict)
         index = self.scenes.interactive[scene]
         size = _rows(self.scenes.box_size, scene, index)
-        after = self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
+        after = self._moved(tensordict, state, size)
         after = torch.where(valid[..., None], after, state)
         out = self._from_state(scene, step + 1, stream, after, valid, goal)
         earned = self.reward(tensordict, out)
         return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
+
+    def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
+        """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
+        return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))

@@ -12,13 +12,16 @@ from symphony import keys
 from symphony.agents import Agent
 from symphony.collectors import BeamSearchResult, KeepAll
 from symphony.config import EvaluateConfig
+from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.driving import DrivingEnv
+from symphony.envs.dynamics import Bicycle
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.metrics import collisions, offroad
 from symphony.modules import SeededNoise
 from symphony.simulation.demonstrations import logged
 from symphony.simulation.finite import FiniteWatch
+from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
@@ -30,11 +33,13 @@ class Simulation(NamedTuple):
         rollouts: [B, K, ...].
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
         search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
+        failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
     """
 
     rollouts: Rollouts
     goal: Tensor
     search: BeamSearchResult | None
+    failed: tuple[dict[int, str], ...] = ()
 
 
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
@@ -47,7 +52,12 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
 
 
 def simulation(
-    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, *, keep_tree: bool = False
+    agent: Agent,
+    scenes: SceneBatch,
+    config: EvaluateConfig,
+    *,
+    keep_tree: bool = False,
+    egos: EgoPlanners | None = None,
 ) -> Simulation:
     """K rollouts of every scene, and how they came about.
 
@@ -56,20 +66,26 @@ def simulation(
         scenes: B scenes.
         config: how.
         keep_tree: of a search keep the pruned branches, too.
+        egos: plan the first agent of every scene, which no search judges; the agent drives the others.
 
     Raises:
-        ConfigError: if the search needs a discriminator and the agent has none, or the agent learned another time
-            step.
+        ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
+            step, or a planner can't be copied for a search.
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
-    if agent.policy is None:
-        raise ValueError("log playback has nothing to simulate")
+    policy = agent.policy
+    if policy is None:
+        if egos is None:
+            raise ValueError("log playback has nothing to simulate")
+        if scenes.interactive.shape[1] > 1:
+            raise ConfigError("beside log playback the planner's ego is the only interactive agent")
+        policy = ConstantVelocity(Bicycle())
     agent.check_step(float(scenes.dt[0]))
-    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
+    env = (DrivingEnv if egos is None else PlannedEnv)(scenes, agent.dynamics, agent.observation)
     trees, branches, taken = _plan(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
-    actor = watch.watched(agent.policy, [keys.LOGITS, keys.ACTION], "policy")
+    actor = watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy")
     start = start_states(
         env,
         goals,
@@ -79,13 +95,18 @@ def simulation(
         logged_goals=config.logged_goals,
         goals_per=config.goals,
     )
-    result, goal = None, start.get(keys.GOAL)
-    if search_kind(agent, config) == "none":
-        policy = TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor)
-        found = simulate(env, policy, start)
+    settings, planned = config.pruning(agent.search), None
+    if egos is not None:
+        keep_every = settings.prune_every if config.retries else 0
+        start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every)
+        actor = TensorDictSequential(actor, planned)
+    result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
+    if search_kind(agent, config) in ("none", "log"):
+        found = simulate(
+            env, TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor), start
+        )
     else:
         best = config.search == "best"
-        settings = config.pruning(agent.search)
         judge = None
         if config.search != "oracle" and agent.discriminator is not None:
             judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
@@ -103,17 +124,40 @@ def simulation(
                 retries=0 if best else config.retries,
                 retry_above=config.retry_above,
                 keep_tree=keep_tree and not best,
+                ego=planned is None,
+                also=() if planned is None else (keys.PLANNER,),
             )
         found = rollouts_of(env, start, result.trajectories)
         # A copy of a branch follows the goals of its parent.
         goal = result.trajectories.get(keys.GOAL)[..., -1, :]
+        number = result.trajectories.get(keys.PLANNER, None)
+        number = None if number is None else number[..., -1, :]
         if best:
             order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
             found, result = Rollouts(*(_branches(part, order) for part in found)), None
             goal = _branches(goal, order)
+            number = None if number is None else _branches(number, order)
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
-    return Simulation(rollouts, goal[:, :, :taken].flatten(1, 2), result)
+    goal = goal[:, :, :taken].flatten(1, 2)
+    if planned is None or number is None:
+        return Simulation(rollouts, goal, result)
+    return _without_failed(Simulation(rollouts, goal, result), planned, number[:, :, :taken].flatten(1, 2))
+
+
+def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
+    """Steps after a planner, number [B, K, 1], failed don't count."""
+    scenes, rollouts = number.shape[:2]
+    each = planned.failures(number)
+    steps = found.rollouts.counted.shape[-2]
+    until = torch.tensor([steps if one is None else one.step for one in each], device=number.device)
+    going = torch.arange(steps, device=number.device) < until.reshape(scenes, rollouts, 1)
+    failed = tuple(
+        {k: one.reason for k, one in enumerate(each[b * rollouts : (b + 1) * rollouts]) if one is not None}
+        for b in range(scenes)
+    )
+    kept = found.rollouts._replace(counted=found.rollouts.counted & going[..., None])
+    return found._replace(rollouts=kept, failed=failed)
 
 
 def search_kind(agent: Agent, config: EvaluateConfig) -> str:
@@ -132,7 +176,7 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
 def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
-    if kind == "none":
+    if kind in ("none", "log"):
         return config.rollouts, 1, 1
     branches = config.branches or agent.search.test_branches
     if kind == "best":
@@ -152,11 +196,16 @@ def _branches(part: Tensor, order: Tensor) -> Tensor:
 
 
 def driven_by(
-    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, *, keep_tree: bool = False
+    agent: Agent,
+    scenes: SceneBatch,
+    config: EvaluateConfig,
+    *,
+    keep_tree: bool = False,
+    egos: EgoPlanners | None = None,
 ) -> Simulation:
     """What an agent does: :func:`playback` of the log, or a :func:`simulation`."""
-    if agent.policy is not None:
-        return simulation(agent, scenes, config, keep_tree=keep_tree)
+    if agent.policy is not None or egos is not None:
+        return simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos)
     found = playback(scenes)
     return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
 

@@ -61,6 +61,11 @@ class About:
         plain = json.loads(json.dumps(plain, default=str))
         return cls(agent, seed, drivers, plain, {"path": str(store.path), "checksum": store.checksum()})
 
+    def with_ego(self, planner: str) -> About:
+        """The same with a planner in the ego's place."""
+        agent = f"{planner} among {self.agent}"
+        return dataclasses.replace(self, agent=agent, drivers={"ego": planner, **self.drivers})
+
 
 @dataclass(frozen=True)
 class Entry:

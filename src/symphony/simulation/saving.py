@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +13,12 @@ import torch
 
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
+from symphony.errors import DataError
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
+from symphony.simulation.planned import EgoPlanners
+from symphony.simulation.planner import planner_maker
 from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
 from symphony.simulation.workers import batches, naming, shared
@@ -31,6 +34,7 @@ def save_simulation(
     config: EvaluateConfig,
     *,
     keep_tree: bool = True,
+    planner: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset and keep the rollouts, segment by segment.
@@ -43,6 +47,8 @@ def save_simulation(
         dataset: in the agent's action space, with routes if it follows goals.
         config: how it is simulated.
         keep_tree: of a search keep all branches with their scores, too.
+        planner: of the ego, ``idm``, ``log`` or an import path; then the dataset holds routes and the agent drives
+            the other interactive agents. Segments whose ego can't be driven are put on record as failed.
         progress: called with the segments done and their total.
 
     Raises:
@@ -50,19 +56,22 @@ def save_simulation(
         ConfigError: the agent can't be simulated so.
         NotFiniteError: a network of the agent puts out a number that is not finite.
     """
-    writer = RolloutWriter(
-        path,
-        About.of(
-            agent.name,
-            dataset.store,
-            plain_settings(config, dataset.interactive, dataset.duration),
-            seed=config.seed,
-        ),
+    if planner:
+        planner_maker(planner)  # or complain before anything is simulated
+    about = About.of(
+        agent.name,
+        dataset.store,
+        plain_settings(config, dataset.interactive, dataset.duration),
+        seed=config.seed,
     )
+    writer = RolloutWriter(path, about.with_ego(planner) if planner else about)
     names = [dataset.store.ids[i] for i in dataset.indices]
     todo = [i for i, name in enumerate(names) if not writer.has(name)]
+    if planner:
+        todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
-    with closing(shared(_Drive(agent, dataset, config, keep_tree), batches(todo, config), config)) as results:
+    drive = _Drive(agent, dataset, config, keep_tree, planner)
+    with closing(shared(drive, batches(todo, config), config)) as results:
         for saved in results:
             for one in saved:
                 writer.add(one)
@@ -74,31 +83,61 @@ def save_simulation(
 
 @dataclass(frozen=True)
 class _Drive:
-    """Simulates an agent on a batch of run segments."""
+    """Simulates an agent on a batch of run segments, and a planner as the ego if one is named."""
 
     agent: Agent
     dataset: SceneDataset
     config: EvaluateConfig
     keep_tree: bool
+    planner: str
 
     def __call__(self, items: list[int]) -> list[SavedRollouts]:
-        """What it did in each."""
-        dataset = self.dataset
-        with naming(dataset, items):
-            scenes = dataset.scenes(items).to(torch.device(self.config.device))
+        """What they did in each."""
+        with naming(self.dataset, items):
+            scenes = self.dataset.scenes(items).to(torch.device(self.config.device))
+            segments = [self.dataset.segment(i) for i in items]
+            egos = None
+            if self.planner:
+                egos = EgoPlanners(self.planner, planner_maker(self.planner), segments)
             try:
-                found = driven_by(self.agent, scenes, self.config, keep_tree=self.keep_tree)
+                found = driven_by(self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos)
             except NotFiniteError as error:
-                raise error.named(dataset.segment(items[error.row]).segment_id) from error
-            tree = found.search if self.keep_tree else None
+                raise error.named(segments[error.row].segment_id) from error
             rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
-            driver = PLAYBACK if self.agent.policy is None else self.agent.name
             return [
                 saved_rollouts(
-                    dataset.segment(i), on_cpu, rollouts, b, goal=found.goal, search=tree, driver=driver
+                    segment,
+                    on_cpu,
+                    rollouts,
+                    b,
+                    goal=found.goal,
+                    search=found.search if self.keep_tree else None,
+                    driver=self._drivers(),
+                    failed=found.failed[b] if found.failed else None,
                 )
-                for b, i in enumerate(items)
+                for b, segment in enumerate(segments)
             ]
+
+    def _drivers(self) -> str | list[str]:
+        name = PLAYBACK if self.agent.policy is None else self.agent.name
+        return [self.planner, *[name] * (self.dataset.interactive - 1)] if self.planner else name
+
+
+def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:
+    """Those whose first interactive agent is the ego; the others are put on record as failed."""
+    found = []
+    for i in items:
+        segment = dataset.segment(i)
+        try:
+            usable = int(dataset.scene(i).interactive[0, 0]) == segment.ego
+            why = "the ego is no vehicle that is seen at the first step"
+        except DataError as error:
+            usable, why = False, error.message
+        if usable:
+            found.append(i)
+        else:
+            writer.fail(segment.segment_id, rollouts, why)
+    return found
 
 
 def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:

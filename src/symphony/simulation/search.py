@@ -76,13 +76,14 @@ def flag_score(state: TensorDictBase) -> Tensor:
 
 
 def realism_score(
-    env: DrivingEnv, discriminator: TensorDictModuleBase | None
+    env: DrivingEnv, discriminator: TensorDictModuleBase | None, *, ego: bool = True
 ) -> Callable[[TensorDictBase], Tensor]:
     """Scores [..., N] of states up to their scene's last logged step, :data:`ENDED` beyond.
 
     Args:
         env: whose states are scored.
         discriminator: writes them; None takes the true collision and off-road flags (an oracle).
+        ego: whether the first agent is judged; else its score is 0.
     """
     score: Callable[[TensorDictBase], Tensor] = flag_score
     if discriminator is not None:
@@ -90,7 +91,8 @@ def realism_score(
 
     def until_the_end(state: TensorDictBase) -> Tensor:
         going = state.get(keys.STEP) <= env.scenes.last_step[state.get(keys.SCENE)]
-        return torch.where(going, score(state), ENDED)
+        found = torch.where(going, score(state), ENDED)
+        return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
 
     return until_the_end
 
@@ -152,6 +154,8 @@ def search(
     keep_tree: bool = False,
     retries: int = 0,
     retry_above: float = 0.0,
+    ego: bool = True,
+    also: Sequence[keys.Key] = (),
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S] to the last logged step.
 
@@ -169,12 +173,14 @@ def search(
         retries: how often a period is simulated again, from its start, for branches that end it with a total above
             ``retry_above``.
         retry_above: that total.
+        ego: whether the first agent is judged, too.
+        also: what is kept of every step beside :data:`KEPT`.
     """
     steps = env.decisions
     return beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
-        realism_score(env, discriminator),
+        realism_score(env, discriminator, ego=ego),
         start,
         steps=steps,
         prune_every=prune_every,
@@ -185,7 +191,7 @@ def search(
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         group_key=keys.GOAL if takes_groups(rule) else None,
-        keep=KEPT,
+        keep=[*KEPT, *also],
         keep_tree=keep_tree,
         retries=retries,
         retry_above=retry_above if retries else None,

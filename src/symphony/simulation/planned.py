@@ -1,0 +1,226 @@
+"""The ego by a planner: planners as a part of the policy, forked with the branches that they drive."""
+
+from __future__ import annotations
+
+import copy
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from symphony import keys
+from symphony.data.segment import RunSegment
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.dynamics import bicycle_step
+from symphony.envs.observation import objects_at
+from symphony.errors import ConfigError
+from symphony.simulation.planner import Planner, Traffic, checked_plan, fixed, scenario_of
+from symphony.streams import fold_in
+
+_PLANNERS = (1 << 40) + 3
+"""Number of the stream that the seeds of planners come from, far above those of rollouts and agents."""
+
+
+class PlannedEnv(DrivingEnv):
+    """Driving whose first interactive agent, the ego, goes where ``PLANNED`` says instead of its action."""
+
+    def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
+        after = super()._moved(tensordict, state, size)
+        return torch.cat([tensordict.get(keys.PLANNED)[..., None, :], after[..., 1:, :]], -2)
+
+
+class Failure(NamedTuple):
+    """Why a planner drives no more.
+
+    Attributes:
+        step: from which on the rollout doesn't count.
+        reason: in words.
+    """
+
+    step: int
+    reason: str
+
+
+class EgoPlanners:
+    """How the egos of a batch are planned.
+
+    Args:
+        name: of the planner.
+        make: makes one.
+        segments: behind the scenes, in their order; the first interactive agent of each is its ego.
+    """
+
+    def __init__(self, name: str, make: Callable[[], Planner], segments: Sequence[RunSegment]) -> None:
+        self.name, self.make, self.segments = name, make, segments
+
+    def begin(
+        self, env: DrivingEnv, start: TensorDictBase, *, seed: int, keep_every: int = 0
+    ) -> tuple[TensorDictBase, EgoPolicy]:
+        """A planner for every start state, and what asks them.
+
+        Args:
+            env: the environment.
+            start: [...] of it; the egos get the routes of the log.
+            seed: of all rollouts.
+            keep_every: steps at whose multiples the search may come back to try again; 0 for never.
+        """
+        if env.scenes.route.shape[2] == 0:
+            goal = start.get(keys.GOAL)
+        else:
+            logged = env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)][..., :1]
+            goal = torch.cat([logged, start.get(keys.GOAL)[..., 1:]], -1)
+        start = env.with_goals(start, goal)
+        number = torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
+        start.set(keys.PLANNER, number)
+        return start, EgoPolicy(env, self, start, seed, keep_every)
+
+
+class EgoPolicy(TensorDictModuleBase):
+    """Asks the planners and writes the states they lead to as ``PLANNED``.
+
+    Rollouts name their planner by number (``PLANNER``). Copies of a branch share a number until they are driven on;
+    then each gets a planner of its own, copied before any of them plans.
+
+    Args:
+        env: the environment.
+        egos: how egos are planned.
+        start: [...] states at which planners begin, each with its number.
+        seed: of all rollouts.
+        keep_every: as of :meth:`EgoPlanners.begin`.
+    """
+
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PLANNER]  # noqa: RUF012 - the type declared
+    out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
+
+    def __init__(
+        self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int, keep_every: int
+    ) -> None:
+        super().__init__()
+        self.env, self.egos, self.keep_every = env, egos, keep_every
+        self._kept_from = 0
+        self._last = env.scenes.last_step.cpu().numpy()
+        self._held: dict[int, Planner | Failure] = {}
+        scene = start.get(keys.SCENE).flatten().tolist()
+        state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
+        stream = fold_in(fold_in(start.get(keys.STREAM), _PLANNERS), seed).flatten().tolist()
+        routes = [self._route(row) for row in range(len(egos.segments))]
+        for number, row in enumerate(scene):
+            made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))
+            try:
+                planner = egos.make()
+                planner.reset(made)
+                self._held[number] = planner
+            except Exception as error:  # whatever a user's planner raises
+                self._held[number] = Failure(0, f"reset: {_words(error)}")
+        self._next = len(scene)
+
+    def _route(self, row: int) -> NDArray[np.float32]:
+        """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
+        scenes, which = self.env.scenes, int(self.env.scenes.route_logged[row, 0])
+        if scenes.route.shape[2] == 0 or which < 0:
+            return np.zeros((0, 2), np.float32)
+        return scenes.route[row, 0, which, : int(scenes.route_count[row, 0, which])].cpu().numpy()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write planned states [..., 4] and numbers of planners [..., 1]."""
+        scene, at, number = (tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP, keys.PLANNER))
+        state, valid = (
+            tensordict.get(key).flatten(0, tensordict.ndim - 1) for key in (keys.STATE, keys.VALID)
+        )
+        everyone = objects_at(self.env.scenes, scene, at, state, self.env.scenes.interactive[scene], valid)
+        rows, steps = scene.tolist(), at.tolist()
+        going = [step < self._last[row] for row, step in zip(rows, steps, strict=True)]
+        numbers = self._own(number.tolist(), going, steps[0])
+        own = state[:, 0].cpu().double()
+        moves, there = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
+        # One that is over, or has failed, keeps its speed.
+        control, target = np.zeros((len(rows), 2)), np.full((len(rows), 4), np.nan)
+        for m, row in enumerate(rows):
+            planner = self._held[numbers[m]]
+            if not going[m] or isinstance(planner, Failure):
+                continue
+            seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m])
+            try:
+                plan = checked_plan(planner.plan(seen), seen.state, self.env.dt)
+            except Exception as error:  # whatever a user's planner raises
+                self._held[numbers[m]] = Failure(steps[m], f"step {steps[m]}: {_words(error)}")
+            else:
+                (control if len(plan) == 2 else target)[m] = plan
+        length = [float(self.egos.segments[row].size[self.egos.segments[row].ego, 0]) for row in rows]
+        pulled, turned = torch.from_numpy(control).unbind(-1)
+        driven = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
+        wanted = torch.from_numpy(target)
+        after = torch.where(wanted.isnan(), driven, wanted).to(state)
+        tensordict.set(keys.PLANNED, after.reshape(*tensordict.shape, 4))
+        return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
+
+    def failures(self, number: Tensor) -> list[Failure | None]:
+        """Of the planners with these numbers [...], flattened."""
+        found = (self._held[n] for n in number.flatten().tolist())
+        return [planner if isinstance(planner, Failure) else None for planner in found]
+
+    def _own(self, numbers: list[int], going: list[bool], step: int) -> list[int]:
+        """Numbers of planners that may be changed, one for each rollout that goes on."""
+        keeps = self.keep_every > 0 and step % self.keep_every == 0
+        if step > self._kept_from and (keeps or self.keep_every == 0) and len(set(numbers)) < len(self._held):
+            self._held = {n: self._held[n] for n in set(numbers)}
+            self._kept_from = step
+        taken: set[int] = set()
+        out = []
+        for number, goes in zip(numbers, going, strict=True):
+            planner, chosen = self._held[number], number
+            if goes and not isinstance(planner, Failure):
+                if keeps or number in taken:
+                    chosen, self._next = self._next, self._next + 1
+                    self._held[chosen] = self._copy(planner)
+                taken.add(chosen)
+            out.append(chosen)
+        return out
+
+    def _copy(self, planner: Planner) -> Planner:
+        try:
+            return copy.deepcopy(planner)
+        except Exception as error:  # whatever a user's planner raises
+            raise ConfigError(
+                f"planner '{self.egos.name}' can't be copied ({_words(error)}), but a search forks it with its "
+                "branches: simulate with --search none"
+            ) from error
+
+    def _traffic(
+        self,
+        row: int,
+        step: int,
+        own: NDArray[np.float64],
+        moves: NDArray[np.float64],
+        there: NDArray[np.bool_],
+    ) -> Traffic:
+        segment = self.egos.segments[row]
+        moves, there = moves[: segment.num_agents], there[: segment.num_agents]
+        moves = np.where(there[:, None], moves, 0.0)
+        return Traffic(
+            step=step,
+            time=step * self.env.dt,
+            ego=segment.ego,
+            state=fixed(own),
+            position=fixed(moves[:, :2]),
+            heading=fixed(moves[:, 2]),
+            velocity=fixed(moves[:, 3:]),
+            size=fixed(segment.size[:, :2].astype(np.float64)),
+            agent_type=fixed(segment.agent_type),
+            valid=fixed(there),
+            lights=fixed(segment.signal_state[:, step]),
+        )
+
+
+def _words(error: Exception) -> str:
+    """An exception on one line, with the place that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}{place}"

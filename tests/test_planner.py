@@ -1,0 +1,360 @@
+"""A planner as the ego: what it sees, that it is forked with its branches, and that its failures are counted."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers_segments import crossing, hide, straight_road
+from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.cli import main
+from symphony.config import EvaluateConfig
+from symphony.data.builtin import builtin_store
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation.report import report
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.driving import simulation
+from symphony.simulation.planned import EgoPlanners
+from symphony.simulation.planner import (
+    MAX_ACCELERATION,
+    MAX_BRAKING,
+    Control,
+    Scenario,
+    Target,
+    Traffic,
+    planner_maker,
+)
+from symphony.simulation.saved_files import RolloutFolder, load_rollouts
+from symphony.simulation.saving import save_simulation
+
+AGENT = "pretrained:bc_ts_h"
+
+
+class Wanderer:
+    """Accelerates at random, and notices when it is not where it went or is asked twice."""
+
+    def reset(self, scenario: Scenario) -> None:
+        self.rng = np.random.default_rng(scenario.seed)
+        self.state, self.step = scenario.state, 0
+
+    def plan(self, traffic: Traffic) -> Target:
+        if traffic.step != self.step or not np.allclose(traffic.state, self.state, atol=1e-3):
+            raise RuntimeError("taken for another")
+        x, y, heading, speed = traffic.state
+        self.step, travel = self.step + 1, 0.2 * speed
+        speed = max(speed + 0.5 * self.rng.normal(), 0.0)
+        self.state = np.array([x + travel * np.cos(heading), y + travel * np.sin(heading), heading, speed])
+        return Target(*self.state)
+
+
+class Shared(Wanderer):
+    """Its copies are itself."""
+
+    def __deepcopy__(self, memo: Any) -> Shared:
+        return self
+
+
+class Locked(Wanderer):
+    """Can't be copied."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+
+class Odd:
+    """Gives back something odd at step 3 and coasts before."""
+
+    what: Any = None
+
+    def reset(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+
+    def plan(self, traffic: Traffic) -> Any:
+        if traffic.step < 3:
+            return np.zeros(2)
+        return self.what(traffic) if callable(self.what) else self.what
+
+
+class Unready(Odd):
+    def reset(self, scenario: Scenario) -> None:
+        raise RuntimeError("not today")
+
+
+def odd(given: Any) -> type[Odd]:
+    return type("Odd", (Odd,), {"what": staticmethod(given) if callable(given) else given})
+
+
+def dataset(agent: Any, count: int = 2, duration: int = 4, interactive: int = 2) -> SceneDataset:
+    store = SegmentStore(builtin_store("test"))
+    return SceneDataset(store, interactive, agent.dynamics, range(count), routes=True, duration=duration)
+
+
+def simulated(make: Any, count: int = 2, **settings: Any) -> Any:
+    agent = load_agent(AGENT)
+    data = dataset(agent, count)
+    egos = EgoPlanners("mine", make, [data.segment(i) for i in range(count)])
+    config = EvaluateConfig(**{"rollouts": 4, "search": "none", **settings})
+    return simulation(agent, data.scenes(range(count)), config, egos=egos, keep_tree=True)
+
+
+SEARCHES: list[dict[str, Any]] = [
+    {"search": "none"},
+    {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5},
+    {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2},
+    {
+        "search": "tree",
+        "branches": 6,
+        "rule": "best",
+        "prune_every": 4,
+        "retries": 2,
+        "retry_above": -100.0,
+    },
+    {"search": "oracle", "branches": 4},
+    {"search": "best", "branches": 2},
+]
+
+
+@pytest.mark.parametrize("settings", SEARCHES, ids=lambda given: "-".join(map(str, given.values())))
+def test_planners_are_forked_with_their_branches(settings: dict[str, Any]) -> None:
+    """A planner that went one way is never asked about another."""
+    found = simulated(Wanderer, **settings)
+    assert found.failed == ({}, {})
+    if settings["search"] == "none":
+        speed = found.rollouts.state[:, :, :, 0, 3]
+        assert (speed[:, 0] != speed[:, 1]).any()
+    if settings["search"] == "tree":
+        parents = found.search.parents[..., :-1, :]
+        assert (parents != torch.arange(6)).any(), "nobody was forked"
+
+
+def test_planners_that_share_their_memory_are_taken_for_another() -> None:
+    found = simulated(Shared, search="tree", branches=6, rule="best", prune_every=5)
+    assert any("taken for another" in why for each in found.failed for why in each.values())
+
+
+def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
+    assert simulated(Locked).failed == ({}, {})
+    with pytest.raises(ConfigError, match=r"'mine' can't be copied.*--search none"):
+        simulated(Locked, search="tree", branches=6, rule="best", prune_every=5)
+
+
+@pytest.mark.parametrize("search", ["tree", "oracle"])
+def test_the_search_judges_learned_agents_only(search: str) -> None:
+    result = simulated(Wanderer, search=search, branches=6).search
+    assert (result.simulated_scores[..., 0] == 0).all()
+    if search == "tree":
+        assert (result.simulated_scores[..., 1] != 0).all()
+
+
+def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
+    seen: list[Traffic] = []
+    told: list[Scenario] = []
+
+    class Pushes:
+        def reset(self, scenario: Scenario) -> None:
+            told.append(scenario)
+
+        def plan(self, traffic: Traffic) -> Control:
+            seen.append(traffic)
+            return Control(99.0 if traffic.step < 3 else -99.0, 0.0)
+
+    agent = load_agent(AGENT)
+    data = dataset(agent)
+    segment = data.segment(0)
+    found = simulated(Pushes, count=2, rollouts=1)
+    state = found.rollouts.state[0, 0].numpy()
+    mine = [t for t in seen if t.ego == segment.ego and np.array_equal(t.size, segment.size[:, :2])]
+    assert [t.step for t in mine] == list(range(segment.num_steps - 1))
+    interactive = data.scenes([0]).interactive[0].tolist()
+    others = np.setdiff1d(np.arange(segment.num_agents), interactive)
+    for t in mine:
+        np.testing.assert_allclose(t.position[interactive], state[t.step, :, :2], atol=1e-4)
+        np.testing.assert_allclose(t.state, state[t.step, 0], atol=1e-4)
+        np.testing.assert_allclose(t.position[others], segment.position[others, t.step, :2], atol=1e-4)
+        np.testing.assert_allclose(t.velocity[others], segment.velocity[others, t.step], atol=1e-4)
+        assert (t.valid[others] == segment.valid[others, t.step]).all()
+        assert (t.lights == segment.signal_state[:, t.step]).all()
+        assert t.time == pytest.approx(t.step * segment.dt)
+    change = np.diff(state[:5, 0, 3]) / segment.dt
+    np.testing.assert_allclose(change[:3], MAX_ACCELERATION, atol=1e-3)
+    assert change[3] == pytest.approx(-min(MAX_BRAKING, state[3, 0, 3] / segment.dt), abs=1e-3)
+    scenario = told[0]
+    assert scenario.steps == segment.num_steps - 1
+    assert np.linalg.norm(scenario.route[0] - segment.position[segment.ego, 0, :2]) < 4
+    assert len({one.seed for one in told}) == len(told)
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (lambda _: 1 / 0, "step 3: ZeroDivisionError: division by zero (test_planner.py:"),
+        ((float("nan"), 0.0), "step 3: ValueError: a plan that is not finite"),
+        ((0.0, 0.0, float("inf"), 0.0), "not finite"),
+        ((1.0, 2.0, 3.0), "not a 3 one"),
+        (None, "step 3: "),
+        ("left", "step 3: ValueError"),
+        (lambda t: Target(t.state[0] + 50, t.state[1], 0.0, 5.0), "a target 50.0 m away"),
+        (lambda t: Target(t.state[0], t.state[1], 0.0, 500.0), "at 500.0 m/s"),
+        (lambda t: t.position.fill(0), "read-only"),
+    ],
+)
+def test_what_is_odd_fails_the_run_from_there_on(given: Any, why: str) -> None:
+    found = simulated(odd(given), count=1, rollouts=2)
+    assert sorted(found.failed[0]) == [0, 1]
+    assert why in found.failed[0][0]
+    counted = found.rollouts.counted[0]
+    assert counted[:, :3].all()
+    assert not counted[:, 3:].any()
+    assert found.rollouts.state.isfinite().all()
+
+
+def test_failures_are_those_of_their_own_rollouts_in_a_search() -> None:
+    """Half of the branches fail; no leaf is without what became of its own planner."""
+    fates: dict[int, bool] = {}
+
+    class Moody(Wanderer):
+        def reset(self, scenario: Scenario) -> None:
+            super().reset(scenario)
+            self.bad = bool(fates.setdefault(scenario.seed, len(fates) % 2 == 0))
+
+        def plan(self, traffic: Traffic) -> Target:
+            if self.bad and traffic.step == 2:
+                raise RuntimeError("no more")
+            return super().plan(traffic)
+
+    found = simulated(Moody, count=1, search="tree", branches=6, rule="best", prune_every=4)
+    first = found.search.slots[0, 0, 0].tolist()
+    assert sorted(found.failed[0]) == [k for k, slot in enumerate(first) if slot % 2 == 0]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    late = hide(straight_road(3, seed=5, steps=21), 0, slice(0, 2))
+    fill(tmp_path / "store", [crossing(4, steps=21), late, straight_road(4, steps=21)])
+    return tmp_path / "store"
+
+
+def run(store: Path, out: Path, planner: str, batch: int = 2, **settings: Any) -> RolloutFolder:
+    agent = load_agent(AGENT)
+    data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=4)
+    config = EvaluateConfig(rollouts=2, branches=4, batch=batch, **settings)
+    return save_simulation(out, agent, data, config, planner=planner)
+
+
+def test_the_same_seed_gives_the_same_bytes_in_any_batch(store: Path, tmp_path: Path) -> None:
+    one, other = (run(store, tmp_path / str(batch), f"{__name__}:Wanderer", batch) for batch in (1, 3))
+    digests = [{e.segment: e.sha256 for e in folder.entries} for folder in (one, other)]
+    assert digests[0] == digests[1]
+    assert len(digests[0]) == 2
+    third = run(store, tmp_path / "seed", f"{__name__}:Wanderer", seed=1)
+    assert {e.segment: e.sha256 for e in third.entries} != digests[0]
+
+
+def test_a_segment_without_its_ego_is_on_record(store: Path, tmp_path: Path) -> None:
+    folder = run(store, tmp_path / "sim", "log", search="none")
+    assert [(entry.segment, entry.rollouts) for entry in folder.failures] == [("straight-5", 2)]
+    assert "ego" in str(folder.failures[0].failed)
+    assert folder.about.drivers == {"ego": "log", "interactive": AGENT, "others": "playback"}
+    for saved in folder:
+        assert saved.agents[0] == saved.segment.ego
+        assert saved.drivers == ("log", AGENT)
+        assert saved.goal[0, 0] >= 0
+    with pytest.raises(DataError, match="another simulation"):
+        run(store, tmp_path / "sim", "idm", search="none")
+
+
+def test_the_command_simulates_reports_and_shows(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(
+        "class Planner:\n"
+        "    def reset(self, scenario):\n"
+        "        self.ends = 5 if scenario.segment_id == 'crossing-0' else 99\n"
+        "    def plan(self, traffic):\n"
+        "        return (0.0, 0.0) if traffic.step < self.ends else None\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    sim = str(tmp_path / "sim")
+    words = ["--data", str(store), "--out", sim, "--rollouts", "2", "--search", "none", "--duration", "4"]
+    assert main(["simulate", AGENT, "--planner", "mine:Planner", *words]) == 0
+    assert "4 of 6 runs failed, the first: crossing-0, step 5: " in capsys.readouterr().out
+    found = report(load_rollouts(sim), "ego")
+    assert found.totals()["runs"] == 6
+    assert found.totals()["failed_runs"] == 4
+    assert found.agent == f"mine:Planner among {AGENT}"
+    assert main(["report", sim, "--judged", "ego"]) == 0
+    assert json.loads((Path(sim) / "report.json").read_text())["failed_runs"] == 4
+    assert main(["view", sim]) == 0
+    assert "mine:Planner" in (Path(sim) / "view.html").read_text()
+
+
+def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> None:
+    words = ["--data", str(store), "--rollouts", "1", "--planner", "idm"]
+    assert main(["simulate", "playback", "--out", str(tmp_path / "one"), *words]) == 0
+    assert all(saved.drivers == ("idm",) for saved in load_rollouts(tmp_path / "one"))
+    assert main(["simulate", "playback", "--out", str(tmp_path / "two"), *words, "--interactive", "2"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("best", "idm, log or an import path"),
+        ("no_such_module:Planner", "can't import"),
+        ("dataclasses:Field", "can't be called"),
+        ("threading:Event", "has no reset and no plan"),
+        (f"{__name__}:Angry", "can't be made: RuntimeError: never"),
+    ],
+)
+def test_what_is_no_planner_is_refused(name: str, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        planner_maker(name)
+
+
+class Angry:
+    def __init__(self) -> None:
+        raise RuntimeError("never")
+
+
+def test_a_scenario_is_its_own_copy_and_cannot_be_changed() -> None:
+    told: list[Scenario] = []
+
+    class Keeps(Odd):
+        def reset(self, scenario: Scenario) -> None:
+            told.append(scenario)
+
+    simulated(Keeps, count=1, rollouts=1)
+    assert copy.deepcopy(told[0]) is told[0]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        told[0].dt = 1.0  # type: ignore[misc]
+    for array in (told[0].route, told[0].log, told[0].road.lanes.points, told[0].road.speed_limit):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
+    found = simulated(Unready, count=1, rollouts=2, search="tree", branches=4)
+    assert set(found.failed[0].values()) == {found.failed[0][0]}
+    assert "reset: RuntimeError: not today" in found.failed[0][0]
+    assert not found.rollouts.counted.any()
+
+
+def test_without_a_planner_nothing_changes() -> None:
+    """A search judges the first agent, too."""
+    agent = load_agent(AGENT)
+    data = dataset(agent, 1)
+    config = EvaluateConfig(rollouts=2, branches=4)
+    found = simulation(agent, data.scenes([0]), config)
+    assert found.failed == ()
+    assert found.search is not None
+    assert (found.search.simulated_scores[..., 0] != 0).any()
