@@ -71,6 +71,8 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ["view"],
         ["report"],
         ["export"],
+        ["wosac", "evaluate"],
+        ["wosac", "submit"],
         ["demo"],
     ],
     ids=" ".join,

@@ -18,8 +18,9 @@ from symphony.cli import main
 from symphony.data.rollouts import RolloutArrays, read_rollouts
 from symphony.data.sources import wosac_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.submission import SubmissionMeta, scenario_message, shard_name, write_submission
+from symphony.data.submission import meta_message, scenario_message, shard_name, write_submission
 from symphony.data.submission_check import check_submission, required_agents
+from symphony.data.submission_meta import SubmissionMeta
 from symphony.errors import ConfigError, DataError
 
 META = SubmissionMeta(
@@ -50,7 +51,7 @@ def pack(path: Path, shards: dict[str, bytes], mode: str = "w:gz") -> Path:
 
 
 def good_shards() -> list[Shard]:
-    shards = [META.message(), META.message()]
+    shards = [meta_message(META), meta_message(META)]
     for k, name in enumerate(NAMES):
         shards[k % 2].scenario_rollouts.append(scenario_message(name, ROLLOUTS[name]))
     return shards

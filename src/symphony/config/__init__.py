@@ -19,6 +19,7 @@ from symphony.config.training import (
     TrainConfig,
     ValidationConfig,
 )
+from symphony.config.wosac import WosacSettings
 
 __all__ = [
     "FORMAT",
@@ -40,6 +41,7 @@ __all__ = [
     "TableFormat",
     "TrainConfig",
     "ValidationConfig",
+    "WosacSettings",
     "from_dict",
     "read_json",
     "to_json",

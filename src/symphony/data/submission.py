@@ -12,13 +12,13 @@ import re
 import tarfile
 import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from symphony.data.rollouts import STATES, RolloutArrays
 from symphony.data.sources import wosac_pb2 as pb
+from symphony.data.submission_meta import SubmissionMeta
 from symphony.errors import ConfigError, DataError
 
 ROLLOUTS, FUTURE = 32, 80
@@ -31,38 +31,9 @@ FIELDS = dict(zip(STATES, ("center_x", "center_y", "center_z", "heading"), stric
 _PARAMETERS = re.compile(r"\d+(\.\d+)?[KMBT]?")
 
 
-@dataclass(frozen=True)
-class SubmissionMeta:
-    """What a submission says about itself; there are no defaults for what only its authors can answer.
-
-    Attributes:
-        account_name: e-mail address registered with the challenge.
-        unique_method_name: short name on the leaderboard.
-        uses_lidar_data: whether the model uses lidar data.
-        uses_camera_data: whether it uses camera data.
-        uses_public_model_pretraining: whether public models were used for pre-training.
-        num_model_parameters: a number with a suffix, such as ``200K``.
-        acknowledge_complies_with_closed_loop_requirement: that every step was simulated from the steps before it.
-        authors, affiliation, description, method_link: further information.
-        public_model_names: which public models.
-    """
-
-    account_name: str
-    unique_method_name: str
-    uses_lidar_data: bool
-    uses_camera_data: bool
-    uses_public_model_pretraining: bool
-    num_model_parameters: str
-    acknowledge_complies_with_closed_loop_requirement: bool
-    authors: tuple[str, ...] = ()
-    affiliation: str = ""
-    description: str = ""
-    method_link: str = ""
-    public_model_names: tuple[str, ...] = ()
-
-    def message(self) -> pb.SimAgentsChallengeSubmission:
-        """The message without scenarios."""
-        return pb.SimAgentsChallengeSubmission(submission_type=SIM_AGENTS, **vars(self))
+def meta_message(meta: SubmissionMeta) -> pb.SimAgentsChallengeSubmission:
+    """A submission without scenarios."""
+    return pb.SimAgentsChallengeSubmission(submission_type=SIM_AGENTS, **vars(meta))
 
 
 def meta_problems(message: pb.SimAgentsChallengeSubmission) -> list[tuple[str, str]]:
@@ -118,7 +89,7 @@ def write_submission(
         raise ConfigError(f"shards must be at least 1, is {shards}")
     if not out.name.endswith(".tar.gz"):
         raise ConfigError(f"{out}: a submission's name ends in .tar.gz")
-    message = meta.message()
+    message = meta_message(meta)
     for field, problem in meta_problems(message):
         raise ConfigError(f"{field}: {problem}")
     seen: set[str] = set()

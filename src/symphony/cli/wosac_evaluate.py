@@ -1,0 +1,74 @@
+"""Score an agent on run segments of any source as the Waymo Open Sim Agents Challenge does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from symphony.config import WosacSettings
+from symphony.files import write_json
+
+if TYPE_CHECKING:
+    from symphony.evaluation.wosac import WosacEvaluation
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Simulate 32 rollouts of every run segment and score them, beside log playback and constant velocity.
+
+    The agent drives all vehicles; pedestrians and cyclists keep their velocity. Standard errors are over recordings.
+    """
+
+    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
+    """Folder of a run (see `symphony train`), `pretrained:NAME`, or a baseline."""
+    data: Path
+    """Store of run segments of 8 s or more, of any time step."""
+    config: Literal["2024", "2025"] = "2025"
+    """Year of the challenge."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write all numbers to, those of every run segment included."""
+    segments: tuple[str, ...] = ()
+    """Ids of the run segments, or their numbers in the store; by default all."""
+    settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
+
+    def run(self) -> None:
+        """Simulate and score, showing how far it is, and report."""
+        from symphony.agents import load_agent
+        from symphony.cli.evaluate import segments_bar
+        from symphony.cli.plot import segment_index
+        from symphony.data.store import SegmentStore
+        from symphony.evaluation.wosac import evaluate_wosac
+
+        agent, store = load_agent(self.agent, self.settings.device), SegmentStore(self.data)
+        items = [segment_index(store, name) for name in self.segments] or list(range(len(store)))
+        with segments_bar(f"scoring {agent.name}") as advance:
+            found = evaluate_wosac(agent, store, items, self.settings, self.config, advance)
+        _print(found)
+        if self.json is not None:
+            write_json(self.json, found.record())
+
+
+def _print(found: WosacEvaluation) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    title = f"WOSAC {found.config}, {len(found.segments)} run segments, {len(set(found.groups))} recordings"
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+    columns = {name: found.numbers(name) for name in found.scores}
+    table.add_column("", overflow="fold")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for number in next(iter(columns.values())):
+        table.add_row(
+            number.removesuffix("_likelihood"), *(_shown(*numbers[number]) for numbers in columns.values())
+        )
+    table.add_row("CPU seconds", *(f"{seconds:.1f}" for seconds in found.seconds.values()))
+    Console().print(table)
+
+
+def _shown(mean: float, error: float) -> str:
+    return f"{mean:.4f}" if math.isnan(error) else f"{mean:.4f} ± {error:.4f}"

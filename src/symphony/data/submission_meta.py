@@ -1,0 +1,38 @@
+"""What a submission to the Waymo Open Sim Agents Challenge says about itself.
+
+Imports nothing heavy, so that the command line can ask for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SubmissionMeta:
+    """What a submission says about itself; there are no defaults for what only its authors can answer.
+
+    Attributes:
+        account_name: e-mail address registered with the challenge.
+        unique_method_name: short name on the leaderboard.
+        uses_lidar_data: whether the model uses lidar data.
+        uses_camera_data: whether it uses camera data.
+        uses_public_model_pretraining: whether public models were used for pre-training.
+        num_model_parameters: a number with a suffix, such as ``200K``.
+        acknowledge_complies_with_closed_loop_requirement: that every step was simulated from the steps before it.
+        authors, affiliation, description, method_link: further information.
+        public_model_names: which public models.
+    """
+
+    account_name: str
+    unique_method_name: str
+    uses_lidar_data: bool
+    uses_camera_data: bool
+    uses_public_model_pretraining: bool
+    num_model_parameters: str
+    acknowledge_complies_with_closed_loop_requirement: bool
+    authors: tuple[str, ...] = ()
+    affiliation: str = ""
+    description: str = ""
+    method_link: str = ""
+    public_model_names: tuple[str, ...] = ()
