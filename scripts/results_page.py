@@ -98,13 +98,6 @@ NGSIM = (
     ("BC+TS+H", "ngsim/{}/bc_ts_h-0-often"),
     ("BC+TS+H, freeways among the simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
 )
-MIXED = (
-    ("BC, simulated data", "ngsim-mixed/{}/mixed-bc"),
-    ("BC+H, simulated data", "ngsim-mixed/{}/mixed-bc_h"),
-    ("BC, then the other place (2 seeds)", "ngsim-mixed/{}/other-bc-*"),
-    ("BC+H, then the other place (2 seeds)", "ngsim-mixed/{}/other-bc_h-*"),
-    ("BC+TS+H, simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
-)
 NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
 RELATIONS = (
     ("BC to BC+TS", "bc", "bc_ts"),
@@ -253,7 +246,6 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "relations": relations,
     "features": lambda: means(FEATURES),
     "ngsim": lambda: beside(NGSIM, PLACES, THREE),
-    "ngsim-mixed": lambda: beside(MIXED, PLACES, THREE),
     "halving": lambda: means(HALVING),
     "ways": lambda: means(WAYS),
     "long": lambda: setting("long"),
