@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -32,7 +33,7 @@ from symphony.simulation.workers import batches, naming, shared
 
 BASELINES = ("playback", "constant_velocity")
 """Evaluated beside every agent, on the agents it drives and for as long."""
-Metric = Callable[[SceneBatch, Rollouts], Tensor]
+Metric = Callable[[SceneBatch, Rollouts], Float[Tensor, "B K"]]
 """A metric of a user's own: a number [B, K] per rollout, NaN where there is none."""
 
 
@@ -51,7 +52,7 @@ class EvaluatedBatch(NamedTuple):
     segments: list[RunSegment]
     scenes: SceneBatch
     rollouts: Rollouts
-    goal: Tensor
+    goal: Int[Tensor, "B K N"]
 
 
 @dataclass(frozen=True)

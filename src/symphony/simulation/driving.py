@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Int
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
@@ -37,7 +38,7 @@ class Simulation(NamedTuple):
     """
 
     rollouts: Rollouts
-    goal: Tensor
+    goal: Int[Tensor, "B K N"]
     search: BeamSearchResult | None
     failed: tuple[dict[int, str], ...] = ()
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -30,10 +31,10 @@ class Rollouts(NamedTuple):
         counted: [..., T, N] steps that are judged: of real agents, up to the segment's last logged step.
     """
 
-    state: Tensor
-    collision: Tensor
-    offroad: Tensor
-    counted: Tensor
+    state: Float[Tensor, "*b T+1 N 4"]
+    collision: Bool[Tensor, "*b T N"]
+    offroad: Bool[Tensor, "*b T N"]
+    counted: Bool[Tensor, "*b T N"]
 
     def cpu(self) -> Rollouts:
         """The same on the CPU."""
@@ -75,8 +76,12 @@ def simulate(
 
 @torch.no_grad()
 def draw_goals(
-    env: DrivingEnv, goals: TensorDictModuleBase | None, start: TensorDictBase, seed: int, tree: Tensor
-) -> Tensor:
+    env: DrivingEnv,
+    goals: TensorDictModuleBase | None,
+    start: TensorDictBase,
+    seed: int,
+    tree: Int[Tensor, "*b"],
+) -> Int[Tensor, "*b N"]:
     """The route [..., N] each agent follows from a start state, -1 for none.
 
     Args:
@@ -142,7 +147,7 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
     return Rollouts(state, collision, offroad, counted_steps(env, start, collision.shape[-2]))
 
 
-def counted_steps(env: DrivingEnv, start: TensorDictBase, steps: int) -> Tensor:
+def counted_steps(env: DrivingEnv, start: TensorDictBase, steps: int) -> Bool[Tensor, "*b T N"]:
     """Where [..., T, N] agents are real and their segment still has logged steps."""
     step = start.get(keys.STEP) + torch.arange(1, steps + 1, device=start.device)
     within = step <= env.scenes.last_step[start.get(keys.SCENE)]

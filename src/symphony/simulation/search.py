@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -69,7 +70,7 @@ def aggregate_of(config: SearchConfig) -> Callable[[Tensor], Tensor]:
     return load_object(config.aggregate) if ":" in config.aggregate else AGGREGATES[config.aggregate]
 
 
-def flag_score(state: TensorDictBase) -> Tensor:
+def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
     """Score [..., N] of an oracle: 1 where an agent collides or is off the road."""
     bad = state.get(keys.COLLISION) | state.get(keys.OFFROAD)
     return (bad.squeeze(-1) & state.get(keys.VALID)).float()
@@ -89,7 +90,7 @@ def realism_score(
     if discriminator is not None:
         score = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID)
 
-    def until_the_end(state: TensorDictBase) -> Tensor:
+    def until_the_end(state: TensorDictBase) -> Float[Tensor, "*b N"]:
         going = state.get(keys.STEP) <= env.scenes.last_step[state.get(keys.SCENE)]
         found = torch.where(going, score(state), ENDED)
         return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
@@ -108,7 +109,7 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
     apart from its actions'.
     """
 
-    def noise(start: TensorDictBase, periods: int) -> Tensor:
+    def noise(start: TensorDictBase, periods: int) -> Float[Tensor, "*b P"]:
         root = start.get(keys.STREAM)[..., 0, :]
         return uniform(seed, fold_in(root, _PRUNING), torch.arange(periods, device=start.device))
 
