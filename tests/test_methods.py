@@ -278,7 +278,7 @@ def led_to(steps: TensorDictBase) -> TensorDictBase:
 def test_searches_are_judged_up_to_the_end_of_each_scene(store: Path, tmp_path: Path) -> None:
     wide = SearchConfig(branches=4, segments=3, prune_every=4, updates=2, states=8)
     record, replay = searched(store, tmp_path, search=wide)
-    env, found = replay.env, replay.found
+    env, found = replay.env, replay.leaves
     for steps, kind in ((found["tree"], "all"), (found, "kept")):
         seen = env.at(led_to(steps))
         going = (seen[keys.STEP] <= env.scenes.last_step[seen[keys.SCENE]]) & seen[keys.VALID]
@@ -292,14 +292,14 @@ def test_searches_are_judged_up_to_the_end_of_each_scene(store: Path, tmp_path: 
 def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> None:
     """Actions of survivors lead from each of their states to the next."""
     _, replay = searched(store, tmp_path)
-    env, lived = replay.env, replay.found.exclude("tree", "collector")
+    env, lived = replay.env, replay.leaves.exclude("tree", "collector")
     before, after = lived[..., :-1], lived[..., 1:]
     stepped = env.step(env.at(before).set(keys.ACTION, before[keys.ACTION]))["next"]
     assert torch.equal(stepped[keys.STATE], after[keys.STATE])
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
     rows = env.scenes.route_logged[:, None, None].expand(*lived.shape, 2)
     assert torch.equal(lived[keys.GOAL], rows)
-    rank = replay.found["collector", "beam_rank"]
+    rank = replay.leaves["collector", "beam_rank"]
     assert sorted(rank[0, :, 0].tolist()) == [0, 1]
     assert (rank == rank[..., :1]).all()
 

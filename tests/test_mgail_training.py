@@ -128,7 +128,7 @@ def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, meth
     replay, policy = pieces(trainer)["replay"], trainer.agent.modules["policy"]
     trainer.rng.manual_seed(0)
     replay.refresh(4)
-    env, found = replay.env, replay.found
+    env, found = replay.env, replay.leaves
     assert found.shape[:2] == (2, 2)
     begin = replay.repeatable(99, torch.Generator().manual_seed(0))
     assert begin.shape == (4,)
@@ -247,7 +247,7 @@ def test_the_duration_cuts_segments(store: Path, tmp_path: Path) -> None:
         trainer._update(step)
     replay, short = pieces(trainer)["replay"], trainer.data
     scenes = replay.env.scenes
-    assert replay.found.shape == (2, 2, 5)
+    assert replay.leaves.shape == (2, 2, 5)
     assert (scenes.last_step == 5).all()
     assert scenes.log_state.shape[1] == short.fitted(scenes.segment.tolist(), scenes)[0].shape[1] == 6
     whole = SceneDataset(SegmentStore(store), 2, Displacement())

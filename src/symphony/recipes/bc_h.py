@@ -34,9 +34,9 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
 
     # The order of updates.
     def update(step: int) -> Updates:
-        items, sees = data.draw(config.segments, rng), observation_of(spec)
-        yield "policy", policy_loss(data.sample_states(items, config.states, sees, rng, device))
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, sees, rng, device))
+        items, observation = data.draw(config.segments, rng), observation_of(spec)
+        yield "policy", policy_loss(data.sample_states(items, config.states, observation, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
 
     phases = [Phase(config.steps, update, cosine(rates, config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)

@@ -53,13 +53,13 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
 
     # The order of updates.
     def update(step: int) -> Updates:
-        items, sees = data.draw(config.segments, rng), observation_of(spec, discriminator=False)
+        items, observation = data.draw(config.segments, rng), observation_of(spec, discriminator=False)
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
-        experts = data.sample_states(items, config.states, sees, rng, device)
-        rollouts = replay.survivors(config.search.states, rng, sees)
+        experts = data.sample_states(items, config.states, observation, rng, device)
+        rollouts = replay.survivors(config.search.states, rng, observation)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, sees, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
 
     phases = [Phase(config.steps, update, cosine(rates, config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)

@@ -52,7 +52,7 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
     # The order of updates, in three phases.
     def regression(step: int) -> Updates:
         items = data.draw(config.segments, rng)
-        yield "policy", regression_loss(data.sample_states(items, config.states, sees, rng, device))
+        yield "policy", regression_loss(data.sample_states(items, config.states, observation, rng, device))
 
     def discriminate(step: int) -> Updates:
         yield "search", replay.refresh(step)
@@ -60,7 +60,6 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
             yield "discriminator", realism_loss(replay.both_kinds(rng))
 
     def head_start(step: int) -> Updates:
-        data.draw(config.segments, rng)
         yield from discriminate(step)
 
     def adversarial(step: int) -> Updates:
@@ -68,11 +67,11 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
         yield from discriminate(step)
         losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
         if config.mgail.expert_weight:
-            experts = data.sample_states(items, config.states, sees, rng, device)
+            experts = data.sample_states(items, config.states, observation, rng, device)
             losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
         yield "policy", losses
 
-    sees, begin = observation_of(spec, discriminator=False), config.mgail.regression
+    observation, begin = observation_of(spec, discriminator=False), config.mgail.regression
     slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
     phases = [
         Phase(begin, regression, cosine(rates, begin)),

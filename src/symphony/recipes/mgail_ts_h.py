@@ -54,11 +54,11 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
 
     # The order of updates, in three phases; goals are learned in all.
     def goals_of(items: list[int]) -> Updates:
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, sees, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
 
     def regression(step: int) -> Updates:
         items = data.draw(config.segments, rng)
-        yield "policy", regression_loss(data.sample_states(items, config.states, sees, rng, device))
+        yield "policy", regression_loss(data.sample_states(items, config.states, observation, rng, device))
         yield from goals_of(items)
 
     def discriminate(step: int) -> Updates:
@@ -76,12 +76,12 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield from discriminate(step)
         losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
         if config.mgail.expert_weight:
-            experts = data.sample_states(items, config.states, sees, rng, device)
+            experts = data.sample_states(items, config.states, observation, rng, device)
             losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
         yield "policy", losses
         yield from goals_of(items)
 
-    sees, begin = observation_of(spec, discriminator=False), config.mgail.regression
+    observation, begin = observation_of(spec, discriminator=False), config.mgail.regression
     slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
     phases = [
         Phase(begin, regression, cosine(rates, begin)),

@@ -45,23 +45,23 @@ class SearchReplay:
         self, collector: BeamSearchCollector, env: DrivingEnv, data: SceneDataset, every: int, states: int
     ) -> None:
         self.collector, self.env, self.data, self.every, self.states = collector, env, data, every, states
-        self._found: TensorDictBase | None = None
+        self._leaves: TensorDictBase | None = None
 
     def refresh(self, step: int) -> TensorDict:
         """Search if it is due at an update, or was never done; what the last search found out about itself:
         see :func:`search_statistics`.
         """
-        if self._found is None or step % self.every == 0:
-            self._found = self.collector.rollout()
-            self._statistics = search_statistics(self.env, self._found)
+        if self._leaves is None or step % self.every == 0:
+            self._leaves = self.collector.rollout()
+            self._statistics = search_statistics(self.env, self._leaves)
         return self._statistics
 
     @property
-    def found(self) -> TensorDictBase:
+    def leaves(self) -> TensorDictBase:
         """Leaves [B, S, T] of the last search, the tree in their entry ``tree``."""
-        if self._found is None:
+        if self._leaves is None:
             raise RuntimeError("nothing was searched yet")
-        return self._found
+        return self._leaves
 
     def survivors(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
         """States of surviving rollouts and what was done in them, drawn uniformly from all before the scenes' ends.
@@ -74,7 +74,7 @@ class SearchReplay:
         Returns:
             TensorDict [K, N]: observation, ``ACTION``, ``RANK`` of the rollout in its tree, ``ROLLOUT`` (True).
         """
-        chosen = _drawn(self.env, self.found, count, rng)
+        chosen = _drawn(self.env, self.leaves, count, rng)
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
         valid = batch.get(keys.VALID)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
@@ -93,7 +93,7 @@ class SearchReplay:
         Returns:
             TensorDict [2 K, N]: observation and ``SIMULATED``.
         """
-        fake = _after(_drawn(self.env, self.found.get("tree"), self.states, rng))
+        fake = _after(_drawn(self.env, self.leaves.get("tree"), self.states, rng))
         real = self._logged(self.states, rng)
         batch = self.env.at(torch.cat([fake.select(*real.keys(True, True)), real]))
         simulated = torch.zeros_like(batch.get(keys.VALID))
@@ -103,13 +103,13 @@ class SearchReplay:
     @property
     def searched(self) -> bool:
         """Whether there was a search yet."""
-        return self._found is not None
+        return self._leaves is not None
 
     def repeatable(self, count: int, rng: torch.Generator) -> TensorDictBase:
         """First states [K] of survivors, with the random numbers that lead along their histories (``noise_plan``)."""
-        first = self.found[..., 0].flatten()
+        first = self.leaves[..., 0].flatten()
         pick = torch.randperm(len(first), generator=rng)[:count]
-        return self.env.at(first[pick]).set(keys.NOISE_PLAN, self.found.get(keys.NOISE).flatten(0, 1)[pick])
+        return self.env.at(first[pick]).set(keys.NOISE_PLAN, self.leaves.get(keys.NOISE).flatten(0, 1)[pick])
 
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
         scenes = self.env.scenes
@@ -146,16 +146,16 @@ def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
     return torch.cat([experts.select(*present), flat])
 
 
-def search_statistics(env: DrivingEnv, found: TensorDictBase) -> TensorDict:
+def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:
     """What matters to a search: whether scores rank colliding and off-road states last (AUC; NaN without any), and
     the share of agent-steps that collide or are off the road before and after pruning.
     """
-    tree, record = found.get("tree"), {}
-    going = found.get(keys.STEP) < env.scenes.last_step[found.get(keys.SCENE)]
-    valid = found.get(keys.VALID) & going
+    tree, record = leaves.get("tree"), {}
+    going = leaves.get(keys.STEP) < env.scenes.last_step[leaves.get(keys.SCENE)]
+    valid = leaves.get(keys.VALID) & going
     for name, key in (("collision", keys.COLLISION), ("offroad", keys.OFFROAD)):
         bad = tree.get(("next", *key)).squeeze(-1) & valid
-        left = found.get(("next", *key)).squeeze(-1) & valid
+        left = leaves.get(("next", *key)).squeeze(-1) & valid
         record[f"search_auc_{name}"] = auc(tree.get(("collector", "beam_score")), bad, valid)
         record[f"search_{name}_all"] = bad.sum() / valid.sum()
         record[f"search_{name}_kept"] = left.sum() / valid.sum()
