@@ -37,7 +37,10 @@ def make(*arguments: str, cwd: Path = ROOT, **environment: str) -> subprocess.Co
         pytest.skip("make is not installed")
     # Not the make that may be running these tests.
     inherited = {
-        key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "MFLAGS", "PYTHON"))
+        key: value
+        for key, value in os.environ.items()
+        # The tests may themselves be run by make, with settings of its own.
+        if not key.startswith(("MAKE", "MFLAGS", "PYTHON", "VENV", "CONSTRAINTS"))
     }
     return subprocess.run(
         [program, *arguments],
