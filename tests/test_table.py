@@ -35,7 +35,6 @@ from symphony.evaluation.comparison import (
     method_name,
 )
 from symphony.evaluation.formats import ABSENT, FORMATS, as_json, as_latex, as_markdown, as_text, print_text
-from symphony.evaluation.paired import PAIRED, clustered_mean, differences
 from symphony.evaluation.paper import METRICS, paper_figures
 from symphony.evaluation.records import evaluation_name, find_runs, keep_evaluation, kept_evaluations
 from symphony.metrics import jensen_shannon
@@ -618,37 +617,3 @@ def test_metrics_of_a_user_s_own_are_columns_where_all_evaluations_have_them() -
     for entry in entries[1:2]:
         entry.record["config"]["metric"] = []  # type: ignore[index]
     assert path not in {column.key for column in compare(entries, "main").columns}
-
-
-def test_paired_differences_are_over_what_both_have_and_over_recordings() -> None:
-    rng, names = np.random.default_rng(0), [f"segment-{k}" for k in range(12)]
-
-    def entry(method: str, seed: int, shift: float) -> Entry:
-        found = make_entry(method, seed)
-        found.record["per_segment"] = [  # type: ignore[index]
-            {"segment": name, "group": f"group-{k // 3}"} | {column.key: base[k] + shift for column in PAIRED}
-            for k, name in enumerate(names)
-        ]
-        return found
-
-    base = rng.normal(size=12)
-    (found,) = differences([entry("bc", 0, 0.0), entry("bc", 1, 1.0), entry("bc_h", 0, 2.5)], "bc")
-    assert (found.method, found.base, found.segments, found.groups) == ("bc_h", "bc", 12, 4)
-    for column in PAIRED:
-        # Seeds are averaged first, and a shift that is the same everywhere has no error.
-        assert found.means[column.key] == pytest.approx(2.0)
-        assert found.errors[column.key] == pytest.approx(0.0, abs=1e-9)
-    assert "12 segments of 4 groups" in found.text()
-    with pytest.raises(ConfigError, match="not among the methods"):
-        differences([entry("bc", 0, 0.0)], "mgail")
-
-
-@given(st.lists(st.floats(-5, 5), min_size=2, max_size=30))
-def test_errors_over_groups_of_one_are_the_usual_ones(values: list[float]) -> None:
-    numbers = np.array(values)
-    mean, error = clustered_mean(numbers, np.arange(len(numbers)))
-    assert mean == pytest.approx(numbers.mean())
-    assert error == pytest.approx(numbers.std(ddof=1) / np.sqrt(len(numbers)), abs=1e-12)
-    # Copies within a group tell nothing new.
-    twice = clustered_mean(np.repeat(numbers, 2), np.repeat(np.arange(len(numbers)), 2))
-    assert twice == pytest.approx((mean, error), abs=1e-9)

@@ -1,0 +1,47 @@
+"""Paired differences between methods, with errors over recordings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symphony.errors import ConfigError
+from symphony.evaluation.comparison import Entry
+from symphony.evaluation.paired import PAIRED, clustered_mean, differences
+from test_table import make_entry
+
+
+def test_paired_differences_are_over_what_both_have_and_over_recordings() -> None:
+    rng, names = np.random.default_rng(0), [f"segment-{k}" for k in range(12)]
+
+    def entry(method: str, seed: int, shift: float) -> Entry:
+        found = make_entry(method, seed)
+        found.record["per_segment"] = [  # type: ignore[index]
+            {"segment": name, "group": f"group-{k // 3}"} | {column.key: base[k] + shift for column in PAIRED}
+            for k, name in enumerate(names)
+        ]
+        return found
+
+    base = rng.normal(size=12)
+    (found,) = differences([entry("bc", 0, 0.0), entry("bc", 1, 1.0), entry("bc_h", 0, 2.5)], "bc")
+    assert (found.method, found.base, found.segments, found.groups) == ("bc_h", "bc", 12, 4)
+    for column in PAIRED:
+        # Seeds are averaged first, and a shift that is the same everywhere has no error.
+        assert found.means[column.key] == pytest.approx(2.0)
+        assert found.errors[column.key] == pytest.approx(0.0, abs=1e-9)
+    assert "12 segments of 4 groups" in found.text()
+    with pytest.raises(ConfigError, match="not among the methods"):
+        differences([entry("bc", 0, 0.0)], "mgail")
+
+
+@given(st.lists(st.floats(-5, 5), min_size=2, max_size=30))
+def test_errors_over_groups_of_one_are_the_usual_ones(values: list[float]) -> None:
+    numbers = np.array(values)
+    mean, error = clustered_mean(numbers, np.arange(len(numbers)))
+    assert mean == pytest.approx(numbers.mean())
+    assert error == pytest.approx(numbers.std(ddof=1) / np.sqrt(len(numbers)), abs=1e-12)
+    # Copies within a group tell nothing new.
+    twice = clustered_mean(np.repeat(numbers, 2), np.repeat(np.arange(len(numbers)), 2))
+    assert twice == pytest.approx((mean, error), abs=1e-9)
