@@ -1,6 +1,8 @@
-"""Paired differences between methods, with errors over recordings."""
+"""Columns of a user's own, and paired differences between methods with errors over recordings."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from symphony.errors import ConfigError
-from symphony.evaluation.comparison import Entry
+from symphony.evaluation.comparison import Entry, compare
+from symphony.evaluation.formats import as_markdown
 from symphony.evaluation.paired import PAIRED, clustered_mean, differences
-from test_table import make_entry
+from test_table import make_entry, row_of
 
 
 def test_paired_differences_are_over_what_both_have_and_over_recordings() -> None:
@@ -45,3 +48,22 @@ def test_errors_over_groups_of_one_are_the_usual_ones(values: list[float]) -> No
     # Copies within a group tell nothing new.
     twice = clustered_mean(np.repeat(numbers, 2), np.repeat(np.arange(len(numbers)), 2))
     assert twice == pytest.approx((mean, error), abs=1e-9)
+
+
+def test_metrics_of_a_user_s_own_are_columns_where_all_evaluations_have_them() -> None:
+    path = "my.metrics:jerk"
+    entries = [make_entry(method, seed) for method in ("bc", "bc_h") for seed in (0, 1)]
+    for number, entry in enumerate(entries):
+        entry.record["config"]["metric"] = [path]  # type: ignore[index]
+        entry.record[path] = float(number)  # type: ignore[index]
+    comparison = compare(entries, "main")
+    assert [column.title for column in comparison.columns][-2:] == ["jerk", "CPU"]
+    assert row_of(comparison, "bc").cells[path].mean == 0.5
+    assert row_of(comparison, "bc_h").cells[path].mean == 2.5
+    assert not row_of(comparison, "bc").cells[path].best, "nobody said whether low is good"
+    assert math.isnan(row_of(comparison, "playback").cells[path].mean)
+    assert "jerk" in as_markdown(comparison)
+    entries[0].record["config"]["metric"] = []  # type: ignore[index]
+    for entry in entries[1:2]:
+        entry.record["config"]["metric"] = []  # type: ignore[index]
+    assert path not in {column.key for column in compare(entries, "main").columns}

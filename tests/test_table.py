@@ -598,22 +598,3 @@ def test_figures_of_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="must end in"):
         plot_curvature({"BC": (some, some)}, tmp_path / "x.doc")
     assert not list(tmp_path.iterdir())
-
-
-def test_metrics_of_a_user_s_own_are_columns_where_all_evaluations_have_them() -> None:
-    path = "my.metrics:jerk"
-    entries = [make_entry(method, seed) for method in ("bc", "bc_h") for seed in (0, 1)]
-    for number, entry in enumerate(entries):
-        entry.record["config"]["metric"] = [path]  # type: ignore[index]
-        entry.record[path] = float(number)  # type: ignore[index]
-    comparison = compare(entries, "main")
-    assert [column.title for column in comparison.columns][-2:] == ["jerk", "CPU"]
-    assert row_of(comparison, "bc").cells[path].mean == 0.5
-    assert row_of(comparison, "bc_h").cells[path].mean == 2.5
-    assert not row_of(comparison, "bc").cells[path].best, "nobody said whether low is good"
-    assert math.isnan(row_of(comparison, "playback").cells[path].mean)
-    assert "jerk" in as_markdown(comparison)
-    entries[0].record["config"]["metric"] = []  # type: ignore[index]
-    for entry in entries[1:2]:
-        entry.record["config"]["metric"] = []  # type: ignore[index]
-    assert path not in {column.key for column in compare(entries, "main").columns}
