@@ -17,14 +17,12 @@ from symphony.simulation.demonstrations import SceneDataset
 
 _RANK = ("collector", "beam_rank")
 _LEARNED = (
-    keys.OWN,
-    keys.OBJECTS,
+    *keys.SEEN,
     keys.OBJECTS_MASK,
-    keys.POINTS,
     keys.POINTS_MASK,
+    keys.LIGHTS_MASK,
     keys.VALID,
     keys.ACTION,
-    keys.ROUTE,
     keys.ROLLOUT,
     keys.RANK,
 )
