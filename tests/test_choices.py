@@ -15,8 +15,10 @@ from symphony.metrics import (
     Choice,
     RolloutMetrics,
     choices,
+    jensen_shannon,
     route_turns,
     sampled_divergence,
+    sampling_floor,
     standing_at_end,
 )
 from symphony.metrics.choices import choice_numbers
@@ -34,23 +36,23 @@ def perfect(
 
 
 def means(segments: int, rollouts: int, copies: int = 1, trials: int = 60) -> np.ndarray:
-    """Value, floor, corrected value and its error of every trial [trials, 4]."""
+    """Value, bias, corrected value and its error of every trial [trials, 4]."""
     rng = np.random.default_rng(segments + rollouts + copies)
     found = [sampled_divergence(*perfect(segments, rollouts, rng, copies)) for _ in range(trials)]
-    return np.array([[one.value, one.floor, one.value - one.floor, one.error] for one in found])
+    return np.array([[one.value, one.value - one.corrected, one.corrected, one.error] for one in found])
 
 
 @pytest.mark.parametrize(("segments", "rollouts"), [(100, 4), (100, 16), (400, 4)])
-def test_a_perfect_policy_scores_its_floor(segments: int, rollouts: int) -> None:
+def test_a_perfect_policy_is_corrected_to_zero(segments: int, rollouts: int) -> None:
     found = means(segments, rollouts)
-    value, floor, corrected, error = found.mean(0)
-    assert floor == pytest.approx(value, rel=0.25)
+    value, bias, corrected, error = found.mean(0)
+    assert bias == pytest.approx(value, rel=0.25)
     assert abs(corrected) < error, "zero within its error"
     assert abs(corrected) < value / 4
     assert found[:, 2].std() < 2 * error
 
 
-def test_more_data_lower_the_floor_and_alike_rollouts_do_not() -> None:
+def test_more_data_lower_the_bias_and_alike_rollouts_do_not() -> None:
     few, many = means(100, 16)[:, 1].mean(), means(400, 16)[:, 1].mean()
     assert many == pytest.approx(few / 4, rel=0.3)
     assert means(100, 4)[:, 1].mean() > few
@@ -58,23 +60,39 @@ def test_more_data_lower_the_floor_and_alike_rollouts_do_not() -> None:
     assert means(100, 16, copies=4)[:, 1].mean() == pytest.approx(means(100, 4)[:, 1].mean(), rel=0.15)
 
 
-def test_what_differs_is_left_when_the_floor_is_taken_away() -> None:
+def test_what_differs_is_left_when_the_bias_is_taken_away() -> None:
     rng = np.random.default_rng(0)
     p, q = rng.dirichlet(np.ones(BINS), 2)
     middle = (p + q) / 2
     true = 0.5 * (p * np.log(p / middle) + q * np.log(q / middle)).sum()
     found = [sampled_divergence(rng.multinomial(4, p, 200), rng.multinomial(1, q, 200)) for _ in range(60)]
-    corrected, value = (np.array(x) for x in ([d.value - d.floor for d in found], [d.value for d in found]))
+    corrected, value = (np.array(x) for x in ([d.corrected for d in found], [d.value for d in found]))
     assert abs(corrected.mean() - true) < 3 * corrected.std() / math.sqrt(60) + 0.02 * true
     assert abs(value.mean() - true) > abs(corrected.mean() - true)
     assert np.mean([d.error for d in found]) == pytest.approx(corrected.std(), rel=0.3)
 
 
-def test_a_single_sample_has_no_floor() -> None:
+def test_a_single_sample_has_no_error() -> None:
     found = sampled_divergence(np.array([[1, 2]]), np.array([[0, 1]]))
     assert found.value > 0
-    assert math.isnan(found.floor)
+    assert math.isnan(found.corrected)
     assert math.isnan(found.error)
+
+
+@pytest.mark.parametrize("segments", [50, 200])
+def test_the_floor_is_what_another_log_scores(segments: int) -> None:
+    rng = np.random.default_rng(segments)
+    p = rng.dirichlet(np.full(BINS, 0.5))
+    logs = [np.eye(BINS, dtype=int)[rng.choice(BINS, segments, p=p)] for _ in range(60)]
+    floors = [sampling_floor(log) for log in logs]
+    # One of the two samples is as large as life, as many rollouts would be.
+    other = [float(jensen_shannon(log.sum(0), p)) for log in logs]
+    assert np.mean(floors) == pytest.approx(np.mean(other), rel=0.25)
+    assert sampling_floor(np.concatenate([logs[0]] * 4)) == pytest.approx(floors[0] / 4, rel=0.25)
+    # A perfect policy on the very segments scores less, if segments differ in what is usual.
+    trials = [perfect(segments, 1600, rng) for _ in range(20)]
+    scored = np.mean([sampled_divergence(policy, log).value for policy, log in trials])
+    assert scored < np.mean([sampling_floor(log) for _, log in trials])
 
 
 # --- standing ---

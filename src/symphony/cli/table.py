@@ -36,7 +36,7 @@ class Table:
     """A row for each way that a method was simulated in (of those that `evaluation` fits), with the cost of each."""
     columns: tuple[TableColumns, ...] = ()
     """More columns: `split`, collisions with playback agents and the rest; `standing`, agents that stand at the end;
-    `corrected`, the divergence less its floor; `goals`, what the search made of the drawn goals."""
+    `corrected`, the divergence without its bias; `goals`, what the search made of the drawn goals."""
     paper: PaperData | None = None
     """Show the paper's own figures on this data set beside ours."""
     paired: Annotated[Method | None, tyro.conf.arg(metavar="METHOD")] = None

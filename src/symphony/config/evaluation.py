@@ -19,8 +19,8 @@ PaperData = Literal["proprietary", "womd"]
 """Data sets whose figures the paper gives."""
 TableFormat = Literal["text", "markdown", "latex", "json"]
 TableColumns = Literal["split", "standing", "corrected", "goals"]
-"""Of a table, on request: collisions with playback agents and the rest, who stands at the end, divergence less its
-floor, what the search made of the goals.
+"""Of a table, on request: collisions with playback agents and the rest, who stands at the end, divergence corrected
+for sampling, what the search made of the goals.
 """
 
 

@@ -85,7 +85,7 @@ COST = Column("cost", "CPU", "s/segment", digits=2)
 AT_A_DISTANCE = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor", "curvature_jsd_corrected")
 """What says nothing of the log itself."""
 FLOOR = Column("curvature_jsd_floor", "JSD floor", "10⁻³", 1000.0, optional=True)
-"""What sampling alone adds to the divergence, beside which it stands."""
+"""What another log of the same size would score, beside the divergence."""
 ASKED: dict[TableColumns, tuple[Column, ...]] = {
     "split": (
         Column("collision_with_playback", "with playback", "%", optional=True),
@@ -101,7 +101,7 @@ ASKED: dict[TableColumns, tuple[Column, ...]] = {
         Column("standing", "standing", "%", digits=1, optional=True),
         Column("standing_log", "in the log", "%", digits=1, optional=True),
     ),
-    "corrected": (Column("curvature_jsd_corrected", "JSD less floor", "10⁻³", 1000.0, optional=True),),
+    "corrected": (Column("curvature_jsd_corrected", "JSD corrected", "10⁻³", 1000.0, optional=True),),
     "goals": (
         Column("goals_turn_variation", "turns moved", "TV", optional=True),
         Column("goals_variation", "goals moved", "TV", optional=True),

@@ -120,7 +120,7 @@ def relations(entries: Sequence[Entry], setting: Setting = "main") -> list[Relat
     """Whether the paper's relations hold in some evaluated runs, one evaluation of each.
 
     Seeds of a method are averaged; errors are of the paired differences between run segments (the linearised error of
-    a factor), clustered by recording. Divergences are compared without what sampling alone adds to them.
+    a factor), clustered by recording. Divergences are compared without their bias by sampling.
 
     Raises:
         DataError: an evaluation without a number that is needed.
@@ -181,7 +181,7 @@ def _pair(one: Statement, before: Sequence[Entry], after: Sequence[Entry]) -> tu
 
 
 def _divergence(before: Sequence[Entry], after: Sequence[Entry]) -> tuple[float, float] | None:
-    """Difference of the divergences without their floors, from what each recording adds to them."""
+    """Difference of the corrected divergences, from what each recording adds to them."""
     parts = [[entry.record["curvature"].get("parts") for entry in entries] for entries in (before, after)]
     if any(one is None for each in parts for one in each):
         return None
@@ -216,7 +216,7 @@ def _paper(one: Statement, setting: Setting) -> dict[PaperData, float]:
     return found
 
 
-def shown(one: Statement, value: float) -> str:
+def formatted(one: Statement, value: float) -> str:
     """A factor or a difference as text, without its unit."""
     if one.kind == "times":
         return f"{value:.1f}"
@@ -236,8 +236,8 @@ def _measured(relation: Relation) -> str:
     one, error = relation.statement, relation.error
     if relation.held is None:
         return relation.missing
-    plus = "" if math.isnan(error) else f" ± {shown(one, error).lstrip('+')}"
-    return f"{shown(one, relation.value)}{plus} {unit(one)}"
+    plus = "" if math.isnan(error) else f" ± {formatted(one, error).lstrip('+')}"
+    return f"{formatted(one, relation.value)}{plus} {unit(one)}"
 
 
 def grid(found: Sequence[Relation]) -> list[list[str]]:
@@ -245,7 +245,9 @@ def grid(found: Sequence[Relation]) -> list[list[str]]:
     lines = [["", "here", *(f"paper, {name}" for name in PAPER_NAMES.values()), "is it so?"]]
     for relation in found:
         one = relation.statement
-        paper = [shown(one, relation.paper[data]) if data in relation.paper else "–" for data in PAPER_NAMES]
+        paper = [
+            formatted(one, relation.paper[data]) if data in relation.paper else "–" for data in PAPER_NAMES
+        ]
         lines.append([one.text, _measured(relation), *paper, relation.verdict])
     return lines
 

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from symphony.metrics.choices import Choice, Standing, choices, route_turns, standing_at_end
-from symphony.metrics.curvature import Divergence, curvature_histogram, jensen_shannon, sampled_divergence
+from symphony.metrics.curvature import (
+    Divergence,
+    curvature_histogram,
+    jensen_shannon,
+    sampled_divergence,
+    sampling_floor,
+)
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
 from symphony.metrics.realism import collisions, displacement, offroad
@@ -29,5 +35,6 @@ __all__ = [
     "passing_gap",
     "route_turns",
     "sampled_divergence",
+    "sampling_floor",
     "standing_at_end",
 ]

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.metrics.choices import Choice, Standing, choice_numbers
-from symphony.metrics.curvature import BINS, Divergence, curvature_histogram, sampled_divergence
+from symphony.metrics.curvature import (
+    BINS,
+    Divergence,
+    curvature_histogram,
+    sampled_divergence,
+    sampling_floor,
+)
 from symphony.metrics.kinds import CollisionKind, CollisionKinds
 
 
@@ -205,10 +211,10 @@ class RolloutMetrics:
             ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
             all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
             standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
-            ``segments`` and ``rollouts`` (per segment). ``curvature_jsd_floor`` is what sampling alone adds to the
-            divergence, ``curvature_jsd_corrected`` the divergence without it (its error is that of the divergence;
-            NaN for a single segment or group). Where kinds were given, likewise the percent of rollouts
-            whose first collision is of a kind, ``collision_into_leader`` and so on for every
+            ``segments`` and ``rollouts`` (per segment). ``curvature_jsd_floor`` is what another log of
+            the same size would score, ``curvature_jsd_corrected`` the divergence without its bias by sampling (its
+            error is that of the divergence; NaN for a single segment or group). Where kinds were given, likewise the
+            percent of rollouts whose first collision is of a kind, ``collision_into_leader`` and so on for every
             :class:`CollisionKind` (they sum to ``collision_rate``), that is with a playback agent,
             ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
             themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
@@ -247,8 +253,8 @@ class RolloutMetrics:
             out[name], out[f"{name}_se"] = _ratio(total, weight, member)
         divergence, _ = self.curvature_divergence()
         out["curvature_jsd"], out["curvature_jsd_se"] = divergence.value, divergence.error
-        out["curvature_jsd_floor"] = divergence.floor
-        out["curvature_jsd_corrected"] = divergence.value - divergence.floor
+        out["curvature_jsd_floor"] = sampling_floor(np.stack([s.histogram_log for s in found]))
+        out["curvature_jsd_corrected"] = divergence.corrected
         chosen = [s.choice for s in found if s.choice is not None]
         out |= choice_numbers(chosen) if chosen else {}
         out["segments"] = len(found)

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import KeyScore
 from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.errors import ConfigError, DataError
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.search import aggregate_of
+from symphony.simulation.search import aggregate_of, realism_score
 
 
 @torch.no_grad()
@@ -38,44 +37,34 @@ def logged_totals(
         raise ConfigError(f"{agent.name} has no discriminator to calibrate a threshold by")
     agent.check_step(dataset.dt)
     device = next(agent.discriminator.parameters()).device
-    score, aggregate = KeyScore(keys.SCORE, agent.discriminator, valid_key=keys.VALID), aggregate_of(search)
-    found = []
+    aggregate, found = aggregate_of(search), []
     for first in range(0, len(dataset), batch):
         items = list(range(first, min(first + batch, len(dataset))))
         scenes = dataset.scenes(items).to(device)
         env = DrivingEnv(scenes, agent.dynamics, agent.observation)
+        score = realism_score(env, agent.discriminator)
         state, logged = dataset.fitted(items, scenes)
-        there = (logged | ~scenes.interactive_valid[:, None]).all(-1)
+        past = torch.arange(state.shape[1], device=device) > scenes.last_step[:, None]
+        there = (logged | ~scenes.interactive_valid[:, None]).all(-1) | past
         scene = torch.arange(len(items), device=device)
         goal = scenes.route_logged if agent.goals is not None else torch.full_like(scenes.interactive, -1)
         for begin in range(1, state.shape[1], search.prune_every):
             steps = range(begin, min(begin + search.prune_every, state.shape[1]))
-            whole = there[:, list(steps)].all(-1)
+            whole = there[:, list(steps)].all(-1) & ~past[:, begin]
             rows = scene[whole]
             if not len(rows):
                 continue
-            scores = torch.stack(
-                [
-                    score(
-                        env.at(
-                            TensorDict(
-                                {
-                                    keys.SCENE: rows[:, None],
-                                    keys.STEP: torch.full_like(rows, step)[:, None],
-                                    keys.STREAM: torch.zeros_like(rows)[:, None],
-                                    keys.VALID: scenes.interactive_valid[rows],
-                                    keys.STATE: state[rows, step],
-                                    keys.GOAL: goal[rows],
-                                },
-                                batch_size=[len(rows)],
-                            )
-                        )
-                    )
-                    for step in steps
-                ],
-                -2,
-            )
-            found.append(aggregate(scores[:, None])[:, 0])
+            still = {
+                keys.SCENE: rows[:, None],
+                keys.STREAM: torch.zeros_like(rows)[:, None],
+                keys.VALID: scenes.interactive_valid[rows],
+                keys.GOAL: goal[rows],
+            }
+            scores = []
+            for step in steps:
+                moving = {keys.STEP: torch.full_like(rows, step)[:, None], keys.STATE: state[rows, step]}
+                scores.append(score(env.at(TensorDict(still | moving, batch_size=[len(rows)]))))
+            found.append(aggregate(torch.stack(scores, -2)[:, None])[:, 0])
     if not found:
         raise DataError("no interactive agents exist for a whole period", file=dataset.store.path)
     return torch.cat(found)
