@@ -71,7 +71,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
 def _more(row: dict[str, Any]) -> list[str]:
     """What else there is to say of an agent, in lines."""
     lines: list[str] = []
-    if row["agent"] == "playback":
+    if row.get("search") == "log":
         return lines
     if not math.isnan(row.get("curvature_jsd_floor", math.nan)):
         lines.append(
