@@ -50,9 +50,7 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
 
     # Losses and optimizers.
-    policy_loss = processes.share(
-        DistillationLoss(policy, rollout_weight=config.search.weight, survivors=config.search.survivors)
-    )
+    policy_loss = processes.share(DistillationLoss(policy, rollout_weight=config.search.weight))
     goal_loss = processes.share(GoalLoss(goals))
     realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
     optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
@@ -64,7 +62,7 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
         experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
-        rollouts = replay.survivors(config.search.states, rng, observation)
+        rollouts = replay.survivors(config.search.states, rng, observation, config.search.survivors)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
         yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
 
