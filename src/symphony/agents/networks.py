@@ -26,7 +26,7 @@ GROUPS = (
     ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
     ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
 )
-"""What every network sees around an agent."""
+"""What every network observes around an agent."""
 DYNAMICS: dict[str, Bicycle | Displacement] = {"bicycle": Bicycle(), "displacement": Displacement()}
 
 
@@ -36,7 +36,7 @@ def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
 
 
 def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> ObservationConfig:
-    """What the networks see.
+    """What the networks observe.
 
     Args:
         spec: of the agent.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from symphony.config import PROFILES, TrainConfig
-from symphony.config.checks import shown
+from symphony.config.checks import option
 from symphony.errors import ConfigError
 
 WORDS = (
@@ -49,7 +49,7 @@ def _changes(before: Any, after: Any, prefix: str = "--") -> Iterator[tuple[str,
     """Flags and the words that set them, for what differs between two configurations."""
     for field in dataclasses.fields(before):
         old, new = getattr(before, field.name), getattr(after, field.name)
-        flag = prefix + shown(field.name)
+        flag = prefix + option(field.name)
         if dataclasses.is_dataclass(old):
             yield from _changes(old, new, f"{flag}.")
         elif new is True and old is False:

@@ -57,7 +57,7 @@ def beam_search(
 
     Gradients flow through environment, policy and scores unless the caller turns them off, along the history of
     each leaf; no tensor is changed in place. The end of an episode changes nothing: every branch runs for
-    `steps` steps, and a score that should not judge what follows the end must be 0 there.
+    `steps` steps, and a score that should not count what follows the end must be 0 there.
 
     Args:
         env: accepts any batch shape (``batch_size=[]``, ``batch_locked=False``); random numbers of its own are

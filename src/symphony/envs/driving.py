@@ -55,7 +55,7 @@ class DrivingEnv(EnvBase):
         scenes: static data of B segments, all with the same number of interactive agents; or a source, from which
             every reset of a whole batch draws as many as the batch has rows.
         dynamics: :class:`Bicycle` (joint discrete actions) or :class:`Displacement` (metres).
-        observation: what the agents see.
+        observation: what the agents observe.
         reward: of a step, from the state before it (with its action) and the state after it, ``[*b, N]``; by default
             -1 for an agent that collides or is off the road.
         ends_on: what ends the episode of a scene, for any of its interactive agents.
@@ -223,7 +223,7 @@ class DrivingEnv(EnvBase):
         return self._from_state(*self._read(state))
 
     def choices(self, state: TensorDictBase) -> TensorDictBase:
-        """Add the feasible routes of a start state, as the goal policy sees them.
+        """Add the feasible routes of a start state, as the goal policy observes them.
 
         Writes ``ROUTES`` [..., N, G, F] and ``ROUTES_MASK`` [..., N, G] into a copy.
         """

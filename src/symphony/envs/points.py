@@ -1,6 +1,6 @@
-"""The nearest map and light points as an agent sees them.
+"""The nearest map and light points as an agent observes them.
 
-Shapes: M rows (any flattened batch), N observing agents, K points each sees, P points of a scene.
+Shapes: M rows (any flattened batch), N observing agents, K points each observes, P points of a scene.
 """
 
 from __future__ import annotations

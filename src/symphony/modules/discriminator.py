@@ -39,7 +39,7 @@ class Discriminator(nn.Module):
         own_features: of the agent itself, its route included where it is given one.
         object_features: of one object; the first two are its position in the agent's frame.
         point_features: of one map or light point; likewise.
-        radius: how far it sees, in the units of those positions.
+        radius: how far it observes, in the units of those positions.
         hidden: width of the encoders.
         head: widths of the head's hidden layers.
         features: ``paper``; ``clearance``, which adds the signed gap to the box of each object and the signed

@@ -42,7 +42,7 @@ class DiscriminatorLoss(MaskedLoss):
             which keeps the shape `[..., N]`, with zeros elsewhere. The penalty is reduced and added alike.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
-    Writes `loss_discriminator` and, detached, per kind the share judged right `accuracy_simulated` and
+    Writes `loss_discriminator` and, detached, per kind the share classified right `accuracy_simulated` and
     `accuracy_data`, the mean logits `score_simulated` and `score_data`, and `auc` of the logits (0.5: cannot tell;
     above: simulated states score higher), scalars whatever the reduction and NaN for a kind that is absent. With a
     penalty also the unweighted mean `gradient_penalty`.

@@ -124,7 +124,7 @@ class MGAILLoss(MaskedLoss):
 
     @property
     def discriminator(self) -> TensorDictModuleBase:
-        """The judge, which is not trained here."""
+        """The discriminator, which is not trained here."""
         return self._held["discriminator"]
 
     @property
@@ -224,8 +224,8 @@ class MGAILLoss(MaskedLoss):
                     drawn.set(key, acting.get(key))
                 alive = ~now.get(self.tensor_keys.done)
                 now = env.step_mdp(env.step(drawn))
-                judged = functional_call(self.discriminator, frozen, (now.copy(),))
-                score = judged.get(self.tensor_keys.score, default=None)
+                scored = functional_call(self.discriminator, frozen, (now.copy(),))
+                score = scored.get(self.tensor_keys.score, default=None)
                 if score is None:
                     raise KeyError(f"the discriminator writes no score under {self.tensor_keys.score!r}")
                 scores.append(score)

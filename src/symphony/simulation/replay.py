@@ -69,7 +69,7 @@ class SearchReplay:
         Args:
             count: K.
             rng: of the draw.
-            observation: what the policy sees.
+            observation: what the policy observes.
 
         Returns:
             TensorDict [K, N]: observation, ``ACTION``, ``RANK`` of the rollout in its tree, ``ROLLOUT`` (True).
