@@ -327,7 +327,7 @@ def _with_best(
         for key, cell in cells.items():
             means = [table[other][key].mean for other in rivals if not math.isnan(table[other][key].mean)]
             rated = key in ranked and method not in BASELINES and len(means) > 1
-            best = rated and formatted[key](cell.mean) == shown[key](min(means))
+            best = rated and formatted[key](cell.mean) == formatted[key](min(means))
             done[method][key] = Cell(cell.values, cell.mean, cell.error, best)
     return done
 
