@@ -69,7 +69,7 @@ def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
     return torch.stack(slots[::-1], -2)
 
 
-def _named(slots: Tensor, branches: int) -> Tensor:
+def _named(slots: Int[Tensor, "*b L"], branches: int) -> Bool[Tensor, "*b S"]:
     """Which of the slots occur among `slots` [..., L]."""
     found = torch.zeros(*slots.shape[:-1], branches, dtype=torch.bool, device=slots.device)
     return found.scatter(-1, slots, True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeGuard
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from symphony.errors import ConfigError
@@ -249,7 +249,9 @@ def prune(
     return torch.empty_like(members.flatten(-2)).scatter(-1, members.flatten(-2), parents.flatten(-2))
 
 
-def _checked(rule: object, parents: Tensor, totals: Tensor) -> Tensor:
+def _checked(
+    rule: object, parents: Shaped[Tensor, ...], totals: Float[Tensor, "*b S"]
+) -> Int[Tensor, "*b S"]:
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
         raise ConfigError(
             f"a pruning rule must return int64 {tuple(totals.shape)}, "

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
@@ -268,7 +268,7 @@ class DrivingEnv(EnvBase):
             default=None,
         )
 
-    def _draw(self, shape: torch.Size, *, renew: bool) -> Tensor:
+    def _draw(self, shape: torch.Size, *, renew: bool) -> Int[Tensor, "*b"]:
         """Rows of the scenes that a batch starts, those at hand or new ones of a source."""
         if self.source is None or (not renew and self._scenes is not None):
             return torch.randint(len(self.scenes), tuple(shape), generator=self._rng)
@@ -287,16 +287,27 @@ class DrivingEnv(EnvBase):
         earned = self.reward(tensordict, out)
         return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
 
-    def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
+    def _moved(
+        self, tensordict: TensorDictBase, state: Float[Tensor, "*b N 4"], size: Float[Tensor, "*b N 2"]
+    ) -> Float[Tensor, "*b N 4"]:
         """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
         return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
-    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _read(
+        self, tensordict: TensorDictBase
+    ) -> tuple[
+        Int[Tensor, "*b"],
+        Int[Tensor, "*b"],
+        Int[Tensor, "*b"],
+        Float[Tensor, "*b N 4"],
+        Bool[Tensor, "*b N"],
+        Int[Tensor, "*b N"],
+    ]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
         state, valid, goal = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL))
         return scene, step, stream, state, valid, goal
 
-    def _valid(self, scene: Tensor) -> Bool[Tensor, "*b N"]:
+    def _valid(self, scene: Int[Tensor, "*b"]) -> Bool[Tensor, "*b N"]:
         return self.scenes.interactive_valid[scene]
 
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
@@ -306,7 +317,13 @@ class DrivingEnv(EnvBase):
         return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
 
     def _from_state(
-        self, scene: Tensor, step: Tensor, stream: Tensor, state: Tensor, valid: Tensor, goal: Tensor
+        self,
+        scene: Int[Tensor, "*b"],
+        step: Int[Tensor, "*b"],
+        stream: Int[Tensor, "*b"],
+        state: Float[Tensor, "*b N 4"],
+        valid: Bool[Tensor, "*b N"],
+        goal: Int[Tensor, "*b N"],
     ) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
         shape = scene.shape
@@ -327,7 +344,7 @@ class DrivingEnv(EnvBase):
             points, count = pick_routes(self.scenes.route, self.scenes.route_count, row, follows)
             observation["route"] = route_ahead(moved, points, count, self.observation.distance_scale)
 
-        def back(value: Tensor) -> Tensor:
+        def back(value: Shaped[Tensor, M * e]) -> Shaped[Tensor, ... * e]:
             return value.reshape((*shape, *value.shape[1:]))
 
         each = [*shape, self.num_agents]
@@ -362,7 +379,12 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()
     def _flags(
-        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor, seen: Observation
+        self,
+        scene: Int[Tensor, " M"],
+        objects: Objects,
+        index: Int[Tensor, "M N"],
+        valid: Bool[Tensor, "M N"],
+        seen: Observation,
     ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
         collision = collision_flags(objects, index) & valid
         if seen.road is not None:
@@ -377,16 +399,18 @@ class DrivingEnv(EnvBase):
         return self._tables
 
 
-def _rows_of(values: Tensor, index: Tensor) -> Tensor:
+def _rows_of(values: Float[Tensor, "*b A F"], index: Int[Tensor, "*b N"]) -> Float[Tensor, "*b N F"]:
     return values.gather(-2, index[..., None].expand(*index.shape, values.shape[-1]))
 
 
-def _rows(table: Float[Tensor, "B A F"], scene: Int[Tensor, "*b"], index: Int[Tensor, "*b N"]) -> Tensor:
+def _rows(
+    table: Float[Tensor, "B A F"], scene: Int[Tensor, "*b"], index: Int[Tensor, "*b N"]
+) -> Float[Tensor, "*b N F"]:
     """table[scene, index] for scene [...] and index [..., N]."""
     return table[scene[..., None], index]
 
 
-def _like(mask: Tensor, value: Tensor) -> Tensor:
+def _like(mask: Bool[Tensor, "*b 1"], value: Shaped[Tensor, ...]) -> Bool[Tensor, "*b ..."]:
     """mask [..., 1] with trailing dimensions of one, to broadcast against value."""
     flat = mask.squeeze(-1)
     return flat.reshape(flat.shape + (1,) * (value.ndim - flat.ndim))

@@ -65,7 +65,7 @@ def nearest_points(
         flat[torch.from_numpy(known)] = torch.from_numpy(found)
     _among_all(flat.numpy(), rest, row, here_x, here_y, x.numpy(), y.numpy())
     flat = flat.view(*origin.shape[:2], count)
-    return flat, _exist(tables, scene, flat)
+    return flat, _exist(tables, flat)
 
 
 def _among_all(
@@ -94,7 +94,7 @@ def _among_all(
         flat[rows] = chosen + (scene[rows] * total)[:, None]
 
 
-def _exist(tables: Tables, scene: Tensor, flat: Tensor) -> Tensor:
+def _exist(tables: Tables, flat: Int[Tensor, "M N K"]) -> Bool[Tensor, "M N K"]:
     if tables.enough_points:
         return torch.ones(flat.shape, dtype=torch.bool)
     return tables.scenes.point_valid.flatten()[flat]
@@ -102,14 +102,14 @@ def _exist(tables: Tables, scene: Tensor, flat: Tensor) -> Tensor:
 
 def _features(
     tables: Tables,
-    scene: Tensor,
-    step: Tensor,
-    flat: Tensor,
-    mask: Tensor,
-    origin: Tensor,
-    heading: Tensor,
-    speed: Tensor,
-) -> Tensor:
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    flat: Int[Tensor, "M N K"],
+    mask: Bool[Tensor, "M N K"],
+    origin: Float[Tensor, "M N 2"],
+    heading: Float[Tensor, "M N"],
+    speed: Float[Tensor, "M N"],
+) -> Float[Tensor, "M N K F"]:
     config, angle = tables.config, -heading[..., None]
     static = tables.points.index_select(0, flat.flatten()).unflatten(0, flat.shape)
     lights = static[..., LIGHT_COLUMN:]
@@ -138,14 +138,14 @@ def _features(
 
 def _features_in_place(
     tables: Tables,
-    scene: Tensor,
-    step: Tensor,
-    flat: Tensor,
-    mask: Tensor,
-    origin: Tensor,
-    heading: Tensor,
-    speed: Tensor,
-) -> Tensor:
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    flat: Int[Tensor, "M N K"],
+    mask: Bool[Tensor, "M N K"],
+    origin: Float[Tensor, "M N 2"],
+    heading: Float[Tensor, "M N"],
+    speed: Float[Tensor, "M N"],
+) -> Float[Tensor, "M N K F"]:
     """The same numbers, written over copied rows block by block; a third of the time, without a gradient."""
     config, count = tables.config, flat.shape[-1]
     agents, index = flat.numel() // count, flat.flatten()
@@ -195,7 +195,7 @@ def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: n
     part[..., 5] = own
 
 
-def _light_now(tables: Tables, scene: Tensor, step: Tensor) -> Tensor:
+def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:
     """State [M, Q] int64 of the lights of each row."""
     scenes = tables.scenes
     steps = scenes.light.shape[1]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -20,12 +21,12 @@ FORESIGHT = (0.5, 1.0, 2.0)
 _GAP, _ROAD = 3, 2 * 5
 
 
-def gap_features(gap: Tensor) -> Tensor:
+def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
     """Signed gaps in metres `[...]` as numbers of order one `[..., 3]`: fine near contact, coarse farther away."""
     return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
-def road_features(distance: Tensor) -> Tensor:
+def road_features(distance: Float[Tensor, "*b K"]) -> Float[Tensor, "*b 2*K"]:
     """Signed distances to the edge of the road in metres `[..., 5]` as numbers of order one `[..., 10]`."""
     return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
 
@@ -70,15 +71,15 @@ class Discriminator(nn.Module):
 
     def forward(
         self,
-        own: Tensor,
-        valid: Tensor,
-        objects: Tensor,
-        objects_mask: Tensor,
-        points: Tensor,
-        points_mask: Tensor,
-        road: Tensor | None = None,
-        *gaps: Tensor,
-    ) -> Tensor:
+        own: Float[Tensor, "*b N F"],
+        valid: Bool[Tensor, "*b N"],
+        objects: Float[Tensor, "*b N O Fo"],
+        objects_mask: Bool[Tensor, "*b N O"],
+        points: Float[Tensor, "*b N P Fp"],
+        points_mask: Bool[Tensor, "*b N P"],
+        road: Float[Tensor, "*b N 5"] | None = None,
+        *gaps: Float[Tensor, "*b N O"] | Float[Tensor, "*b N O H"],
+    ) -> Float[Tensor, "*b N"]:
         """Logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, road `[..., N, 5]`, gaps
         `[..., N, O]` and with foresight `[..., N, O, H]`.
         """
@@ -91,7 +92,7 @@ class Discriminator(nn.Module):
         logits = self.network(own, valid, objects, objects_mask, points, points_mask).squeeze(-1)
         return torch.where(valid, logits, 0.0)
 
-    def _near(self, elements: Tensor) -> Tensor:
+    def _near(self, elements: Float[Tensor, "*e F"]) -> Bool[Tensor, "*e"]:
         return elements[..., :2].detach().square().sum(-1) <= self.radius**2
 
 
