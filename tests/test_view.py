@@ -2,47 +2,27 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import json
-import math
 import re
 import shutil
 import subprocess
-import zlib
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 from helpers_saved import played, random_trees, searched
 from helpers_segments import crossing, hide, random_segment, straight_road
 from symphony.cli import main
 from symphony.evaluation.report import Report, add_segment
-from symphony.render.viewer import Event, packed, view_page
+from symphony.render.viewer import Event, packed, unpacked, view_page
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_files import About, save_rollouts
 
 ABOUT = About("made", settings={"note": "</script><b>"})
-
-
-def unpacked(text: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Facts and arrays of a packed segment, as the page reads them."""
-    block = zlib.decompress(base64.b64decode(text, validate=True))
-    length = int.from_bytes(block[:4], "little")
-    header = json.loads(block[4 : 4 + length])
-    types = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
-    found = {}
-    for item in header["arrays"]:
-        begin, shape = 4 + length + item["offset"], item["shape"]
-        raw = np.frombuffer(block, types[item["type"]], math.prod(shape), begin).reshape(shape)
-        raw = raw.cumsum(-1) if item.get("delta") else raw
-        found[item["name"]] = raw * item["scale"] if item.get("scale") else raw
-    return header["facts"], found
 
 
 def blocks(page: str) -> list[str]:
@@ -88,6 +68,13 @@ def test_a_packed_segment_holds_its_numbers(number: int) -> None:
         np.testing.assert_allclose(arrays["tree.x"].swapaxes(2, 3), saved.trees.state[..., 0], atol=6e-4)
         np.testing.assert_array_equal(arrays["tree.totals"], saved.trees.totals)
         np.testing.assert_array_equal(arrays["tree.parents"], saved.trees.parents)
+
+
+def test_damaged_text_is_refused() -> None:
+    text = packed(pages()[1])
+    for damaged in (text[:-8], "?" + text, ""):
+        with pytest.raises(ValueError, match="packed"):
+            unpacked(damaged)
 
 
 def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:

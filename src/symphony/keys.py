@@ -61,7 +61,7 @@ POINTS: Key = ("agents", "observation", "points")
 """[..., N, P, Fp] float."""
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
 ROUTE: Key = ("agents", "observation", "route")
-"""[..., N, Fr] float: the agent's route as it observes it."""
+"""[..., N, Fr] float: the agent's route as it sees it."""
 SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE)
 """What an agent observes and could react to."""
 GAP: Key = ("agents", "observation", "gap")
@@ -72,7 +72,7 @@ ROAD: Key = ("agents", "observation", "road")
 """[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
 
 ROUTES: Key = ("agents", "routes")
-"""[..., N, G, Fg] float: every feasible route, as the goal policy observes it."""
+"""[..., N, G, Fg] float: every feasible route, as the goal policy sees it."""
 ROUTES_MASK: Key = ("agents", "routes_mask")
 GOAL_LOGITS: Key = ("agents", "goal_logits")
 """[..., N, G] float."""

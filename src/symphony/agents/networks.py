@@ -26,7 +26,7 @@ GROUPS = (
     ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
     ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
 )
-"""What every network observes around an agent."""
+"""What every network sees around an agent."""
 DYNAMICS: dict[str, Bicycle | Displacement] = {"bicycle": Bicycle(), "displacement": Displacement()}
 
 

@@ -1,4 +1,4 @@
-"""Evaluate saved rollouts one by one."""
+"""Judge saved rollouts one by one."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Report:
     """Folder of saved rollouts."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Where the report goes; by default the same folder."""
-    evaluated: Literal["interactive", "ego"] = "interactive"
-    """Which of the driven agents are evaluated: all, or only the ego."""
+    judged: Literal["interactive", "ego"] = "interactive"
+    """Which of the driven agents are judged: all, or only the ego."""
     view: bool = True
     """Leave the page that plays the rollouts unwritten."""
 
     def run(self) -> None:
-        """Evaluate, write, and print the totals."""
+        """Judge, write, and print the totals."""
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
         from rich.table import Table
@@ -45,28 +45,28 @@ class Report:
             TextColumn("segments"),
         )
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task("Evaluating", total=len(folder))
+            task = bar.add_task("Judging", total=len(folder))
             found = report(
-                folder, self.evaluated, lambda done, total: bar.update(task, completed=done, total=total)
+                folder, self.judged, lambda done, total: bar.update(task, completed=done, total=total)
             )
-        numbers = found.to_dict()
+        plain = found.plain()
         with naming(out):
             out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "report.json", numbers)
+        write_json(out / "report.json", plain)
         write_file(out / "report.csv", found.csv())
-        write_file(out / "report.html", report_page(numbers, "view.html" if self.view else None))
+        write_file(out / "report.html", report_page(plain, "view.html" if self.view else None))
         if self.view:
             replays = ((saved, found.events[saved.segment.segment_id]) for saved in folder)
             write_file(out / "view.html", view_page(folder.about.agent, replays, folder.about.settings))
         table = Table(
             "",
             "",
-            title=f"{found.agent}: {numbers['runs']} runs, {numbers['failed_runs']} failed",
+            title=f"{found.agent}: {plain['runs']} runs, {plain['failed_runs']} failed",
             show_header=False,
         )
         for name, value in found.totals().items():
             if not name.endswith("_se") and isinstance(value, float):
-                error = numbers.get(f"{name}_se")
+                error = plain.get(f"{name}_se")
                 table.add_row(name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}"))
         Console().print(table)
         Console().print(f"written: {out / 'report.html'}", soft_wrap=True)

@@ -293,21 +293,12 @@ class DrivingEnv(EnvBase):
         """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
         return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
-    def _read(
-        self, tensordict: TensorDictBase
-    ) -> tuple[
-        Int[Tensor, "*b"],
-        Int[Tensor, "*b"],
-        Int[Tensor, "*b"],
-        Float[Tensor, "*b N 4"],
-        Bool[Tensor, "*b N"],
-        Int[Tensor, "*b N"],
-    ]:
+    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
         state, valid, goal = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL))
         return scene, step, stream, state, valid, goal
 
-    def _valid(self, scene: Int[Tensor, "*b"]) -> Bool[Tensor, "*b N"]:
+    def _valid(self, scene: Tensor) -> Bool[Tensor, "*b N"]:
         return self.scenes.interactive_valid[scene]
 
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
@@ -317,13 +308,7 @@ class DrivingEnv(EnvBase):
         return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
 
     def _from_state(
-        self,
-        scene: Int[Tensor, "*b"],
-        step: Int[Tensor, "*b"],
-        stream: Int[Tensor, "*b"],
-        state: Float[Tensor, "*b N 4"],
-        valid: Bool[Tensor, "*b N"],
-        goal: Int[Tensor, "*b N"],
+        self, scene: Tensor, step: Tensor, stream: Tensor, state: Tensor, valid: Tensor, goal: Tensor
     ) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
         shape = scene.shape

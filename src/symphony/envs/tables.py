@@ -63,7 +63,7 @@ class Tables:
         return self.scenes.point_light.flatten() if self.scenes.light.shape[2] else None
 
     @cached_property
-    def position(self) -> tuple[Float[Tensor, "B P"], Float[Tensor, "B P"]]:
+    def position(self) -> tuple[Tensor, Tensor]:
         """x and y [B, P] of the points; infinity where there is none."""
         nowhere = ~self.scenes.point_valid
         x, y = self.scenes.point.masked_fill(nowhere[..., None], torch.inf).unbind(-1)

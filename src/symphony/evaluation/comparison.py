@@ -55,7 +55,7 @@ class Column:
     scale: float = 1.0
     digits: int = 2
 
-    def formatted(self, value: float) -> str:
+    def shown(self, value: float) -> str:
         """The value as text."""
         return f"{value * self.scale:.{self.digits}f}"
 
@@ -318,7 +318,7 @@ def _with_best(
 
     What looks equal in the table is equally good.
     """
-    formatted = {column.key: column.formatted for column in columns}
+    shown = {column.key: column.shown for column in columns}
     ranked = {column.key for column in COLUMNS}
     done: dict[str, dict[str, Cell]] = {}
     for method, cells in table.items():
@@ -327,7 +327,7 @@ def _with_best(
         for key, cell in cells.items():
             means = [table[other][key].mean for other in rivals if not math.isnan(table[other][key].mean)]
             rated = key in ranked and method not in BASELINES and len(means) > 1
-            best = rated and formatted[key](cell.mean) == formatted[key](min(means))
+            best = rated and shown[key](cell.mean) == shown[key](min(means))
             done[method][key] = Cell(cell.values, cell.mean, cell.error, best)
     return done
 

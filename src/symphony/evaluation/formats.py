@@ -157,15 +157,15 @@ def _cells(row: Row, comparison: Comparison, text: Callable[[Cell, Column], str]
 def _number(cell: Cell, column: Column, plus: str = " ± ") -> str:
     if math.isnan(cell.mean):
         return NOTHING
-    mean = column.formatted(cell.mean)
-    return mean if math.isnan(cell.error) else f"{mean}{plus}{column.formatted(cell.error)}"
+    mean = column.shown(cell.mean)
+    return mean if math.isnan(cell.error) else f"{mean}{plus}{column.shown(cell.error)}"
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:
     if math.isnan(cell.mean):
         return "--"
-    text = _bold(column.formatted(cell.mean), cell, r"\textbf{", "}")
-    return text if math.isnan(cell.error) else rf"{text} {{\scriptsize $\pm${column.formatted(cell.error)}}}"
+    text = _bold(column.shown(cell.mean), cell, r"\textbf{", "}")
+    return text if math.isnan(cell.error) else rf"{text} {{\scriptsize $\pm${column.shown(cell.error)}}}"
 
 
 def _bold(text: str, cell: Cell, before: str, after: str) -> str:

@@ -21,12 +21,12 @@ FORESIGHT = (0.5, 1.0, 2.0)
 _GAP, _ROAD = 3, 2 * 5
 
 
-def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
+def gap_features(gap: Tensor) -> Tensor:
     """Signed gaps in metres `[...]` as numbers of order one `[..., 3]`: fine near contact, coarse farther away."""
     return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
-def road_features(distance: Float[Tensor, "*b K"]) -> Float[Tensor, "*b 2*K"]:
+def road_features(distance: Tensor) -> Tensor:
     """Signed distances to the edge of the road in metres `[..., 5]` as numbers of order one `[..., 10]`."""
     return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
 

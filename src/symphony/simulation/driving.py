@@ -67,7 +67,7 @@ def simulation(
         scenes: B scenes.
         config: how.
         keep_tree: of a search keep the pruned branches, too.
-        egos: plan the first agent of every scene, which no search scores; the agent drives the others.
+        egos: plan the first agent of every scene, which no search judges; the agent drives the others.
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
@@ -108,14 +108,14 @@ def simulation(
         )
     else:
         best = config.search == "best"
-        scorer = None
+        judge = None
         if config.search != "oracle" and agent.discriminator is not None:
-            scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
+            judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
             result = search(
                 env,
                 actor,
-                scorer,
+                judge,
                 start,
                 seed=config.seed,
                 rule=KeepAll() if best else pruning_rule(settings),

@@ -72,7 +72,7 @@ class SearchReplay:
         Args:
             count: K.
             rng: of the draw.
-            observation: what the policy observes.
+            observation: what the policy sees.
 
         Returns:
             TensorDict [K, N]: observation, ``ACTION``, ``RANK`` of the rollout in its tree, ``ROLLOUT`` (True).

@@ -28,7 +28,7 @@ class Rollouts(NamedTuple):
         state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
         collision: [..., T, N].
         offroad: [..., T, N].
-        counted: [..., T, N] steps that are evaluated: of real agents, up to the segment's last logged step.
+        counted: [..., T, N] steps that are judged: of real agents, up to the segment's last logged step.
     """
 
     state: Float[Tensor, "*b T+1 N 4"]

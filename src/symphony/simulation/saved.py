@@ -35,7 +35,7 @@ class SavedTrees:
         collision: [R, S, T, N].
         offroad: [R, S, T, N].
         score: [R, S, T, N] of those states, high is bad; NaN where there is none.
-        totals: [R, P, S] what the pruning after each period compared.
+        totals: [R, P, S] what the pruning after each period judged by.
         parents: [R, P, S] after period p slot s was continued from slot ``parents[p, s]``.
         slots: [R, P, L] the slot in which each period of each leaf's history was simulated.
         prune_every: steps per period; the last may be shorter.
@@ -69,7 +69,7 @@ class SavedRollouts:
         segment: the log, its map and its lights.
         agents: [N] rows of the log that were driven; all others play back the log.
         state: [K, T + 1, N, 4] x, y, heading, speed, the first state included.
-        counted: [K, T, N] steps that are evaluated.
+        counted: [K, T, N] steps that are judged.
         collision: [K, T, N].
         offroad: [K, T, N].
         goal: [K, N] line of ``routes`` that an agent followed, -1 for none.

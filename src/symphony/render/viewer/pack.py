@@ -9,6 +9,7 @@ differences along the last axis (``delta``).
 from __future__ import annotations
 
 import base64
+import binascii
 import json
 import math
 import zlib
@@ -167,3 +168,27 @@ def _pack_trees(packer: _Packer, trees: SavedTrees) -> dict[str, Any]:
     _, periods, branches = trees.parents.shape
     leaves = trees.slots.shape[-1]
     return {"periods": periods, "branches": branches, "leaves": leaves, "prune_every": trees.prune_every}
+
+
+def unpacked(text: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Facts and arrays of a packed segment, as the page reads them.
+
+    Raises:
+        ValueError: the text is damaged.
+    """
+    try:
+        block = zlib.decompress(base64.b64decode(text, validate=True))
+        length = int.from_bytes(block[:4], "little")
+        header = json.loads(block[4 : 4 + length])
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise ValueError(f"not a packed segment ({error})") from error
+    found = {}
+    for item in header["arrays"]:
+        count = math.prod(item["shape"])
+        raw = np.frombuffer(block, _TYPES[item["type"]], count, 4 + length + item["offset"]).reshape(
+            item["shape"]
+        )
+        if item.get("delta"):
+            raw = raw.cumsum(-1)
+        found[item["name"]] = raw * item["scale"] if item.get("scale") else raw
+    return header["facts"], found
