@@ -10,11 +10,10 @@ from __future__ import annotations
 import functools
 import inspect
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Union, get_args, get_origin
 
 from jaxtyping import AbstractArray
-from torch import Tensor
 
 
 def tensors_only(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -43,7 +42,7 @@ def fits(value: Any, hint: Any) -> bool:
         return isinstance(value, hint)
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return any(fits(value, part) and (isinstance(value, Tensor) or _is(value, part)) for part in parts)
+        return any(fits(value, part) and _is(value, part) for part in parts)
     if origin is tuple and isinstance(value, tuple):
         parts = parts[:1] * len(value) if len(parts) == 2 and parts[1] is ... else parts
         return len(value) == len(parts) and all(map(fits, value, parts))
@@ -58,6 +57,3 @@ def fits(value: Any, hint: Any) -> bool:
 def _is(value: Any, hint: Any) -> bool:
     checkable = inspect.isclass(hint) and not getattr(hint, "_is_protocol", False)
     return not checkable or isinstance(value, hint)
-
-
-__all__: Iterable[str] = ["fits", "tensors_only"]

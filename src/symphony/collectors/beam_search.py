@@ -227,6 +227,7 @@ def _fork(
     state: TensorDictBase, parents: Int[Tensor, "*b S"], slot_keys: Sequence[NestedKey]
 ) -> TensorDictBase:
     branches = parents.shape[-1]
+    # Places in the flattened [*b, S]: of the first branch of each row, and of the parents beside it.
     first = torch.arange(0, parents.numel(), branches, device=parents.device)
     rows = first.reshape(*parents.shape[:-1], 1) + parents
     return _set_slots(_take(state, rows), state, slot_keys)

@@ -186,6 +186,7 @@ class ReplaceBad:
         own = (good[..., None, :] & same).any(-1)
         candidates = good[..., None, :] & (same | ~own[..., :, None])
         waiting = ~good[..., None, :] & torch.where(own[..., :, None], same, ~own[..., None, :])
+        # Those that wait for the same branches take them by turns, from one on that the noise picks.
         turn = (waiting & (slots < slots[:, None])).sum(-1)
         number = candidates.sum(-1)
         first = (noise.double()[..., None] * number).long()

@@ -50,6 +50,7 @@ def _where_circles_meet(
     # One flat index, because finding all coordinates of each pair would cost more than the test.
     pair = (near & other).view(-1).nonzero().squeeze(-1)
     subjects, agents = state.shape[1], objects.state.shape[1]
+    # Of a place in [M, N, A] the one in [M, N], and that of the agent in [M, A] of the same row.
     who = torch.div(pair, agents, rounding_mode="floor")
     whom = torch.div(who, subjects, rounding_mode="floor") * agents + pair % agents
     one, two = state.view(-1, 5)[who], objects.state.reshape(-1, 5)[whom]

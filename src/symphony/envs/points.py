@@ -166,6 +166,7 @@ def _features_in_place(
     if tables.light is not None:
         light = tables.light.index_select(0, index)
         place = (light >= 0).nonzero().squeeze(-1)
+        # Of a place in [M, N, K] the row.
         row = place // (count * origin.shape[1])
         state = _light_now(tables, scene, step)[row, light[place].long()]
         out.view(-1, POINT_FEATURES)[place, LIGHT_COLUMN + state] = 1.0
@@ -199,5 +200,6 @@ def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]
     """State [M, Q] int64 of the lights of each row."""
     scenes = tables.scenes
     steps = scenes.light.shape[1]
+    # Places in the flattened [B, steps]; after the log its last state stays.
     row = scene * steps + step.clamp(max=steps - 1)
     return scenes.light.flatten(0, 1).index_select(0, row).long()

@@ -160,6 +160,7 @@ def pick_routes(
     if routes == 0:
         return route.new_zeros(*goal.shape, POINTS, 2), torch.zeros_like(goal)
     place = torch.arange(agents, device=goal.device)
+    # Places in the flattened [B, A, G].
     row = ((scene[:, None] * agents + place) * routes + goal.clamp_min(0)).flatten()
     points = route.flatten(0, 2).index_select(0, row).unflatten(0, goal.shape)
     exists = count.flatten().index_select(0, row).unflatten(0, goal.shape)

@@ -202,6 +202,7 @@ def _argmin(values: Float[Tensor, "*b E"]) -> tuple[Float[Tensor, "*b"], Int[Ten
     body = values[..., : fold * _FOLD].unflatten(-1, (_FOLD, fold))
     smallest, column = body.amin(-2).min(-1)
     lane = body.gather(-1, column[..., None, None].expand(*column.shape, _FOLD, 1))[..., 0].min(-1).indices
+    # Its place before the fold, [_FOLD, fold].
     index = lane * fold + column
     if fold * _FOLD == size:
         return smallest, index

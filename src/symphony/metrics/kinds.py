@@ -84,6 +84,7 @@ class CollisionKinds(NamedTuple):
         number = len(CollisionKind)
         none = torch.iinfo(torch.int64).max
         rank = torch.tensor(_RANK, device=self.kind.device)
+        # One number to take the least of, and to take apart again: step, then rank, then whether it is no playback.
         key = 2 * (number * self.step + rank[self.kind.clamp(min=0)]) + (~self.playback).long()
         key = torch.where(self.kind < 0, none, key)
         key = torch.cat([key, key.new_full((*key.shape[:-1], 1), none)], -1).amin(-1)
