@@ -239,7 +239,7 @@ def test_steps_and_scores_that_are_not_finite_do_no_harm() -> None:
     axes = plot_tree(SEGMENT, make_tree(position=position, score=score), blank())
     # Both steps that touch the missing place are left out; slot 1 goes on with its own period.
     assert sum(map(len, steps_drawn(axes, "0").values())) == BRANCHES * STEPS - 2
-    plot_genealogy(make_tree(score=np.full_like(score, np.nan)), blank())
+    plot_genealogy(make_tree(score=np.full_like(score, np.nan)), blank(), dt=0.2)
 
 
 @pytest.mark.parametrize(
