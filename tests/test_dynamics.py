@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from symphony.envs.dynamics import (
     Bicycle,
     Displacement,
+    bicycle_inverse,
     bicycle_step,
     displacement_inverse,
     displacement_step,
@@ -32,6 +33,15 @@ def controls(count: int = 64, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor
     rng = torch.Generator().manual_seed(seed)
     unit = torch.rand(3, count, generator=rng, dtype=torch.float64)
     return 8 * unit[0] - 4, unit[1] - 0.5, 3 + 9 * unit[2]
+
+
+def test_bicycle_inverse_recovers_the_controls() -> None:
+    state, (acceleration, steering, length) = states(), controls()
+    after = bicycle_step(state, acceleration, steering, length, DT)
+    moved = after[:, 3] > 0  # a vehicle that stops within the step loses part of its braking
+    got = bicycle_inverse(state, after, length, DT)
+    torch.testing.assert_close(got[0][moved], acceleration[moved])
+    torch.testing.assert_close(got[1][moved], steering[moved])
 
 
 def test_bicycle_circles_with_the_radius_of_its_steering() -> None:

@@ -60,6 +60,23 @@ def bicycle_step(
     )
 
 
+def bicycle_inverse(
+    state: Float[Tensor, "*#b 4"], after: Float[Tensor, "*#b 4"], length: Float[Tensor, "*#b"], dt: float
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Acceleration and steering that take the speed and heading of ``state`` to those of ``after``.
+
+    Exact where :func:`bicycle_step` produced ``after`` and the agent moved; steering is 0 at standstill and
+    saturates at a turn no bicycle can make.
+    """
+    acceleration = (after[..., 3] - state[..., 3]) / dt
+    travel = 0.5 * (state[..., 3] + after[..., 3]) * dt
+    moving = travel > 1e-6
+    turn = wrap(after[..., 2] - state[..., 2])
+    sine = turn * WHEELBASE * length / (2.0 * torch.where(moving, travel, torch.ones_like(travel)))
+    slip = torch.asin(sine.clamp(-0.999, 0.999))
+    return acceleration, torch.where(moving, torch.atan(2.0 * torch.tan(slip)), torch.zeros_like(slip))
+
+
 def displacement_step(
     state: Float[Tensor, "*#b 4"],
     displacement: Float[Tensor, "*#b 2"],
