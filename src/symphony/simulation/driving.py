@@ -96,7 +96,7 @@ def simulation(
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
-        goals_per=config.goals,
+        goals_per=config.pruning(agent.search).goals,
     )
     settings, planned = config.pruning(agent.search), None
     if egos is not None:
