@@ -265,6 +265,8 @@ def test_short_logs_have_a_shorter_history() -> None:
     assert not window.valid[:, :6].any()
     assert window.valid[:, 6:].all()
     np.testing.assert_allclose(window.position[:, 10], segment.position[:, 2], atol=1e-5)
+    # What is not known goes back at the first velocity: no jump at the first step that is.
+    np.testing.assert_allclose(np.diff(window.position[..., :2], 2, axis=1), 0, atol=1e-4)
     assert scored(wosac_scenario(segment), constant_velocity(window))["min_ade"] < 0.01
     with pytest.raises(DataError, match=r"has 7\.8 s, the score needs 8"):
         wosac_window(straight_road(steps=40))
@@ -278,7 +280,8 @@ def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command) == 0
     assert "WOSAC 2025, 3 run segments, 2 recordings" in capsys.readouterr().out
     record = json.loads(out.read_text())
-    assert list(record["agents"]) == ["playback", "constant_velocity", AGENT]
+    assert list(record["agents"]) == ["playback", "constant_velocity", "random", AGENT]
+    assert record["how"] == {"search": "none", "seed": 0, "logged_goals": False}
     for numbers in record["agents"].values():
         each = [one["metametric"] for one in numbers["segments"].values()]
         assert numbers["metametric"] == pytest.approx(np.mean(each))

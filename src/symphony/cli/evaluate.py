@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from symphony.cli.tables import print_metrics
-from symphony.config import EvaluateConfig
+from symphony.config import EvaluateConfig, WosacSettings
 from symphony.files import write_json
 
 if TYPE_CHECKING:
@@ -40,6 +40,11 @@ class Evaluate:
     """Folder to keep the very rollouts in that are evaluated (see `symphony view`, `report` and `export`)."""
     keep: bool = True
     """Leave the folder of the run as it is."""
+    metrics: tuple[Literal["wosac"], ...] = ()
+    """More scores for the record and for `symphony table`: `wosac`, of 32 rollouts of everyone for 8 s, by the same
+    search or without it (see docs/wosac.md)."""
+    wosac_config: Literal["2024", "2025"] = "2025"
+    """Year of the challenge whose weights the WOSAC score has."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> None:
@@ -54,12 +59,13 @@ class Evaluate:
 
         if self.figure is not None:
             check_picture(self.figure)
+        settings = WosacSettings.of(self.config) if self.metrics else None  # or complain now
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
         keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
         if self.save_rollouts is not None:
-            settings = plain_settings(self.config, agent.interactive, agent.duration)
-            about = About.of(agent.name, store, settings, seed=self.config.seed)
+            plain = plain_settings(self.config, agent.interactive, agent.duration)
+            about = About.of(agent.name, store, plain, seed=self.config.seed)
             keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name))
 
         def observe(batch: EvaluatedBatch) -> None:
@@ -71,12 +77,26 @@ class Evaluate:
         )
         print_evaluation(found, self.data)
         record = evaluation_record(agent, found, store)
+        if settings is not None:
+            record |= self._wosac(agent, store, settings, record)
         if self.keep:
             keep_evaluation(agent.name, record)
         if self.json is not None:
             write_json(self.json, record)
         if self.figure is not None:
             draw_clips(clips.clips, self.figure)
+
+    def _wosac(
+        self, agent: Agent, store: SegmentStore, settings: WosacSettings, record: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Parts of the record with the WOSAC score."""
+        from symphony.cli.wosac_evaluate import print_wosac
+        from symphony.evaluation.wosac import evaluate_wosac, wosac_parts
+
+        with segments_bar(f"WOSAC score of {agent.name}") as advance:
+            found = evaluate_wosac(agent, store, range(len(store)), settings, self.wosac_config, advance)
+        print_wosac(found)
+        return wosac_parts(found, record)
 
 
 def print_evaluation(found: Evaluation, data: Path) -> None:

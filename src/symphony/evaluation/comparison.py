@@ -68,6 +68,14 @@ COLUMNS = (
     Column("curvature_jsd", "curvature JSD", "10⁻³", 1000.0),
 )
 """In the paper's order and units."""
+WOSAC = (
+    Column("wosac_metametric", "WOSAC", "", digits=3),
+    Column("wosac_kinematic_metrics", "kinematic", "", digits=3),
+    Column("wosac_interactive_metrics", "interactive", "", digits=3),
+    Column("wosac_map_based_metrics", "map", "", digits=3),
+    Column("wosac_min_ade", "minADE", "m"),
+)
+"""Of evaluations with `--metrics wosac`; the metametric and the three means of its components, 0 to 1."""
 COST = Column("cost", "CPU", "s/segment", digits=2)
 """Of the simulation of all rollouts of a segment."""
 
@@ -272,7 +280,7 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
     entries = sorted(entries, key=lambda entry: (ROWS.index(entry.method), entry.seed))
     _check_comparable(entries)
     # Beside the paper's figures stand only what the paper has.
-    columns = COLUMNS if figures else (*COLUMNS, *_own_columns(entries), COST)
+    columns = COLUMNS if figures else (*COLUMNS, *_wosac_columns(entries), *_own_columns(entries), COST)
     rows = [_baseline_row(entries[0], name, columns) for name in BASELINES]
     for method in dict.fromkeys(entry.method for entry in entries):
         mine = [entry for entry in entries if entry.method == method]
@@ -288,6 +296,14 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
     return Comparison(setting, dataset, columns, tuple(rows), tuple(_notes(entries, dataset)))
 
 
+def _wosac_columns(entries: Sequence[Entry]) -> tuple[Column, ...]:
+    """The WOSAC score where all evaluations have it, of one year."""
+    years = {entry.record.get("wosac", {}).get("config") for entry in entries}
+    if len(years) > 1 and None not in years:
+        raise ConfigError(f"WOSAC scores of {', '.join(sorted(years))}, choose with --evaluation")
+    return () if None in years else WOSAC
+
+
 def _own_columns(entries: Sequence[Entry]) -> list[Column]:
     """A column for each metric of a user's own that all evaluations have."""
     paths = [set(entry.record["config"].get("metric", ())) for entry in entries]
@@ -299,7 +315,7 @@ def _baseline_row(entry: Entry, name: str, columns: Sequence[Column]) -> Row:
     cells = {column.key: Cell((), math.nan, math.nan) for column in columns}
     # The log is at no distance from itself, so only its collisions and its time off the road say anything.
     known = METRICS[:2] if name == "playback" else METRICS
-    for key in known:
+    for key in (*known, *(column.key for column in columns if column in WOSAC)):
         cells[key] = Cell.of([_number(entry, key, name)])
     return Row(name, (), cells)
 
@@ -386,6 +402,10 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
         differing = [name for name in names if len({json.dumps(c.get(name)) for c in mine}) > 1]
         if differing:
             notes.append(f"runs of {method_name(method)} differ in {', '.join(differing)}")
+    if dataset is None and _wosac_columns(entries):
+        notes.append(
+            f"WOSAC {record['wosac']['config']}: 32 rollouts of 8 s of all vehicles; higher is better"
+        )
     for entry in entries:
         then, now = entry.record["run"]["updates"], updates_done(entry.folder)
         if then and now and then != now:
