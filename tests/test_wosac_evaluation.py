@@ -23,13 +23,15 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import WOSAC, Entry, compare
 from symphony.evaluation.formats import as_markdown
 from symphony.evaluation.passing import order_of, passing_gaps, passing_pairs
-from symphony.evaluation.wosac import THINNED, _thinned, evaluate_wosac, log_playback, wosac_window
+from symphony.evaluation.wosac import THINNED, _thinned, evaluate_wosac
+from symphony.evaluation.wosac_segments import log_playback, wosac_window
 from symphony.evaluation.wosac_table import COLUMNS, how_in_words, read_wosac, wosac_grid
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.wosac import _driven, constant_velocity, future_log, history_only, wosac_rollouts
 from test_context import CASES, scene
 
 AGENT = "pretrained:bc_ts_h"
+RANDOM = "random"
 PLAIN = WosacSettings(search="none")
 
 
@@ -41,7 +43,7 @@ def same(a: RolloutArrays, b: RolloutArrays) -> bool:
 
 
 def test_random_actions_know_nothing_and_are_their_own() -> None:
-    agent, segment = load_agent("random"), wosac_window(crossing())
+    agent, segment = load_agent(RANDOM), wosac_window(crossing())
     found = wosac_rollouts(agent, segment, PLAIN)
     assert len(np.unique(found.x[:, :, -1], axis=0)) == 32
     assert not same(found, wosac_rollouts(agent, segment, replace(PLAIN, seed=1)))
@@ -126,7 +128,7 @@ def test_there_is_a_thinned_playback_where_the_store_is_finer_than_the_agent(tmp
     fine, coarse = (SegmentStore(tmp_path / name) for name in ("fine", "coarse"))
     agent = load_agent(AGENT)
     assert (_thinned(agent, fine, [0]), _thinned(agent, coarse, [0])) == (2, 1)
-    assert _thinned(load_agent("random"), fine, [0]) == 1
+    assert _thinned(load_agent(RANDOM), fine, [0]) == 1
     found = evaluate_wosac(agent, fine, [0], PLAIN)
     assert list(found.results) == ["playback", THINNED, "constant_velocity", "random", AGENT]
 
@@ -177,12 +179,12 @@ def test_without_pairs_there_is_no_order() -> None:
 def record(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Of `symphony evaluate --metrics wosac`."""
     folder = tmp_path_factory.mktemp("evaluated")
-    fill(folder / "store", [straight_road(seed=k, group=f"recording {k}") for k in range(2)])
+    fill(folder / "store", [straight_road(2, seed=k, group=f"recording {k}") for k in range(2)])
     out = folder / "record.json"
     assert (
         main([
-            *("evaluate", AGENT, "--data", str(folder / "store"), "--json", str(out)),
-            *("--rollouts", "2", "--search", "none", "--metrics", "wosac"),
+            *("evaluate", RANDOM, "--data", str(folder / "store"), "--json", str(out)),
+            *("--rollouts", "2", "--metrics", "wosac"),
         ]) == 0
     )  # fmt: skip
     found: dict[str, Any] = json.loads(out.read_text())
@@ -191,8 +193,8 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def test_the_record_has_the_score(record: dict[str, Any]) -> None:
     whole = record["wosac"]["agents"]
-    assert record["wosac_metametric"] == whole[AGENT]["metametric"]
-    assert record["wosac_metametric_se"] == whole[AGENT]["metametric_se"]
+    assert record["wosac_metametric"] == whole[RANDOM]["metametric"]
+    assert record["wosac_metametric_se"] == whole[RANDOM]["metametric_se"]
     for name in ("playback", "constant_velocity"):
         assert record[name]["wosac_min_ade"] == whole[name]["min_ade"]
         assert "collision_rate" in record[name]
@@ -236,7 +238,7 @@ def test_the_table_of_scores(
 ) -> None:
     one, two = tmp_path / "one.json", tmp_path / "two.json"
     one.write_text(json.dumps(record["wosac"]))
-    alone = record["wosac"] | {"agents": {AGENT: record["wosac"]["agents"][AGENT]}}
+    alone = record["wosac"] | {"agents": {RANDOM: record["wosac"]["agents"][RANDOM]}}
     two.write_text(json.dumps(alone))
     assert main(["wosac", "table", str(two), str(one), "--names", "two", "one"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -244,8 +246,8 @@ def test_the_table_of_scores(
     assert names == ["", "---", "log playback", "constant velocity", "random", "two", "one"]
     assert "2 run segments of 2 recordings" in lines[-1]
     grid = wosac_grid([read_wosac(one)])
-    assert grid[-1][0] == f"{AGENT}, no search, sampled goals"
-    numbers = record["wosac"]["agents"][AGENT]
+    assert grid[-1][0] == f"{RANDOM}, no search"
+    numbers = record["wosac"]["agents"][RANDOM]
     for column, cell in zip(COLUMNS, grid[-1][1:], strict=False):
         assert float(cell.split(" ± ")[0]) == pytest.approx(
             column.scale * numbers[column.key], abs=0.51 * 10**-column.digits
@@ -267,7 +269,7 @@ def test_words() -> None:
 
 def test_processes_change_nothing(tmp_path: Path) -> None:
     fill(tmp_path / "store", [crossing(num_agents=2, seed=k) for k in range(2)])
-    agent, store = load_agent("random"), SegmentStore(tmp_path / "store")
+    agent, store = load_agent(RANDOM), SegmentStore(tmp_path / "store")
     done: list[tuple[int, int]] = []
     found = [
         evaluate_wosac(
@@ -277,7 +279,7 @@ def test_processes_change_nothing(tmp_path: Path) -> None:
             replace(PLAIN, workers=workers),
             progress=lambda *at: done.append(at),
             baselines=False,
-        ).record()["agents"]["random"]["segments"]
+        ).record()["agents"][RANDOM]["segments"]
         for workers in (1, 2)
     ]
     assert found[0] == found[1]

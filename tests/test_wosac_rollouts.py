@@ -27,7 +27,8 @@ from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, 
 from symphony.data.store import SegmentStore
 from symphony.data.submission_check import check_submission, required_agents
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.wosac import evaluate_wosac, log_playback, wosac_scenario, wosac_window
+from symphony.evaluation.wosac import evaluate_wosac
+from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wosac_window
 from symphony.metrics.wosac import SimulatedRollouts, WosacScenario, score
 from symphony.simulation.wosac import between_decisions, constant_velocity, history_only, wosac_rollouts
 

@@ -83,7 +83,7 @@ def wosac_grid(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> 
                 f"records of different run segments or years: {first['agent']}, {record['agent']}; "
                 "a table is of the same ones"
             )
-    order = next((one["agents"] for one in records if len(one["agents"]) > 1), {})
+    order: dict[str, Any] = next((one["agents"] for one in records if len(one["agents"]) > 1), {})
     rows = [(_WORDS[name], numbers) for name, numbers in order.items() if name in _WORDS]
     for k, record in enumerate(records):
         name = names[k] if names else f"{record['agent']}, {how_in_words(record['how'])}"
