@@ -1,6 +1,6 @@
 """Write the tables of the pages from the records in `results/`, between their markers.
 
-    python scripts/results_page.py            # rewrites README.md, docs/results.md and docs/appendix.md
+    python scripts/results_page.py            # rewrites README.md and pages of docs
     python scripts/results_page.py --check    # says what differs, and fails if anything does
 
 A block is `<!-- table NAME -->`, the table, `<!-- end table -->`. What a name stands for is in TABLES below.
@@ -21,10 +21,11 @@ import numpy as np
 from symphony.evaluation.comparison import Entry
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
+from symphony.evaluation.wosac_table import read_wosac, wosac_grid
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
-PAGES = ("README.md", "docs/results.md", "docs/appendix.md")
+PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/wosac.md")
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 
 Record = dict[str, Any]
@@ -100,6 +101,17 @@ NGSIM = (
     ("BC+TS+H", "ngsim/{}/bc_ts_h-0-often"),
     ("BC+TS+H, freeways among the simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
 )
+WOSAC = (
+    ("BC", "bc"),
+    ("BC+H", "bc_h"),
+    ("BC+H, goals of the log", "bc_h-logged"),
+    ("BC+TS+H", "bc_ts_h"),
+    ("BC+TS+H, goals of the log", "bc_ts_h-logged"),
+    ("MGAIL+TS+H", "mgail_ts_h"),
+    ("MGAIL+TS+H, goals of the log", "mgail_ts_h-logged"),
+)
+"""Rows of the WOSAC score, as far as there are records: label, end of the record's name."""
+WOSAC_LOGS = (("sumo", "playback"), ("ngsim", "playback"), ("ngsim", "playback_thinned"))
 NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
 
 
@@ -235,6 +247,24 @@ def searched(data: str) -> Grid:
     return grid
 
 
+def wosac(data: str) -> Grid:
+    """The WOSAC score of agents, beside the baselines."""
+    files = [(label, RECORDS / "wosac" / f"{data}-{name}.json") for label, name in WOSAC]
+    found = [(label, read_wosac(file)) for label, file in files if file.is_file()]
+    return wosac_grid([record for _, record in found], [label for label, _ in found])
+
+
+def wosac_log() -> Grid:
+    """What the log itself scores in every component."""
+    columns = [records(f"wosac/{data}-bc_h")[0]["agents"][name] for data, name in WOSAC_LOGS]
+    names = [name for name in columns[0] if name.endswith("_likelihood")]
+    grid = [["", "town-small, 5 Hz", "NGSIM, 10 Hz", "NGSIM, at 5 Hz and back"]]
+    for name in ("metametric", *names):
+        label = name.removesuffix("_likelihood").replace("_", " ")
+        grid.append([label, *(f"{numbers[name]:.4f}" for numbers in columns)])
+    return grid
+
+
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
@@ -251,6 +281,9 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "sweep": sweep,
     "search-town": lambda: searched("town"),
     "search-ngsim": lambda: searched("ngsim"),
+    "wosac-log": wosac_log,
+    "wosac-sumo": lambda: wosac("sumo"),
+    "wosac-ngsim": lambda: wosac("ngsim"),
 }
 
 

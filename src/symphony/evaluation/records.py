@@ -62,7 +62,8 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         store; ``config``: the settings of the evaluation, with what was left to the agent filled
         in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and ``parts``,
         pseudo-values of the divergence by recording (see :func:`symphony.metrics.sampled_divergence`);
-        ``per_segment``: a row for each run segment.
+        ``per_segment``: a row for each run segment. `symphony evaluate --metrics wosac` adds ``wosac`` and numbers
+        whose names begin so (see :func:`symphony.evaluation.wosac.wosac_parts`).
     """
     visited, visited_log = result.metrics.curvature_histograms()
     divergence, names = result.metrics.curvature_divergence()
@@ -143,6 +144,8 @@ def evaluation_name(record: dict[str, Any]) -> str:
         if field.name not in (*_NAMED, *_PRUNING, *_MEMORY, "metric") and value != usual:
             parts.append(field.name if value is True else f"{field.name}={value}")
     parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
+    if "wosac" in record:
+        parts.append(f"wosac{record['wosac']['config']}")
     return "-".join(parts)
 
 
