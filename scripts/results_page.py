@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from symphony.evaluation.comparison import Entry
+from symphony.evaluation.paired import clustered_mean
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
 from symphony.evaluation.wosac_table import read_wosac, wosac_grid
@@ -91,6 +92,13 @@ SEARCH = (
     ("only the bad replaced, goals of each branch", "replace-branch", ""),
 )
 """Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
+REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
+REAL_ROWS = (
+    ("constant velocity", "ngsim-constant-velocity"),
+    ("BC", "ngsim-bc"),
+    ("BC+TS+H without its search", "ngsim-none"),
+    ("BC+TS+H", "ngsim-replace-branch"),
+)
 PLAYBACK = "log playback"
 NGSIM = (
     (PLAYBACK, "ngsim/{}/playback"),
@@ -233,17 +241,34 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {error:.{digits}f}"
 
 
-def searched(data: str) -> Grid:
+def searched(folder: str, data: str) -> Grid:
     """One agent simulated in several ways: errors over recordings, and CPU seconds per segment."""
     grid = [["", *(heading for heading, _ in COLUMNS.values()), "CPU s"]]
     for label, name, part in SEARCH:
-        (record,) = records(f"search/{data}-{name}")
+        (record,) = records(f"{folder}/{data}-{name}")
         row = record[part] if part else record
         cells = [
             f"{row[key]:.{digits}f} ± {row[f'{key}_se']:.{digits}f}" for key, (_, digits) in COLUMNS.items()
         ]
         cost = "" if part else f"{record['cost']['simulation'] / record['segments']:.2f}"
         grid.append([label, *cells, cost])
+    return grid
+
+
+def by_place() -> Grid:
+    """Each place of the NGSIM test part apart; errors over snippets."""
+    grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
+    for label, name in REAL_ROWS:
+        (record,) = records(f"driving/{name}")
+        line = [label]
+        for place in REAL:
+            rows = [row for row in record["per_segment"] if place in row["group"]]
+            groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
+            for key, digits in (("collision_rate", 1), ("ade", 2)):
+                values = np.array([row[key] for row in rows], np.float64)
+                mean, error = clustered_mean(values, groups)
+                line.append(f"{mean:.{digits}f} ± {error:.{digits}f}")
+        grid.append(line)
     return grid
 
 
@@ -279,8 +304,11 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "many": lambda: setting("many"),
     "paper": against_paper,
     "sweep": sweep,
-    "search-town": lambda: searched("town"),
-    "search-ngsim": lambda: searched("ngsim"),
+    "search-town": lambda: searched("search", "town"),
+    "search-ngsim": lambda: searched("search", "ngsim"),
+    "driving-town": lambda: searched("driving", "town"),
+    "driving-ngsim": lambda: searched("driving", "ngsim"),
+    "driving-places": by_place,
     "wosac-log": wosac_log,
     "wosac-sumo": lambda: wosac("sumo"),
     "wosac-ngsim": lambda: wosac("ngsim"),
