@@ -23,6 +23,7 @@ from symphony.cli import (
     evaluate,
     export,
     figure,
+    planners,
     plot,
     profiles,
     report,
@@ -55,6 +56,7 @@ app.command(name="simulate")(simulate.Simulate)
 app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
+app.command(name="planners")(planners.Planners)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="demo")(demo.Demo)
 

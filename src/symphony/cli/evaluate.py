@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from symphony.cli.tables import print_metrics
+from symphony.cli.tables import print_metrics, short_name, write_numbers
 from symphony.config import EvaluateConfig
-from symphony.files import write_json
+from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
     from symphony.agents import Agent
@@ -32,8 +33,16 @@ class Evaluate:
     (the log itself) or `constant_velocity`."""
     data: Path
     """Store of run segments to simulate."""
+    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
+    """Only these run segments, by their ids or their numbers in the store; then the folder of the run is left as it
+    is."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File to write all numbers to, those of every run segment included."""
+    """File to write all numbers to, those of every run segment included; - for standard output."""
+    planner: str = ""
+    """Judge a planner as the ego instead, among agents that the agent drives (among the log with `playback`): see
+    `symphony simulate`. Its numbers are those of `symphony planners`; no folder of a run is touched."""
+    planner_seconds: float = 60.0
+    """That it has for one answer; more fails the run."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -42,9 +51,21 @@ class Evaluate:
     """Leave the folder of the run as it is."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
+    def __post_init__(self) -> None:
+        if self.planner and self.figure is not None:
+            raise ConfigError(
+                "--figure goes without --planner: keep the rollouts and draw them, symphony view"
+            )
+        if not self.planner_seconds > 0:
+            raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
+
     def run(self) -> None:
         """Evaluate, print the numbers and write them."""
+        if self.planner:
+            self._judge_planner()
+            return
         from symphony.agents import load_agent
+        from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore
         from symphony.evaluation.pictures import PANELS, ClipKeeper, RolloutKeeper, check_picture, draw_clips
         from symphony.evaluation.records import evaluation_record, keep_evaluation
@@ -55,7 +76,9 @@ class Evaluate:
         if self.figure is not None:
             check_picture(self.figure)
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
-        clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
+        chosen = [segment_index(store, name) for name in self.segments]
+        shown = evenly_spaced(len(chosen or store), PANELS if self.figure is not None else 0)
+        clips = ClipKeeper(shown, title=f"{short_name(agent.name)}: ")
         keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
         if self.save_rollouts is not None:
             settings = plain_settings(self.config, agent.interactive, agent.duration)
@@ -67,16 +90,45 @@ class Evaluate:
                 keeper(batch)
 
         found = evaluate_with_bar(
-            agent, store, self.config, observe=observe if keepers else None, baselines=True
+            agent,
+            store,
+            self.config,
+            observe=observe if keepers else None,
+            baselines=True,
+            items=chosen or None,
         )
         print_evaluation(found, self.data)
         record = evaluation_record(agent, found, store)
-        if self.keep:
+        if self.keep and not chosen:
             keep_evaluation(agent.name, record)
         if self.json is not None:
-            write_json(self.json, record)
+            write_numbers(self.json, record)
         if self.figure is not None:
             draw_clips(clips.clips, self.figure)
+
+    def _judge_planner(self) -> None:
+        from tempfile import TemporaryDirectory
+
+        from symphony.cli.planners import table_text
+        from symphony.cli.simulate import Simulate, failed_runs
+        from symphony.evaluation.planners import planner_record
+
+        with TemporaryDirectory() as spare:
+            folder = Simulate(
+                agent=self.agent,
+                data=self.data,
+                out=self.save_rollouts or Path(spare),
+                segments=self.segments,
+                planner=self.planner,
+                planner_seconds=self.planner_seconds,
+                config=self.config,
+            ).simulated()
+            record = planner_record(folder)
+            for line in failed_runs(folder):
+                sys.stderr.write(f"{line}\n")
+        if self.json is not None:
+            write_numbers(self.json, record)
+        sys.stdout.write(table_text([record]))
 
 
 def print_evaluation(found: Evaluation, data: Path) -> None:
@@ -92,12 +144,13 @@ def evaluate_with_bar(
     *,
     baselines: bool = False,
     observe: Callable[[EvaluatedBatch], None] | None = None,
+    items: Sequence[int] | None = None,
 ) -> Evaluation:
-    """Evaluate an agent, showing on stderr how far it is."""
+    """Evaluate an agent on a store, or on some of its items, showing on stderr how far it is."""
     from symphony.evaluation import evaluate
 
     with segments_bar(f"evaluating {agent if isinstance(agent, str) else agent.name}") as advance:
-        return evaluate(agent, data, config, advance, baselines=baselines, observe=observe)
+        return evaluate(agent, data, config, advance, items=items, baselines=baselines, observe=observe)
 
 
 def segments_bar(description: str) -> Any:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+from symphony.files import json_text, write_json
 
 COLUMNS = (
     ("collision_rate", "collision\n%", 1),
@@ -64,6 +68,14 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
         f"agents each, up to {most} rollouts; ± standard error over recordings; seed {first['seed']}",
         style="dim",
     )
+
+
+def write_numbers(path: Path, numbers: Any) -> None:
+    """Write numbers as JSON to a file, or to standard output where the file is called -."""
+    if str(path) == "-":
+        sys.stdout.write(json_text(numbers))
+    else:
+        write_json(path, numbers)
 
 
 def short_name(agent: str) -> str:
