@@ -97,7 +97,7 @@ class Evaluate:
             baselines=True,
             items=chosen or None,
         )
-        print_evaluation(found, self.data)
+        print_evaluation(found, self.data, aside=str(self.json) == "-")
         record = evaluation_record(agent, found, store)
         if self.keep and not chosen:
             keep_evaluation(agent.name, record)
@@ -128,13 +128,13 @@ class Evaluate:
                 sys.stderr.write(f"{line}\n")
         if self.json is not None:
             write_numbers(self.json, record)
-        sys.stdout.write(table_text([record]))
+        (sys.stderr if str(self.json) == "-" else sys.stdout).write(table_text([record]))
 
 
-def print_evaluation(found: Evaluation, data: Path) -> None:
-    """Print baselines and agent as one table."""
+def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False) -> None:
+    """Print baselines and agent as one table; to stderr if ``aside``."""
     others = [baseline.numbers() for baseline in found.baselines if baseline.agent != found.agent]
-    print_metrics([*others, found.numbers()], title=str(data))
+    print_metrics([*others, found.numbers()], title=str(data), aside=aside)
 
 
 def evaluate_with_bar(
