@@ -134,6 +134,9 @@ def without_paths(config: TrainConfig) -> TrainConfig:
         validation=judged,
         resume=False,
         wandb="disabled",
+        wandb_project="symphony",
+        wandb_group="",
+        wandb_tags=(),
         device="cpu",
     )
 

@@ -61,11 +61,11 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ["data"],
         ["data", "convert"],
         ["data", "info"],
-        ["data", "plot"],
+        ["plot", "segment"],
         ["train"],
         ["evaluate"],
         ["table"],
-        ["figure", "curvature"],
+        ["plot", "curvature"],
         ["plot", "tree"],
         ["plot", "curves"],
         ["view"],
@@ -244,7 +244,7 @@ def test_convert_reads_real_files(samples: Path, tmp_path: Path) -> None:
     assert main(["data", "convert", "womd", str(source), "--out", str(out)]) == 0
     assert len(SegmentStore(out)) == 1
     picture = tmp_path / "segment.png"
-    assert main(["data", "plot", str(out), "--segment", "0", "--out", str(picture)]) == 0
+    assert main(["plot", "segment", str(out), "--segment", "0", "--out", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -294,7 +294,7 @@ def test_info_of_an_empty_store(tmp_path: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize("segment", ["straight", "1"])
 def test_plot_finds_a_segment_by_id_or_number(store: Path, segment: str, tmp_path: Path) -> None:
     out = tmp_path / "new" / "segment.svg"
-    assert main(["data", "plot", str(store), "--segment", segment, "--out", str(out)]) == 0
+    assert main(["plot", "segment", str(store), "--segment", segment, "--out", str(out)]) == 0
     assert "straight" in out.read_text()
 
 
@@ -321,7 +321,7 @@ def test_plot_refuses_what_it_cannot_draw(
     monkeypatch.chdir(tmp_path)
     arguments = {"--segment": "straight", "--out": "segment.png"} | change
     flat = [word for pair in arguments.items() for word in pair]
-    assert main(["data", "plot", str(store), *flat]) == 1
+    assert main(["plot", "segment", str(store), *flat]) == 1
     captured = capsys.readouterr()
     assert captured.err.startswith("symphony: error: ")
     assert captured.err.count("\n") == 1

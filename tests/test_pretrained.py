@@ -173,7 +173,7 @@ def test_its_name_works_wherever_an_agent_is_named(made: Path, store: Path, tmp_
     tree = ["plot", "tree", "pretrained:tiny", *data, "--segment", "0", "--branches", "2"]
     assert main([*tree, "--out", str(picture)]) == 0
     assert picture.stat().st_size > 5_000
-    figure = ["figure", "curvature", "pretrained:tiny", "--out"]
+    figure = ["plot", "curvature", "pretrained:tiny", "--out"]
     assert main([*figure, str(tmp_path / "a.png")]) == 0
     assert main([*figure, str(tmp_path / "b.png"), *data, "--rollouts", "2"]) == 0
     method = make_pretrained.read_run(made).method
@@ -273,7 +273,7 @@ def test_one_process_says_where_the_agent_is(
     if rank is not None:
         monkeypatch.setenv("RANK", rank)
     Train(tiny("bc", store, tmp_path / "run", steps=1)).run()
-    assert capsys.readouterr().out.count("Trained agent in") == lines
+    assert capsys.readouterr().out.count("trained agent ") == lines
 
 
 def test_python_m_symphony() -> None:

@@ -22,7 +22,6 @@ from symphony.cli import (
     demo,
     evaluate,
     export,
-    figure,
     planners,
     plot,
     profiles,
@@ -50,7 +49,6 @@ app.command(data.app, name="data", help=data.__doc__)
 app.command(name="train")(train.Train)
 app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="table")(table.Table)
-app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
 app.command(name="simulate")(simulate.Simulate)
 app.command(name="view")(view.View)

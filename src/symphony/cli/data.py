@@ -1,4 +1,4 @@
-"""Convert or generate run segments into a store, look into it, draw from it."""
+"""Convert or generate run segments into a store, and look into it."""
 
 from __future__ import annotations
 
@@ -208,43 +208,6 @@ class Verify:
             write_numbers(self.json, found)
         if str(self.json) != "-":
             _write(f"{len(store)} segments are what was written; checksum {found['checksum']}")
-
-
-@app.command(name="plot")
-@dataclass(frozen=True)
-class Plot:
-    """Draw a run segment: map, lights and agents, with the tracks of the whole window."""
-
-    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
-    """Folder of the store."""
-    segment: str
-    """Its id, or its number in the store."""
-    out: Path
-    """Picture to write (.png, .pdf or .svg)."""
-    interactive: int = 2
-    """Agents in colour, the ego included."""
-    step: int = 0
-    """Step at which boxes and lights are shown."""
-
-    def run(self) -> None:
-        """Draw it."""
-        from symphony.cli.plot import segment_index
-        from symphony.data.selection import interactive_choice
-        from symphony.data.store import SegmentStore
-        from symphony.render import plot_segment
-        from symphony.render.style import picture_path
-
-        picture_path(self.out)
-        store = SegmentStore(self.store)
-        segment = store[segment_index(store, self.segment)]
-        if not 0 <= self.step < segment.num_steps:
-            raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
-        if self.interactive < 1:
-            raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
-        choice = interactive_choice(segment, self.interactive)
-        title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
-        chosen = choice.agents.tolist()
-        plot_segment(segment, self.out, step=self.step, interactive=chosen, title=title)
 
 
 def _write(text: str) -> None:
