@@ -18,8 +18,10 @@ import tyro
 from symphony import allocator
 from symphony._version import __version__
 from symphony.cli import (
+    agents,
     data,
     demo,
+    doctor,
     evaluate,
     export,
     planners,
@@ -56,7 +58,9 @@ app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
 app.command(name="planners")(planners.Planners)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
+app.command(name="agents")(agents.Agents)
 app.command(name="demo")(demo.Demo)
+app.command(name="doctor")(doctor.Doctor)
 
 
 def main(args: Sequence[str] | None = None) -> int:

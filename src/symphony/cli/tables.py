@@ -72,7 +72,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         errors = {name: row.get(f"{name}_se") for name, _, _ in COLUMNS if name != "curvature_jsd"}
-        cells = [_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
+        cells = [number_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
         table.add_row(escape(short_name(str(row["agent"]))), *cells)
     console = Console(stderr=aside)
     print_table(table, console)
@@ -109,8 +109,9 @@ def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
     return [(f"collision_{kind}", text) for kind, text in KINDS if f"collision_{kind}" in row]
 
 
-def _cell(value: float, error: float | None, digits: int) -> str:
-    if math.isnan(value):
+def number_cell(value: float | None, error: float | None, digits: int) -> str:
+    """A number with its standard error; a dash for none."""
+    if value is None or math.isnan(value):
         return "–"
     text = f"{value:.{digits}f}"
     return text if error is None or math.isnan(error) else f"{text} ± {error:.{digits}f}"
