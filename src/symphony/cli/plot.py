@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.cli.curvature import Curvature
+from symphony.cli.tables import short_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 
@@ -112,7 +113,7 @@ class Rollouts:
             routes=agent.goals is not None,
             duration=config.duration or agent.duration,
         )
-        clips = ClipKeeper(range(len(dataset)), self.drawn)
+        clips = ClipKeeper(range(len(dataset)), self.drawn, f"{short_name(agent.name)}: ")
         with segments_bar(f"simulating {agent.name}") as advance:
             evaluate_dataset(agent, dataset, config, advance, observe=clips)
         draw_clips(clips.clips, self.out)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from symphony.cli.tables import short_name
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -65,7 +66,8 @@ class View:
         names = self.segments or tuple(folder.ids[:PANELS])
         if not names:
             raise ConfigError(f"{self.folder} holds no rollouts to draw")
-        clips = [clip_of(folder.of(name), self.rollouts or (1 if moving else None)) for name in names]
+        count, agent = self.rollouts or (1 if moving else None), title_of(folder.about.agent)
+        clips = [clip_of(folder.of(name), count, f"{agent}: {name}") for name in names]
         if kind in FILMS:
             write_film(clips, out)
         elif moving:
@@ -94,7 +96,12 @@ def write_view(folder: RolloutFolder, out: Path, segments: tuple[str, ...] = ())
     return found.totals()
 
 
-def clip_of(saved: SavedRollouts, count: int | None) -> Clip:
+def title_of(agent: str) -> str:
+    """Who drove, without folders, to be put before the name of a segment."""
+    return " among ".join(short_name(part) for part in agent.split(" among "))
+
+
+def clip_of(saved: SavedRollouts, count: int | None, title: str | None = None) -> Clip:
     """The first so many rollouts of a segment, to be drawn."""
     from symphony.render import Clip
 
@@ -112,4 +119,5 @@ def clip_of(saved: SavedRollouts, count: int | None) -> Clip:
         counted,
         collision,
         offroad,
+        title=title,
     )
