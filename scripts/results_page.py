@@ -1,6 +1,6 @@
 """Write the tables of the pages from the records in `results/`, between their markers.
 
-    python scripts/results_page.py            # rewrites README.md, docs/results.md and docs/appendix.md
+    python scripts/results_page.py            # rewrites the pages
     python scripts/results_page.py --check    # says what differs, and fails if anything does
 
 A block is `<!-- table NAME -->`, the table, `<!-- end table -->`. What a name stands for is in TABLES below.
@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from symphony.evaluation.paper import paper_figures
+from symphony.evaluation.planners import crowd_name, planner_grid, planner_title
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
-PAGES = ("README.md", "docs/results.md", "docs/appendix.md")
+PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/planners.md")
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 
 Record = dict[str, Any]
@@ -238,6 +239,17 @@ def searched(data: str) -> Grid:
     return grid
 
 
+def flattered() -> Grid:
+    """How often egos begin to collide per 100 steps, in all that searches simulated and in what they kept."""
+    grid = [["crowd", "planner", "in all branches", "in the leaves"]]
+    for record in records("planners/*"):
+        found = record["search"]
+        if found is not None:
+            cells = [f"{found[name]:.2f}" for name in ("simulated", "kept")]
+            grid.append([crowd_name(record), planner_title(record), *cells])
+    return grid
+
+
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
@@ -254,6 +266,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "sweep": sweep,
     "search-town": lambda: searched("town"),
     "search-ngsim": lambda: searched("ngsim"),
+    "planners": lambda: planner_grid(records("planners/*")),
+    "planners-search": flattered,
 }
 
 

@@ -41,8 +41,8 @@ def last_words(folder: Path, config: TrainConfig) -> list[str]:
         score = "the last one; nothing was validated, see --validation.data"
     else:
         score = (
-            f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on "
-            f"{config.validation.segments} segments of {config.validation.data}"
+            f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on segments of "
+            f"{config.validation.data} (at most {config.validation.segments})"
         )
     pictures = sorted((folder / "media").glob("rollout-*.gif"))
     shown = f"{pictures[-1]}, the newest of {len(pictures)}" if pictures else "none, see --preview.every"
