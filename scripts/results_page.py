@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from symphony.evaluation.paper import paper_figures
-from symphony.evaluation.planners import crowd_name, planner_grid, planner_title
+from symphony.evaluation.planners import crowd_name, paired_difference, planner_grid, planner_title
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
@@ -240,13 +240,32 @@ def searched(data: str) -> Grid:
 
 
 def flattered() -> Grid:
-    """How often egos begin to collide per 100 steps, in all that searches simulated and in what they kept."""
-    grid = [["crowd", "planner", "in all branches", "in the leaves"]]
-    for record in records("planners/*"):
-        found = record["search"]
-        if found is not None:
-            cells = [f"{found[name]:.2f}" for name in ("simulated", "kept")]
-            grid.append([crowd_name(record), planner_title(record), *cells])
+    """What searches do for egos: collisions that begin per 100 steps, in all branches and in the leaves; collisions of
+    runs and the score without a search and with it, its difference paired over segments.
+    """
+    found = records("planners/*")
+    heads = (
+        "in all branches",
+        "in the leaves",
+        "collisions %, no search",
+        "search",
+        "score, search less none",
+    )
+    grid = [["crowd", "planner", *heads]]
+    for record in found:
+        search = record["search"]
+        if search is None:
+            continue
+        (other,) = (
+            one
+            for one in found
+            if (one["crowd"], one["planner"]) == (record["crowd"], record["planner"])
+            and one["search"] is None
+        )
+        apart, error = paired_difference(record, other)
+        cells = [f"{search[name]:.2f}" for name in ("simulated", "kept")]
+        cells += [f"{one['collision_rate']:.1f}" for one in (other, record)]
+        grid.append([crowd_name(record), planner_title(record), *cells, f"{apart:+.1f} ± {error:.1f}"])
     return grid
 
 

@@ -190,7 +190,7 @@ def winners(records: Sequence[Record]) -> list[str]:
         first, *rest = sorted(members, key=lambda one: -(one["score"] or 0.0))
         if not rest:
             continue
-        difference, error = _difference(first, rest[0])
+        difference, error = paired_difference(first, rest[0])
         clear = error is not None and difference is not None and difference > 2 * error
         by = "–" if difference is None else f"{difference:.1f}"
         by += "" if error is None else f" ± {error:.1f}"
@@ -199,7 +199,7 @@ def winners(records: Sequence[Record]) -> list[str]:
     return found
 
 
-def _difference(one: Record, other: Record) -> tuple[float | None, float | None]:
+def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None]:
     """Mean score of the first less that of the second, paired over segments, and its standard error over groups."""
     means = []
     for record in (one, other):
