@@ -240,8 +240,8 @@ def searched(data: str) -> Grid:
 
 
 def flattered() -> Grid:
-    """What searches do for egos: collisions that begin per 100 steps, in all branches and in the leaves; collisions of
-    runs and the score without a search and with it, its difference paired over segments.
+    """What searches do for egos: collisions that begin per 100 steps, in all branches and in the leaves; collisions
+    of runs and the score without a search and with it, its difference paired over segments.
     """
     found = records("planners/*")
     heads = (
