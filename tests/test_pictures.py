@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,9 @@ import pytest
 
 from helpers_segments import straight_road
 from symphony.data.segment import RunSegment
-from symphony.render import Clip, plot_grid, plot_rollout
+from symphony.render import Clip, plot_grid, plot_rollout, viewer
 from symphony.render.plots import Rollouts, beginnings, colors_of
-from symphony.render.style import new_figure, with_aspect
+from symphony.render.style import AGENT_COLORS, new_figure, with_aspect
 from symphony.render.video import frames_of
 
 STEPS = 12
@@ -75,6 +77,10 @@ def test_rollouts_that_are_the_same_are_counted_once(kinds: list[int], words: st
 def test_eight_agents_have_eight_colours() -> None:
     found = straight_road(8, steps=STEPS)
     assert len(set(colors_of(found, range(8)))) == 8
+    script = (Path(viewer.__file__).parent / "scene.js").read_text()
+    palette = re.search(r"const PALETTE = (\[.*?\]);", script)
+    assert palette is not None
+    assert json.loads(palette[1]) == [color.lower() for color in AGENT_COLORS]
 
 
 def test_panels_are_of_one_size(tmp_path: Path) -> None:
