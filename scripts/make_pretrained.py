@@ -1,10 +1,17 @@
 """Make an agent that comes with the package from a run: ``python scripts/make_pretrained.py RUN NAME``.
 
 Writes ``src/symphony/pretrained/NAME`` anew: configuration, the weights of the checkpoint that is the run's agent,
-the evaluation that was given, and a model card made of these. The same run and evaluation give the same bytes.
+the evaluations that were given, and a model card made of these, ``card.json`` (which `symphony agents` prints) and
+``README.md``. The same run and evaluations give the same bytes.
 
     symphony evaluate RUN --data town-small/test
-    python scripts/make_pretrained.py RUN NAME --scores RUN/evaluations/test-....json
+    symphony evaluate RUN --data ngsim
+    python scripts/make_pretrained.py RUN NAME --scores RUN/evaluations/test-....json RUN/evaluations/ngsim-....json
+
+Scores of an agent that is there already, on further data (the same data's are replaced):
+
+    symphony evaluate pretrained:NAME --data ngsim --json ngsim.json
+    python scripts/make_pretrained.py pretrained:NAME NAME --scores ngsim.json
 """
 
 from __future__ import annotations
@@ -24,7 +31,7 @@ from symphony.agents import build_agent
 from symphony.agents.agent import FILE, read_spec
 from symphony.agents.checkpoint import load_checkpoint, save_checkpoint
 from symphony.agents.choice import choose, split_name
-from symphony.agents.included import FOLDER, PREFIX, run_folder
+from symphony.agents.included import CARD, CARD_FORMAT, FOLDER, PREFIX, read_card, run_folder
 from symphony.cli.tables import COLUMNS
 from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, to_json
 from symphony.data.generate import PRESETS
@@ -48,7 +55,7 @@ class Source:
         step: updates after which its agent was saved.
         before: what it started from, in words; empty for new networks.
         data: checksum of what it learned from.
-        scores: the record of an evaluation; None if there is none.
+        scores: records of evaluations, each on data of its own.
     """
 
     config: TrainConfig
@@ -56,13 +63,13 @@ class Source:
     step: int
     before: str
     data: str
-    scores: dict[str, Any] | None
+    scores: Sequence[dict[str, Any]]
 
 
 def make(
     run: str,
     name: str,
-    scores: Path | None = None,
+    scores: Sequence[Path] = (),
     pruning: EvaluateConfig = EvaluateConfig(),  # noqa: B008  (frozen)
     folder: Path = FOLDER,
 ) -> Path:
@@ -71,7 +78,7 @@ def make(
     Args:
         run: ``RUN`` or ``RUN@WHICH`` (see :func:`symphony.agents.load_agent`).
         name: of the agent.
-        scores: an evaluation of the run as ``symphony evaluate`` writes it; by default the one that the run keeps.
+        scores: evaluations of the run as ``symphony evaluate`` writes them; by default the one that the run keeps.
         pruning: its `rule`, `prune_every` and `temperature` say how the agent's trees are pruned from now on; by
             default as it was trained.
         folder: of all these agents.
@@ -83,10 +90,10 @@ def make(
     source, which = split_name(run)
     config, spec, checkpoint = read_run(source), read_spec(source), choose(source, which)
     step = int(checkpoint.name[-12:])
-    record = _read_scores(source, scores)
-    known = Source(config, spec, step, _before(source, config), _checksum(config.data), record)
+    records = _read_scores(source, scores)
+    known = Source(config, spec, step, _before(source, config), _checksum(config.data), records)
     out = replace(config, search=pruning.pruning(config.search))
-    if record is not None:
+    for record in records:
         _check_scores(record, out, step)
     changed = replace(spec, search=out.search)
     modules = build_agent(name, changed).modules
@@ -102,16 +109,55 @@ def make(
     np.random.seed(0)  # noqa: NPY002
     torch.manual_seed(0)
     save_checkpoint(place / "checkpoints", step=step, modules=modules)
-    if record is not None:
-        record = {key: value for key, value in record.items() if key != "per_segment"}
-        record |= {"agent": PREFIX + name, "run": {**record["run"], "updates": step, "named": False}}
-        (place / EVALUATIONS).mkdir()
-        write_json(place / EVALUATIONS / f"{evaluation_name(record)}.json", record)
+    for given in records:
+        _keep(place, name, given, step)
     parameters = {
         part: sum(weights.numel() for weights in module.parameters()) for part, module in modules.items()
     }
-    (place / "README.md").write_text(card(name, known, out, parameters), encoding="utf-8")
+    facts = card_of(name, known, out, parameters)
+    write_json(place / CARD, facts)
+    (place / "README.md").write_text(page(facts), encoding="utf-8")
     return place
+
+
+def add_scores(name: str, scores: Sequence[Path], folder: Path = FOLDER) -> Path:
+    """Add evaluations to an agent that is there, or replace those on the same data, and renew its card.
+
+    Args:
+        name: of the agent.
+        scores: evaluations of it as ``symphony evaluate`` writes them.
+        folder: of all these agents.
+
+    Raises:
+        ConfigError: if an evaluation is of something else.
+        DataError: if one of the files can't be read.
+    """
+    place = folder / name
+    facts, config = read_card(place), read_run(place)
+    given = [read_evaluation(file) for file in scores]
+    for record in given:
+        _check_scores(record, config, facts["training"]["updates"])
+        for kept in (place / EVALUATIONS).glob("*.json"):
+            if read_evaluation(kept)["data"]["checksum"] == record["data"]["checksum"]:
+                kept.unlink()
+        _keep(place, name, record, facts["training"]["updates"])
+    records = [read_evaluation(file) for file in sorted((place / EVALUATIONS).glob("*.json"))]
+    facts["scores"] = [_scores_of(record) for record in _in_order(records)]
+    write_json(place / CARD, facts)
+    (place / "README.md").write_text(page(facts), encoding="utf-8")
+    return place
+
+
+def _keep(place: Path, name: str, record: dict[str, Any], step: int) -> None:
+    kept = {key: value for key, value in record.items() if key != "per_segment"}
+    kept |= {"agent": PREFIX + name, "run": {**record["run"], "updates": step, "named": False}}
+    (place / EVALUATIONS).mkdir(exist_ok=True)
+    write_json(place / EVALUATIONS / f"{evaluation_name(kept)}.json", kept)
+
+
+def _in_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those on standard sets first."""
+    return sorted(records, key=lambda one: (_standard(one["data"]) is None, one["data"]["name"]))
 
 
 def read_run(folder: Path) -> TrainConfig:
@@ -134,6 +180,9 @@ def without_paths(config: TrainConfig) -> TrainConfig:
         validation=evaluated,
         resume=False,
         wandb="disabled",
+        wandb_project="symphony",
+        wandb_group="",
+        wandb_tags=(),
         device="cpu",
     )
 
@@ -168,11 +217,11 @@ def _before(run: Path, config: TrainConfig) -> str:
     return f"{words} ({method_name(earlier.method)}, {_count(earlier.steps)} updates{origin})"
 
 
-def _read_scores(run: Path, file: Path | None) -> dict[str, Any] | None:
-    if file is not None:
-        return read_evaluation(file)
+def _read_scores(run: Path, files: Sequence[Path]) -> list[dict[str, Any]]:
+    if files:
+        return _in_order([read_evaluation(file) for file in files])
     kept = kept_evaluations(run)
-    return choose_evaluation(run, kept)[1] if kept else None
+    return [choose_evaluation(run, kept)[1]] if kept else []
 
 
 def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> None:
@@ -193,8 +242,8 @@ def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> Non
             raise ConfigError(f"the evaluation is of another agent: {what} {evaluated}, not {own}")
 
 
-def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, int]) -> str:
-    """The model card.
+def card_of(name: str, source: Source, config: TrainConfig, parameters: dict[str, int]) -> dict[str, Any]:
+    """The model card, as ``card.json`` has it.
 
     Args:
         name: of the agent.
@@ -203,23 +252,46 @@ def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, i
         parameters: number of weights of each network.
     """
     method = method_name(config.method)
+    return {
+        "format": CARD_FORMAT,
+        "name": PREFIX + name,
+        "method": method,
+        "about": f"{method} (see the table of methods in the README of Symphony): {_method_words(source.spec)} It "
+        f"drives {config.agent.interactive} vehicles of a run segment at {1 / source.spec.dt:g} Hz while all others "
+        "follow their log.",
+        "training": {
+            "data": data_name(source.config.data),
+            "checksum": source.data,
+            "seed": source.config.seed,
+            "updates": source.step,
+            "words": _training(source, config),
+        },
+        "settings": _settings(config, source.spec, parameters),
+        "scores": [_scores_of(record) for record in source.scores],
+        "limits": _limits(source.config, source.spec, method),
+    }
+
+
+def page(facts: dict[str, Any]) -> str:
+    """The model card as a page."""
+    rows = ["| setting | value |", "| --- | --- |"]
+    rows += [f"| {key} | {value} |" for key, value in facts["settings"].items()]
     parts = [
-        f"# {PREFIX}{name}",
-        f"{method} (see the table of methods in the README of Symphony): {_method_words(source.spec)} It drives "
-        f"{config.agent.interactive} vehicles of a run segment at 5 Hz while all others follow their log.",
-        f"```sh\nsymphony evaluate {PREFIX}{name} --data DIR\n```",
+        f"# {facts['name']}",
+        facts["about"],
+        f"```sh\nsymphony evaluate {facts['name']} --data DIR\n```",
         "## Training",
-        _training(source, config),
-        _settings(config, source.spec, parameters),
+        facts["training"]["words"],
+        "\n".join(rows),
         "## Scores",
-        _scores(PREFIX + name, source.scores),
+        *([_score_page(facts["name"], found) for found in facts["scores"]] or ["It has not been evaluated."]),
         "## Limits",
-        _limits(source.config, source.spec, method),
+        facts["limits"],
         "## Files",
-        "`agent.json`: what the networks are and how it is simulated. `config.json`: all settings of the training, "
-        "with names in place of paths. `checkpoints/`: the weights as safetensors, each "
-        "with its checksum in `checkpoint.json`, without the state of the optimizers. "
-        + ("`evaluations/`: the scores above. " if source.scores else "")
+        "`agent.json`: what the networks are and how it is simulated. `card.json`: this page for `symphony agents`. "
+        "`config.json`: all settings of the training, with names in place of paths. `checkpoints/`: the weights as "
+        "safetensors, each with its checksum in `checkpoint.json`, without the state of the optimizers. "
+        + ("`evaluations/`: the scores above. " if facts["scores"] else "")
         + "Licence: that of the package, Apache-2.0. Made by `scripts/make_pretrained.py`.",
     ]
     return "\n\n".join(parts) + "\n"
@@ -271,7 +343,7 @@ def _pruning(search: dict[str, Any]) -> str:
     return words + (f" (temperature {search['temperature']:g})" if search["rule"] == "systematic" else "")
 
 
-def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) -> str:
+def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) -> dict[str, str]:
     rows: list[tuple[str, Any]] = [
         (f"weights of the {part}", _count(number)) for part, number in parameters.items()
     ]
@@ -291,13 +363,11 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
             (f"`search.{key}`", getattr(config.search, key))
             for key in ("test_branches", "prune_every", "rule", "survivors")
         ]
-    lines = ["| setting | value |", "| --- | --- |", *(f"| {key} | {value} |" for key, value in rows)]
-    return "\n".join(lines)
+    return {key: str(value) for key, value in rows}
 
 
-def _scores(name: str, record: dict[str, Any] | None) -> str:
-    if record is None:
-        return "It has not been evaluated."
+def _scores_of(record: dict[str, Any]) -> dict[str, Any]:
+    """An evaluation as a card has it."""
     how, data = record["config"], record["data"]
     trees = "one search tree" if how["trees"] == 1 else f"{how['trees']} search trees"
     ways = {
@@ -306,29 +376,39 @@ def _scores(name: str, record: dict[str, Any] | None) -> str:
         "oracle": "trees pruned by the true collision and off-road flags",
         "best": f"the best of {how['branches']} independent rollouts by the discriminator",
     }
-    lines = [
-        "| " + " | ".join(["agent", *(heading.replace("\n", " ") for _, heading, _ in COLUMNS)]) + " |",
-        "| --- " * (len(COLUMNS) + 1) + "|",
-        _row(name, record),
-        _row("constant velocity", record["constant_velocity"]),
-        _row("log playback", record["playback"]),
-    ]
-    test = data["name"]
-    standard = [
-        f"{preset}/{split}"
-        for preset, made in PRESETS.items()
-        for split, checksum in made.checksums.items()
-        if checksum == data["checksum"]
-    ]
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"{record['segments']} run segments of `{standard[0] if standard else test}` (checksum "
-            f"`{data['checksum']}`), {how['interactive']} interactive agents each; per segment "
-            f"{ways[how['search']]}; ± standard error over recordings; seed {how['seed']}.",
-        ]
+    numbers = [name for key, _, _ in COLUMNS for name in (key, f"{key}_se")]
+    rows = {"": record, "constant velocity": record["constant_velocity"], "log playback": record["playback"]}
+    return {
+        "data": _standard(data) or data["name"],
+        "checksum": data["checksum"],
+        "segments": record["segments"],
+        "groups": record["groups"],
+        "interactive": how["interactive"],
+        "how": ways[how["search"]],
+        "seed": how["seed"],
+        "rows": {label: {name: row.get(name) for name in numbers} for label, row in rows.items()},
+    }
+
+
+def _standard(data: dict[str, Any]) -> str | None:
+    """Name of the standard set that a store is, by its checksum."""
+    for preset, made in PRESETS.items():
+        for split, checksum in made.checksums.items():
+            if checksum == data["checksum"]:
+                return f"{preset}/{split}"
+    return None
+
+
+def _score_page(name: str, found: dict[str, Any]) -> str:
+    heads = ["agent", *(heading.replace("\n", " ") for _, heading, _ in COLUMNS)]
+    lines = [f"| {' | '.join(heads)} |", "| --- " * len(heads) + "|"]
+    lines += [_row(label or name, row) for label, row in found["rows"].items()]
+    text = (
+        f"{found['segments']} run segments of `{found['data']}` (checksum `{found['checksum']}`), "
+        f"{found['interactive']} interactive agents each; per segment {found['how']}; ± standard error over "
+        f"{found['groups']} recordings; seed {found['seed']}."
     )
+    return "\n".join([*lines, "", text])
 
 
 def _row(name: str, numbers: dict[str, Any]) -> str:
@@ -377,7 +457,11 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("run", help="folder of a run, or RUN@WHICH")
     parser.add_argument("name", help="of the agent, such as bc_ts_h")
     parser.add_argument(
-        "--scores", type=Path, help="an evaluation of it (default: the one that the run keeps)"
+        "--scores",
+        type=Path,
+        nargs="+",
+        default=[],
+        help="evaluations of it, each on data of its own (default: the one that the run keeps)",
     )
     parser.add_argument(
         "--rule",
@@ -392,7 +476,10 @@ def main(args: Sequence[str] | None = None) -> None:
         pruning = EvaluateConfig(
             rule=arguments.rule, prune_every=arguments.prune_every, temperature=arguments.temperature
         )
-        place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder)
+        if arguments.run == PREFIX + arguments.name:
+            place = add_scores(arguments.name, arguments.scores, arguments.folder)
+        else:
+            place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder)
     except SymphonyError as error:
         parser.exit(1, f"error: {error}\n")
     size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())

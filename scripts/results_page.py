@@ -1,6 +1,6 @@
 """Write the tables of the pages from the records in `results/`, between their markers.
 
-    python scripts/results_page.py            # rewrites README.md and pages of docs
+    python scripts/results_page.py            # rewrites the pages
     python scripts/results_page.py --check    # says what differs, and fails if anything does
 
 A block is `<!-- table NAME -->`, the table, `<!-- end table -->`. What a name stands for is in TABLES below.
@@ -21,12 +21,13 @@ import numpy as np
 from symphony.evaluation.comparison import Entry
 from symphony.evaluation.paired import clustered_mean
 from symphony.evaluation.paper import paper_figures
+from symphony.evaluation.planners import crowd_name, paired_difference, planner_grid, planner_title
 from symphony.evaluation.relations import grid, relations
 from symphony.evaluation.wosac_table import read_wosac, wosac_grid
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
-PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/wosac.md")
+PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/wosac.md", "docs/planners.md")
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 
 Record = dict[str, Any]
@@ -290,6 +291,36 @@ def wosac_log() -> Grid:
     return grid
 
 
+def flattered() -> Grid:
+    """What searches do for egos: collisions that begin per 100 steps, in all branches and in the leaves; collisions
+    of runs and the score without a search and with it, its difference paired over segments.
+    """
+    found = records("planners/*")
+    heads = (
+        "in all branches",
+        "in the leaves",
+        "collisions %, no search",
+        "search",
+        "score, search less none",
+    )
+    grid = [["crowd", "planner", *heads]]
+    for record in found:
+        search = record["search"]
+        if search is None:
+            continue
+        (other,) = (
+            one
+            for one in found
+            if (one["crowd"], one["planner"]) == (record["crowd"], record["planner"])
+            and one["search"] is None
+        )
+        apart, error = paired_difference(record, other)
+        cells = [f"{search[name]:.2f}" for name in ("simulated", "kept")]
+        cells += [f"{one['collision_rate']:.1f}" for one in (other, record)]
+        grid.append([crowd_name(record), planner_title(record), *cells, f"{apart:+.1f} ± {error:.1f}"])
+    return grid
+
+
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
@@ -312,6 +343,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "wosac-log": wosac_log,
     "wosac-sumo": lambda: wosac("sumo"),
     "wosac-ngsim": lambda: wosac("ngsim"),
+    "planners": lambda: planner_grid(records("planners/*")),
+    "planners-search": flattered,
 }
 
 

@@ -61,11 +61,11 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ["data"],
         ["data", "convert"],
         ["data", "info"],
-        ["data", "plot"],
+        ["plot", "segment"],
         ["train"],
         ["evaluate"],
         ["table"],
-        ["figure", "curvature"],
+        ["plot", "curvature"],
         ["plot", "tree"],
         ["plot", "curves"],
         ["view"],
@@ -73,6 +73,9 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ["export"],
         ["wosac", "evaluate"],
         ["wosac", "submit"],
+        ["agents"],
+        ["doctor"],
+        ["planners"],
         ["demo"],
     ],
     ids=" ".join,
@@ -180,7 +183,7 @@ def test_programming_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_closed_pipe_is_no_traceback(store: Path) -> None:
     reader, writer = (
         [sys.executable, "-c", "import sys; sys.stdin.close()"],
-        [sys.executable, "-m", "symphony.cli", "data", "info", str(store), "--json"],
+        [sys.executable, "-m", "symphony.cli", "data", "info", str(store), "--json", "-"],
     )
     sink = subprocess.Popen(reader, stdin=subprocess.PIPE)
     sink.wait()
@@ -244,12 +247,12 @@ def test_convert_reads_real_files(samples: Path, tmp_path: Path) -> None:
     assert main(["data", "convert", "womd", str(source), "--out", str(out)]) == 0
     assert len(SegmentStore(out)) == 1
     picture = tmp_path / "segment.png"
-    assert main(["data", "plot", str(out), "--segment", "0", "--out", str(picture)]) == 0
+    assert main(["plot", "segment", str(out), "--segment", "0", "--out", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_info_as_json_and_as_text_agree(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["data", "info", str(store), "--json"]) == 0
+    assert main(["data", "info", str(store), "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["segments"] == 2
     assert found["checksum"] == SegmentStore(store).checksum()
@@ -263,14 +266,14 @@ def test_info_as_json_and_as_text_agree(store: Path, capsys: pytest.CaptureFixtu
 
 def test_info_says_who_is_interactive(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def found(*arguments: str) -> dict[str, Any]:
-        assert main(["data", "info", str(store), "--json", *arguments]) == 0
+        assert main(["data", "info", str(store), "--json", "-", *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 
     counts = found()["interactive"]
     assert counts["count"] == 2
     assert sum(counts["contexts"].values()) == 2
     assert "segments" not in counts
-    listed = found("--segments")["interactive"]
+    listed = found("--per-segment")["interactive"]
     assert listed.pop("segments").keys() == set(SegmentStore(store).ids)
     assert listed == counts
     assert found("--interactive", "99")["interactive"] == {"count": 99, "contexts": {}, "too_few": 2}
@@ -279,7 +282,7 @@ def test_info_says_who_is_interactive(store: Path, capsys: pytest.CaptureFixture
     text = capsys.readouterr().out
     for context, count in counts["contexts"].items():
         assert re.search(rf"partner: {context} +{count}\b", text)
-    assert main(["data", "info", str(store), "--segments"]) == 2
+    assert main(["data", "info", str(store), "--per-segment"]) == 2
     assert "--json" in capsys.readouterr().err
     assert main(["data", "info", str(store), "--interactive", "-1"]) == 2
     assert "negative" in capsys.readouterr().err
@@ -294,7 +297,7 @@ def test_info_of_an_empty_store(tmp_path: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize("segment", ["straight", "1"])
 def test_plot_finds_a_segment_by_id_or_number(store: Path, segment: str, tmp_path: Path) -> None:
     out = tmp_path / "new" / "segment.svg"
-    assert main(["data", "plot", str(store), "--segment", segment, "--out", str(out)]) == 0
+    assert main(["plot", "segment", str(store), "--segment", segment, "--out", str(out)]) == 0
     assert "straight" in out.read_text()
 
 
@@ -321,7 +324,7 @@ def test_plot_refuses_what_it_cannot_draw(
     monkeypatch.chdir(tmp_path)
     arguments = {"--segment": "straight", "--out": "segment.png"} | change
     flat = [word for pair in arguments.items() for word in pair]
-    assert main(["data", "plot", str(store), *flat]) == 1
+    assert main(["plot", "segment", str(store), *flat]) == 1
     captured = capsys.readouterr()
     assert captured.err.startswith("symphony: error: ")
     assert captured.err.count("\n") == 1
@@ -335,7 +338,7 @@ def test_every_vehicle_can_be_the_ego(
     for egos, least in (("one", 1), ("all", 5)):
         out = str(tmp_path / egos)
         assert main(["data", "convert", "commonroad", file, "--out", out, "--egos", egos]) == 0
-        assert main(["data", "info", out, "--json"]) == 0
+        assert main(["data", "info", out, "--json", "-"]) == 0
         found = json.loads(capsys.readouterr().out.split("converted", 1)[-1].split("┘", 1)[-1])["segments"]
         assert (found == 1) if egos == "one" else (found >= least)
     assert main(["data", "convert", "womd", file, "--out", out + "x", "--egos", "all"]) == 2

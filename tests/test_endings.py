@@ -180,7 +180,7 @@ def test_no_store_can_be_made_of_the_root(capsys: pytest.CaptureFixture[str], tm
 @pytest.mark.parametrize(
     "command",
     [
-        ["data", "plot", "DIR", "--segment", "0", "--out", "a.bmp"],
+        ["plot", "segment", "DIR", "--segment", "0", "--out", "a.bmp"],
         ["evaluate", "playback", "--data", "DIR", "--figure", "a.bmp"],
     ],
 )

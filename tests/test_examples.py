@@ -11,6 +11,13 @@ from typing import Any
 
 import pytest
 
+from symphony.agents import load_agent
+from symphony.config import EvaluateConfig
+from symphony.data.builtin import builtin_store
+from symphony.data.store import SegmentStore
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.saving import save_simulation
+
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 ELSEWHERE = {"beam_search_torchrl"}
 """Run by tests/test_collectors_beam_search.py."""
@@ -60,6 +67,17 @@ def test_planner(example: Any, tmp_path: Path) -> None:
     assert totals["runs"] == 4
     assert totals["failed_runs"] == 0
     assert totals["progress"] > 5
+
+
+def test_coast_neither_speeds_nor_turns(example: Any, tmp_path: Path) -> None:
+    plan = example("coast").plan
+    agent, store = load_agent("playback"), SegmentStore(builtin_store("test"))
+    dataset = SceneDataset(store, 1, agent.dynamics, [0], routes=True, duration=2)
+    (saved,) = save_simulation(tmp_path / "sim", agent, dataset, EvaluateConfig(rollouts=1), planner=plan)
+    assert not saved.failed
+    heading, speed = saved.state[0, :, 0, 2], saved.state[0, :, 0, 3]
+    assert abs(heading - heading[0]).max() < 1e-4
+    assert abs(speed - speed[0]).max() < 1e-4
 
 
 @pytest.mark.slow

@@ -309,7 +309,7 @@ def test_crowded_segments_have_enough_interactive_agents() -> None:
     assert any("too few moving" in reason for reason in found.reasons)
 
 
-ARGUMENTS = ["--segments", "10", "--seed", "11"]
+ARGUMENTS = ["--count", "10", "--seed", "11"]
 
 
 @needs_sumo
@@ -355,11 +355,11 @@ def test_a_killed_run_is_continued_and_workers_change_nothing(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ([], "--segments or --preset"),
-        (["--segments", "0"], "segments"),
+        ([], "--count or --preset"),
+        (["--count", "0"], "segments"),
         (["--preset", "town", "--seed", "3"], "--seed"),
-        (["--segments", "2", "--kinds", "town,village"], "village"),
-        (["--segments", "2", "--workers", "0"], "--workers"),
+        (["--count", "2", "--kinds", "town,village"], "village"),
+        (["--count", "2", "--workers", "0"], "--workers"),
     ],
 )
 def test_wrong_usage(

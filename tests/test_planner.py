@@ -309,9 +309,12 @@ def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("best", "idm, log or an import path"),
+        ("best", "idm, log, an import path"),
+        ("pipe:", "there is no command ''"),
+        ("pipe:no_such_command -x", "there is no command 'no_such_command'"),
+        ("no_such.py:plan", "no such file"),
         ("no_such_module:Planner", "can't import"),
-        ("dataclasses:Field", "can't be called"),
+        ("dataclasses:Field", "can't be made: TypeError"),
         ("threading:Event", "has no reset and no plan"),
         (f"{__name__}:Angry", "can't be made: RuntimeError: never"),
     ],

@@ -145,6 +145,39 @@ def test_the_card_says_what_was_done_and_found(run: Path, made: Path, store: Pat
         assert part in card
 
 
+def test_scores_on_further_data_are_added_and_replaced(made: Path, tmp_path: Path) -> None:
+    """Each data set has one place on the card, and the files and the card say the same."""
+    (file,) = (made / "evaluations").iterdir()
+    record = json.loads(file.read_text())
+    further, again = tmp_path / "further.json", tmp_path / "again.json"
+    record["data"] = {"name": "roads", "checksum": "ab" * 32}
+    further.write_text(json.dumps(record))
+    record["collision_rate"] = 12.5
+    again.write_text(json.dumps(record))
+    for given in (further, again):
+        make_pretrained.add_scores("tiny", [given], made.parent)
+        facts = pretrained.read_card(made)
+        assert [found["data"] for found in facts["scores"]] == ["roads", "train"]
+        assert len(list((made / "evaluations").iterdir())) == 2
+        assert (made / "README.md").read_text() == make_pretrained.page(facts)
+    assert facts["scores"][0]["rows"][""]["collision_rate"] == 12.5
+
+
+def test_the_command_prints_every_card(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["agents", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"agents": [pretrained.read_card(made)]}
+    assert main(["agents"]) == 0
+    shown = capsys.readouterr().out
+    assert "pretrained:tiny" in shown
+    assert "seed 0" in shown
+    assert main(["agents", "pretrained:tiny"]) == 0
+    assert " ".join(pretrained.read_card(made)["limits"].split()) in " ".join(capsys.readouterr().out.split())
+    assert main(["agents", "pretrained:other"]) == 1
+    (made / "card.json").unlink()
+    assert main(["agents"]) == 1
+    assert "no model card" in capsys.readouterr().err
+
+
 def test_scores_of_another_agent_are_refused(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     with pytest.raises(ConfigError, match="of another agent: rule best, not systematic"):
@@ -155,7 +188,7 @@ def test_scores_of_another_agent_are_refused(run: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.json"
     wrong.write_text(json.dumps(record))
     with pytest.raises(ConfigError, match="of another agent: seed 7, not 0"):
-        make_pretrained.make(str(run), "x", scores=wrong, pruning=PRUNING, folder=folder)
+        make_pretrained.make(str(run), "x", scores=[wrong], pruning=PRUNING, folder=folder)
     assert not folder.exists()
 
 
@@ -173,7 +206,7 @@ def test_its_name_works_wherever_an_agent_is_named(made: Path, store: Path, tmp_
     tree = ["plot", "tree", "pretrained:tiny", *data, "--segment", "0", "--branches", "2"]
     assert main([*tree, "--out", str(picture)]) == 0
     assert picture.stat().st_size > 5_000
-    figure = ["figure", "curvature", "pretrained:tiny", "--out"]
+    figure = ["plot", "curvature", "pretrained:tiny", "--out"]
     assert main([*figure, str(tmp_path / "a.png")]) == 0
     assert main([*figure, str(tmp_path / "b.png"), *data, "--rollouts", "2"]) == 0
     method = make_pretrained.read_run(made).method
@@ -228,8 +261,10 @@ def test_shipped(name: str) -> None:
     data, _, split = str(config.data).partition("/")
     assert PRESETS[data].checksums[split] in card  # type: ignore[index]
     assert "not been evaluated" not in card
-    (file,) = (folder / "evaluations").iterdir()
-    assert f"{json.loads(file.read_text())['collision_rate']:.1f}" in card
+    facts, files = pretrained.read_card(folder), list((folder / "evaluations").iterdir())
+    assert make_pretrained.page(facts) == card
+    rates = [found["rows"][""]["collision_rate"] for found in facts["scores"]]
+    assert sorted(rates) == sorted(json.loads(file.read_text())["collision_rate"] for file in files)
     for place, content in contents(folder).items():
         assert "optimizer" not in place
         assert b"/work" not in content, place
@@ -273,7 +308,7 @@ def test_one_process_says_where_the_agent_is(
     if rank is not None:
         monkeypatch.setenv("RANK", rank)
     Train(tiny("bc", store, tmp_path / "run", steps=1)).run()
-    assert capsys.readouterr().out.count("Trained agent in") == lines
+    assert capsys.readouterr().out.count("trained agent ") == lines
 
 
 def test_python_m_symphony() -> None:

@@ -183,7 +183,7 @@ def test_the_command_verifies(folder: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_the_command_gives_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["data", "verify", str(folder), "--json"]) == 0
+    assert main(["data", "verify", str(folder), "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found == {"path": str(folder), "segments": 3, "checksum": SegmentStore(folder).checksum()}
 

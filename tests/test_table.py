@@ -516,19 +516,19 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
     assert main(["table", "--setting", "main", "--runs", str(run), "--paper", "womd"]) == 0
     assert f"{record['ade']:.2f}" in capsys.readouterr().out
     picture = tmp_path / "out" / "curvature.png"
-    assert main(["figure", "curvature", str(run), "--out", str(picture)]) == 0
+    assert main(["plot", "curvature", str(run), "--out", str(picture)]) == 0
     assert picture.stat().st_size > 5_000
 
     assert main([*command, "--seed", "5"]) == 0
     assert len(kept_evaluations(run)) == 2
     assert main(["table", "--setting", "main", "--runs", str(run)]) == 1
-    assert main(["figure", "curvature", str(run), "--out", str(picture)]) == 1
+    assert main(["plot", "curvature", str(run), "--out", str(picture)]) == 1
     assert capsys.readouterr().err.count("choose one with --evaluation") == 2
     chosen = ["--evaluation", "*-seed5"]
     assert main(["table", "--setting", "main", "--runs", str(run), *chosen]) == 0
-    assert main(["figure", "curvature", str(run), "--out", str(picture), *chosen]) == 0
+    assert main(["plot", "curvature", str(run), "--out", str(picture), *chosen]) == 0
     again = ["--data", str(store), "--rollouts", "2", "--seed", "6"]
-    assert main(["figure", "curvature", str(run), "--out", str(picture), *again]) == 0
+    assert main(["plot", "curvature", str(run), "--out", str(picture), *again]) == 0
     assert len(kept_evaluations(run)) == 3
     assert not list((run / "evaluations").glob(".*"))
 
@@ -548,11 +548,11 @@ def test_baselines_leave_nothing_behind(
         (["table", "--setting", "main"], 2),
         (["table", "--setting", "short", "--runs", "x"], 2),
         (["table", "--setting", "main", "--runs", "absent"], 1),
-        (["figure", "curvature", "--out", "x.png"], 2),
-        (["figure", "curvature", "absent", "--out", "x.png"], 1),
-        (["figure", "curvature", "absent", "--out", "x.doc"], 1),
-        (["figure", "curvature", "absent", "--out", "x.png", "--rollouts", "3"], 2),
-        (["figure", "curvature", "absent", "--out", "x.png", "--data", "x", "--evaluation", "y"], 2),
+        (["plot", "curvature", "--out", "x.png"], 2),
+        (["plot", "curvature", "absent", "--out", "x.png"], 1),
+        (["plot", "curvature", "absent", "--out", "x.doc"], 1),
+        (["plot", "curvature", "absent", "--out", "x.png", "--rollouts", "3"], 2),
+        (["plot", "curvature", "absent", "--out", "x.png", "--data", "x", "--evaluation", "y"], 2),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else str(value),
 )

@@ -3,29 +3,53 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import sys
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from symphony.errors import ConfigError
 
 
 def load_object(path: str) -> Any:
-    """Import ``module:name``; modules in the current folder are found, as with ``python -m``.
+    """Import ``module:name``; modules in the current folder are found, as with ``python -m``. A file will do, too:
+    ``path/to/file.py:name``, with what lies beside it to import.
 
     Raises:
-        ConfigError: if there is no such module or name.
+        ConfigError: if there is no such module, file or name.
     """
-    module, _, name = path.partition(":")
+    module, _, name = path.rpartition(":")
     if os.getcwd() not in sys.path and "" not in sys.path:
         sys.path.append(os.getcwd())
     try:
-        found = importlib.import_module(module)
+        found = _file(Path(module)) if module.endswith(".py") else importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"can't import '{path}': {error}") from error
     return found
+
+
+def _file(path: Path) -> ModuleType:
+    """A file as a module, run once."""
+    path = path.resolve()
+    if str(path) in sys.modules:
+        return sys.modules[str(path)]
+    spec = importlib.util.spec_from_file_location(str(path), path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise ConfigError(f"{path}: no such file")
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[str(path)] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever a user's file raises
+        del sys.modules[str(path)]
+        raise ConfigError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
+    return module
 
 
 def build_object(path: str, *args: Any, **kwargs: Any) -> Any:

@@ -57,6 +57,18 @@ def split_name(name: str) -> tuple[Path, str]:
     return (Path(run), which) if at and not Path(name).is_dir() else (Path(name), "")
 
 
+def best_of(last: Path) -> Best | None:
+    """What the last checkpoint of a run tells of its best one; None if nothing was validated.
+
+    Raises:
+        CheckpointError: if it can't be read.
+    """
+    try:
+        return Best.of(load_checkpoint(last, partial=True, restore_rng=False).extra)
+    except CheckpointError as error:
+        raise error.at(file=last / MANIFEST) from error
+
+
 def choose(folder: Path, which: str = "") -> Path:
     """The checkpoint of a run that is meant.
 
@@ -85,10 +97,7 @@ def choose(folder: Path, which: str = "") -> Path:
         raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
     if which == "last":
         return found[-1]
-    try:
-        best = Best.of(load_checkpoint(found[-1], partial=True, restore_rng=False).extra)
-    except CheckpointError as error:
-        raise error.at(file=found[-1] / MANIFEST) from error
+    best = best_of(found[-1])
     if best is None:
         if which == "best":
             raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")

@@ -18,11 +18,13 @@ import tyro
 from symphony import allocator
 from symphony._version import __version__
 from symphony.cli import (
+    agents,
     data,
     demo,
+    doctor,
     evaluate,
     export,
-    figure,
+    planners,
     plot,
     profiles,
     report,
@@ -49,14 +51,16 @@ app.command(data.app, name="data", help=data.__doc__)
 app.command(name="train")(train.Train)
 app.command(name="evaluate")(evaluate.Evaluate)
 app.command(name="table")(table.Table)
-app.command(figure.app, name="figure", help=figure.__doc__)
 app.command(plot.app, name="plot", help=plot.__doc__)
 app.command(name="simulate")(simulate.Simulate)
 app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
+app.command(name="planners")(planners.Planners)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
+app.command(name="agents")(agents.Agents)
 app.command(name="demo")(demo.Demo)
+app.command(name="doctor")(doctor.Doctor)
 
 
 def main(args: Sequence[str] | None = None) -> int:

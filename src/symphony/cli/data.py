@@ -1,8 +1,7 @@
-"""Convert or generate run segments into a store, look into it, draw from it."""
+"""Convert or generate run segments into a store, and look into it."""
 
 from __future__ import annotations
 
-import json as jsonlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from symphony.cli.generate import Generate, Quality
+from symphony.cli.tables import print_table, write_numbers
 from symphony.errors import ConfigError, printable
 
 _WINDOWS = ("window", "stride", "motion")
@@ -174,19 +174,19 @@ class Info:
 
     store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
     """Folder of the store."""
-    json: bool = False
-    """Print everything as JSON, the skipped records included."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write everything to, the skipped records included; - for standard output, and nothing else."""
     interactive: int = 2
     """Choose that many interactive agents in each segment and count why the ego's partner was chosen; 0 for not
     doing so."""
-    segments: bool = False
+    per_segment: bool = False
     """In the JSON, say for each segment which agents were chosen, and why."""
 
     def __post_init__(self) -> None:
         if self.interactive < 0:
             raise ConfigError(f"--interactive must not be negative, is {self.interactive}")
-        if self.segments and not (self.json and self.interactive):
-            raise ConfigError("--segments goes with --json and interactive agents")
+        if self.per_segment and not (self.json and self.interactive):
+            raise ConfigError("--per-segment goes with --json and interactive agents")
 
     def run(self) -> None:
         """Print it."""
@@ -197,11 +197,11 @@ class Info:
         found = info(self.store)
         if self.interactive:
             found["interactive"] = choices(SegmentStore(self.store), self.interactive)
-            if not self.segments:
+            if not self.per_segment:
                 del found["interactive"]["segments"]
-        if self.json:
-            _write(jsonlib.dumps(found, indent=2))
-        else:
+        if self.json is not None:
+            write_numbers(self.json, found)
+        if str(self.json) != "-":
             _print_info(found)
 
 
@@ -215,8 +215,8 @@ class Verify:
 
     store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
     """Folder of the store."""
-    json: bool = False
-    """Print the result as JSON."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write the result to; - for standard output, and nothing else."""
 
     def run(self) -> None:
         """Verify, showing how far it is, and print."""
@@ -236,47 +236,10 @@ class Verify:
             task = bar.add_task("Verifying", total=len(store))
             store.verify(lambda done, total: bar.update(task, completed=done, total=total))
         found = {"path": str(store.path), "segments": len(store), "checksum": store.checksum()}
-        if self.json:
-            _write(jsonlib.dumps(found, indent=2))
-        else:
+        if self.json is not None:
+            write_numbers(self.json, found)
+        if str(self.json) != "-":
             _write(f"{len(store)} segments are what was written; checksum {found['checksum']}")
-
-
-@app.command(name="plot")
-@dataclass(frozen=True)
-class Plot:
-    """Draw a run segment: map, lights and agents, with the tracks of the whole window."""
-
-    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
-    """Folder of the store."""
-    segment: str
-    """Its id, or its number in the store."""
-    out: Path
-    """Picture to write (.png, .pdf or .svg)."""
-    interactive: int = 2
-    """Agents in colour, the ego included."""
-    step: int = 0
-    """Step at which boxes and lights are shown."""
-
-    def run(self) -> None:
-        """Draw it."""
-        from symphony.cli.plot import segment_index
-        from symphony.data.selection import interactive_choice
-        from symphony.data.store import SegmentStore
-        from symphony.render import plot_segment
-        from symphony.render.style import picture_path
-
-        picture_path(self.out)
-        store = SegmentStore(self.store)
-        segment = store[segment_index(store, self.segment)]
-        if not 0 <= self.step < segment.num_steps:
-            raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
-        if self.interactive < 1:
-            raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
-        choice = interactive_choice(segment, self.interactive)
-        title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
-        chosen = choice.agents.tolist()
-        plot_segment(segment, self.out, step=self.step, interactive=chosen, title=title)
 
 
 def _write(text: str) -> None:
@@ -308,7 +271,7 @@ def _print_report(report: Any, out: Path) -> None:
         table.add_row(f"odd: {_shown(reason)}", str(count))
     if report.overlaps:
         table.add_row("converted with boxes that overlap in the log", str(report.overlaps))
-    Console().print(table)
+    print_table(table, Console())
     if report.warning:
         Console(stderr=True).print(f"[yellow]warning:[/] {_shown(report.warning)}", soft_wrap=True)
 
@@ -367,7 +330,7 @@ def _print_info(found: dict[str, Any]) -> None:
     table.title_justify = "left"
     for name, value in rows:
         table.add_row(_shown(name), _shown(value))
-    Console().print(table)
+    print_table(table, Console())
 
 
 def _interactive_rows(found: dict[str, Any] | None) -> list[tuple[str, str]]:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from symphony.cli.tables import print_metrics
+from symphony.cli.tables import print_metrics, short_name, write_numbers
 from symphony.config import EvaluateConfig, WosacSettings
 from symphony.errors import ConfigError
-from symphony.files import write_json
 
 if TYPE_CHECKING:
     from symphony.agents import Agent
@@ -34,8 +33,16 @@ class Evaluate:
     (the log itself) or `constant_velocity`."""
     data: Path
     """Store of run segments to simulate."""
+    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
+    """Only these run segments, by their ids or their numbers in the store; then the folder of the run is left as it
+    is."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File to write all numbers to, those of every run segment included."""
+    """File to write all numbers to, those of every run segment included; - for standard output."""
+    planner: str = ""
+    """Judge a planner as the ego instead, among agents that the agent drives (among the log with `playback`): see
+    `symphony simulate`. Its numbers are those of `symphony planners`; no folder of a run is touched."""
+    planner_seconds: float = 60.0
+    """That it has for one answer; more fails the run."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -54,9 +61,23 @@ class Evaluate:
     """Year of the challenge whose weights the WOSAC score has."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
+    def __post_init__(self) -> None:
+        if self.planner and self.figure is not None:
+            raise ConfigError(
+                "--figure goes without --planner: keep the rollouts and draw them, symphony view"
+            )
+        if self.planner and self.calibrate is not None:
+            raise ConfigError("--calibrate goes without --planner: give the threshold, --threshold")
+        if not self.planner_seconds > 0:
+            raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
+
     def run(self) -> None:
         """Evaluate, print the numbers and write them."""
+        if self.planner:
+            self._judge_planner()
+            return
         from symphony.agents import load_agent
+        from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore
         from symphony.evaluation.pictures import PANELS, ClipKeeper, RolloutKeeper, check_picture, draw_clips
         from symphony.evaluation.records import evaluation_record, keep_evaluation
@@ -70,7 +91,9 @@ class Evaluate:
             WosacSettings.of(self.config)  # or complain now
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
-        clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
+        chosen = [segment_index(store, name) for name in self.segments]
+        shown = evenly_spaced(len(chosen or store), PANELS if self.figure is not None else 0)
+        clips = ClipKeeper(shown, title=f"{short_name(agent.name)}: ")
         keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
         if self.save_rollouts is not None:
             plain = plain_settings(config, agent.interactive, agent.duration)
@@ -81,15 +104,23 @@ class Evaluate:
             for keeper in keepers:
                 keeper(batch)
 
-        found = evaluate_with_bar(agent, store, config, observe=observe if keepers else None, baselines=True)
-        print_evaluation(found, self.data)
+        found = evaluate_with_bar(
+            agent,
+            store,
+            config,
+            observe=observe if keepers else None,
+            baselines=True,
+            items=chosen or None,
+        )
+        print_evaluation(found, self.data, aside=str(self.json) == "-")
         record = evaluation_record(agent, found, store)
         if "wosac" in self.metrics:
-            record |= self._wosac(agent, store, WosacSettings.of(config), record)
-        if self.keep:
+            settings = WosacSettings.of(config)
+            record |= self._wosac(agent, store, chosen or range(len(store)), settings, record)
+        if self.keep and not chosen:
             keep_evaluation(agent.name, record)
         if self.json is not None:
-            write_json(self.json, record)
+            write_numbers(self.json, record)
         if self.figure is not None:
             draw_clips(clips.clips, self.figure)
 
@@ -118,22 +149,51 @@ class Evaluate:
         return replace(config, threshold=threshold)
 
     def _wosac(
-        self, agent: Agent, store: SegmentStore, settings: WosacSettings, record: dict[str, Any]
+        self,
+        agent: Agent,
+        store: SegmentStore,
+        items: Sequence[int],
+        settings: WosacSettings,
+        record: dict[str, Any],
     ) -> dict[str, Any]:
         """Parts of the record with the WOSAC score."""
         from symphony.cli.wosac_evaluate import print_wosac
         from symphony.evaluation.wosac import evaluate_wosac, wosac_parts
 
         with segments_bar(f"WOSAC score of {agent.name}") as advance:
-            found = evaluate_wosac(agent, store, range(len(store)), settings, self.wosac_config, advance)
+            found = evaluate_wosac(agent, store, items, settings, self.wosac_config, advance)
         print_wosac(found)
         return wosac_parts(found, record)
 
+    def _judge_planner(self) -> None:
+        from tempfile import TemporaryDirectory
 
-def print_evaluation(found: Evaluation, data: Path) -> None:
-    """Print baselines and agent as one table."""
+        from symphony.cli.planners import table_text
+        from symphony.cli.simulate import Simulate, failed_runs
+        from symphony.evaluation.planners import planner_record
+
+        with TemporaryDirectory() as spare:
+            folder = Simulate(
+                agent=self.agent,
+                data=self.data,
+                out=self.save_rollouts or Path(spare),
+                segments=self.segments,
+                planner=self.planner,
+                planner_seconds=self.planner_seconds,
+                config=self.config,
+            ).simulated()
+            record = planner_record(folder)
+            for line in failed_runs(folder):
+                sys.stderr.write(f"{line}\n")
+        if self.json is not None:
+            write_numbers(self.json, record)
+        (sys.stderr if str(self.json) == "-" else sys.stdout).write(table_text([record]))
+
+
+def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False) -> None:
+    """Print baselines and agent as one table; to stderr if ``aside``."""
     others = [baseline.numbers() for baseline in found.baselines if baseline.agent != found.agent]
-    print_metrics([*others, found.numbers()], title=str(data))
+    print_metrics([*others, found.numbers()], title=str(data), aside=aside)
 
 
 def evaluate_with_bar(
@@ -143,12 +203,13 @@ def evaluate_with_bar(
     *,
     baselines: bool = False,
     observe: Callable[[EvaluatedBatch], None] | None = None,
+    items: Sequence[int] | None = None,
 ) -> Evaluation:
-    """Evaluate an agent, showing on stderr how far it is."""
+    """Evaluate an agent on a store, or on some of its items, showing on stderr how far it is."""
     from symphony.evaluation import evaluate
 
     with segments_bar(f"evaluating {agent if isinstance(agent, str) else agent.name}") as advance:
-        return evaluate(agent, data, config, advance, baselines=baselines, observe=observe)
+        return evaluate(agent, data, config, advance, items=items, baselines=baselines, observe=observe)
 
 
 def segments_bar(description: str) -> Any:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from symphony.cli.tables import print_table, write_numbers
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ class Generate:
 
     out: Path
     """Folder of the store; with a preset, of its stores `train`, `validation` and `test`."""
-    segments: int | None = None
-    """How many; needed unless a preset says it."""
+    count: int | None = None
+    """How many segments; needed unless a preset says it."""
     preset: Literal["town-small", "town"] | None = None
     """A standard set: 2 000 + 200 + 500 segments, or 10 000 + 200 + 1 000, of 10 s."""
     seed: int = 0
@@ -48,12 +49,12 @@ class Generate:
     """Processes that make networks."""
     engine: Literal["local", "ray"] = "local"
     """Where they are: on this machine, or wherever Ray puts them."""
-    json: Path | None = None
-    """Write the measures to this file too."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write the measures to; - for standard output, the tables then go to standard error."""
 
     def __post_init__(self) -> None:
-        if self.preset is None and self.segments is None:
-            raise ConfigError("give --segments or --preset")
+        if self.preset is None and self.count is None:
+            raise ConfigError("give --count or --preset")
         if self.preset is not None:
             given = [f.name for f in fields(self) if getattr(self, f.name) != f.default]
             extra = sorted(set(given) - _WITH_PRESET)
@@ -70,7 +71,7 @@ class Generate:
         if self.preset is not None:
             return {split: (plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()}
         kinds = tuple(kind.strip() for kind in self.kinds.split(","))
-        segments = 0 if self.segments is None else self.segments
+        segments = 0 if self.count is None else self.count
         plan = Plan(segments, self.seed, self.split, kinds, self.duration, self.interactive)
         return {self.split: (plan, self.out)}
 
@@ -81,15 +82,15 @@ class Generate:
 
         from symphony.data.generate import MADE_WITH, PRESETS
         from symphony.data.sources.sumo import sumo_version
-        from symphony.files import write_json
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
-        console = Console()
+        aside = str(self.json) == "-"
+        console = Console(stderr=aside)
         found = {}
         for split, (plan, path) in self._plans().items():
             made = self._make(plan, path, split)
             found[split] = entry = describe(path, plan, made)
-            print_quality(entry["quality"], title=str(path), rows=_generation_rows(entry))
+            print_quality(entry["quality"], title=str(path), rows=_generation_rows(entry), aside=aside)
             console.print(f"checksum {entry['checksum']}", soft_wrap=True)
             if entry["checksum"] != expected.get(split, entry["checksum"]):
                 text = (
@@ -100,7 +101,7 @@ class Generate:
                 Console(stderr=True).print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
             entry["expected_checksum"] = expected.get(split)
         if self.json is not None:
-            write_json(self.json, {"preset": self.preset, "stores": found})
+            write_numbers(self.json, {"preset": self.preset, "stores": found})
 
     def _make(self, plan: Plan, path: Path, name: str) -> Generation:
         from rich.console import Console
@@ -134,8 +135,8 @@ class Quality:
     """Folder of the store."""
     interactive: int = 2
     """Interactive agents per segment: they are what is measured."""
-    json: Path | None = None
-    """Write the measures to this file too."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write the measures to; - for standard output, the tables then go to standard error."""
 
     def __post_init__(self) -> None:
         if self.interactive < 1:
@@ -144,14 +145,13 @@ class Quality:
     def run(self) -> None:
         """Measure and print."""
         from symphony.evaluation.logs import shortfalls
-        from symphony.files import write_json
 
         quality = measured(self.store, self.interactive)
-        print_quality(quality, title=str(self.store))
+        print_quality(quality, title=str(self.store), aside=str(self.json) == "-")
         for missed in shortfalls(quality):
             sys.stderr.write(f"below what generated sets must reach: {missed}\n")
         if self.json is not None:
-            write_json(self.json, quality)
+            write_numbers(self.json, quality)
 
 
 def measured(path: Path, interactive: int) -> dict[str, Any]:
@@ -223,9 +223,13 @@ _SPREADS = (
 
 
 def print_quality(
-    quality: dict[str, Any], title: str = "", rows: list[tuple[str, str, str]] | None = None
+    quality: dict[str, Any],
+    title: str = "",
+    rows: list[tuple[str, str, str]] | None = None,
+    *,
+    aside: bool = False,
 ) -> None:
-    """Print measures, and before them rows (name, value, target) of one's own."""
+    """Print measures, and before them rows (name, value, target) of one's own; to stderr if ``aside``."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -254,9 +258,9 @@ def print_quality(
         column.justify = "right"
     for key, name in _SPREADS:
         spreads.add_row(name, *(_number(quality[key][column], 2) for column in columns))
-    console = Console()
-    console.print(table)
-    console.print(spreads)
+    console = Console(stderr=aside)
+    print_table(table, console)
+    print_table(spreads, console)
     console.print(
         f"The log of {quality['interactive']} interactive agents per segment. Error of the fit: metres at the end of "
         "the greedy fit to 7x21 bicycle actions. Moving vehicles: at the first step.",

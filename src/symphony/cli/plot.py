@@ -1,4 +1,4 @@
-"""Draw what a run learned from and what it does: its rollouts, the tree of a search, the curves of its training."""
+"""Draw run segments, what agents do in them, the tree of a search, the curves of a training, the paper's figure."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from symphony.cli.curvature import Curvature
+from symphony.cli.tables import short_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from symphony.data.store import SegmentStore
 
 app = tyro.extras.SubcommandApp()
+app.command(name="curvature")(Curvature)
 
 
 @app.command(name="tree")
@@ -110,7 +113,7 @@ class Rollouts:
             routes=agent.goals is not None,
             duration=config.duration or agent.duration,
         )
-        clips = ClipKeeper(range(len(dataset)), self.drawn)
+        clips = ClipKeeper(range(len(dataset)), self.drawn, f"{short_name(agent.name)}: ")
         with segments_bar(f"simulating {agent.name}") as advance:
             evaluate_dataset(agent, dataset, config, advance, observe=clips)
         draw_clips(clips.clips, self.out)
@@ -155,6 +158,42 @@ class Curves:
             plot_curves(found, self.out, metrics=self.metrics, window=self.window)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+
+
+@app.command(name="segment")
+@dataclass(frozen=True)
+class Segment:
+    """Draw a run segment: map, lights and agents, with the tracks of the whole window."""
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of the store."""
+    segment: str
+    """Its id, or its number in the store."""
+    out: Path
+    """Picture to write (.png, .pdf or .svg)."""
+    interactive: int = 2
+    """Agents in colour, the ego included."""
+    step: int = 0
+    """Step at which boxes and lights are shown."""
+
+    def run(self) -> None:
+        """Draw it."""
+        from symphony.data.selection import interactive_choice
+        from symphony.data.store import SegmentStore
+        from symphony.render import plot_segment
+        from symphony.render.style import picture_path
+
+        picture_path(self.out)
+        store = SegmentStore(self.store)
+        segment = store[segment_index(store, self.segment)]
+        if not 0 <= self.step < segment.num_steps:
+            raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
+        if self.interactive < 1:
+            raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
+        choice = interactive_choice(segment, self.interactive)
+        title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
+        chosen = choice.agents.tolist()
+        plot_segment(segment, self.out, step=self.step, interactive=chosen, title=title)
 
 
 def segment_index(store: SegmentStore, name: str) -> int:

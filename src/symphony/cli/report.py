@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from symphony.cli.tables import print_table
+
 
 @dataclass(frozen=True)
 class Report:
@@ -68,5 +70,5 @@ class Report:
             if not name.endswith("_se") and isinstance(value, float):
                 error = plain.get(f"{name}_se")
                 table.add_row(name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}"))
-        Console().print(table)
+        print_table(table, Console())
         Console().print(f"written: {out / 'report.html'}", soft_wrap=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.config import EvaluateConfig
+from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
     from symphony.simulation.saved_files import RolloutFolder
@@ -30,22 +31,32 @@ class Simulate:
     """Folder of the rollouts."""
     segments: tuple[str, ...] = ()
     """Ids of the run segments, or their numbers in the store; by default all."""
+    runs: int = 0
+    """Simulate as many segments, spread evenly over the store, as give at least so many runs (rollouts of a segment);
+    0 for all segments."""
     planner: str = ""
-    """Drives the ego, the agent the other interactive agents: `idm`, `log`, or the import path of one of your own,
-    such as `my.planner:Planner`. With `playback` as the agent all others play back the log."""
+    """Drives the ego, the agent the other interactive agents: `idm`, `log`, or one of your own: a file `my.py:plan`,
+    an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as the agent all others play
+    back the log."""
+    planner_seconds: float = 60.0
+    """That a planner has for one answer; more fails the run."""
     tree: bool = True
     """Leave out the branches that a search pruned."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
-    def run(self) -> None:
-        """Simulate and save."""
-        from rich.console import Console
+    def __post_init__(self) -> None:
+        if self.runs < 0 or (self.runs and self.segments):
+            raise ConfigError("--runs is a number of runs, and goes without --segments")
+        if not self.planner_seconds > 0:
+            raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
 
+    def simulated(self) -> RolloutFolder:
+        """Simulate and save."""
         from symphony.agents import load_agent
         from symphony.cli.evaluate import segments_bar
         from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore
-        from symphony.simulation.demonstrations import SceneDataset
+        from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
@@ -56,6 +67,8 @@ class Simulate:
         # Beside log playback nobody else is simulated.
         others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = [segment_index(store, name) for name in self.segments]
+        if self.runs:
+            chosen = evenly_spaced(len(store), min(-(-self.runs // config.rollouts), len(store)))
         dataset = SceneDataset(
             store,
             config.interactive or others,
@@ -66,16 +79,22 @@ class Simulate:
             keep=config.batch,
         )
         with segments_bar(f"simulating {agent.name}") as advance:
-            found = save_simulation(
+            return save_simulation(
                 self.out,
                 agent,
                 dataset,
                 config,
                 keep_tree=self.tree,
                 planner=self.planner,
+                planner_seconds=self.planner_seconds,
                 progress=advance,
             )
-        console = Console()
+
+    def run(self) -> None:
+        """Simulate, save, and say where."""
+        from rich.console import Console
+
+        found, console = self.simulated(), Console()
         console.print(f"{len(found)} run segments in {self.out}: symphony view {self.out}", soft_wrap=True)
         if self.planner:
             for line in failed_runs(found):

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from symphony.files import json_text, write_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
 
 COLUMNS = (
     ("collision_rate", "collision\n%", 1),
@@ -27,8 +35,25 @@ KINDS = (
 """Kinds of first collision (see :class:`symphony.metrics.CollisionKind`) and their words."""
 
 
-def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
-    """Print results of agents as one table, standard errors beside the numbers."""
+def print_table(table: Table, console: Console) -> None:
+    """Print a table as wide as what is in it: a name is neither cut nor broken, however narrow the terminal."""
+    from rich.measure import Measurement
+
+    if table.title:
+        # Beside the table, or it would be broken to its width.
+        console.print(table.title, style=table.title_style or "italic", soft_wrap=True)
+        table.title = None
+    options = console.options.update(max_width=sys.maxsize)
+    before, needed = console.width, Measurement.get(console, options, table).maximum
+    console.width = max(before, needed)
+    try:
+        console.print(table, crop=False)
+    finally:
+        console.width = before
+
+
+def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: bool = False) -> None:
+    """Print results of agents as one table, standard errors beside the numbers; to stderr if ``aside``."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -47,10 +72,10 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         errors = {name: row.get(f"{name}_se") for name, _, _ in COLUMNS if name != "curvature_jsd"}
-        cells = [_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
+        cells = [number_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
         table.add_row(escape(short_name(str(row["agent"]))), *cells)
-    console = Console()
-    console.print(table)
+    console = Console(stderr=aside)
+    print_table(table, console)
     first = rows[0]
     for row in rows:
         if row["collision_rate"] > 0 and "collision_into_leader" in row:
@@ -66,6 +91,14 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
         f"agents each, up to {most} rollouts; ± standard error over recordings; seed {first['seed']}",
         style="dim",
     )
+
+
+def write_numbers(path: Path, numbers: Any) -> None:
+    """Write numbers as JSON to a file, or to standard output where the file is called -."""
+    if str(path) == "-":
+        sys.stdout.write(json_text(numbers))
+    else:
+        write_json(path, numbers)
 
 
 def _more(row: dict[str, Any]) -> list[str]:
@@ -103,8 +136,9 @@ def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
     return [(f"collision_{kind}", text) for kind, text in KINDS if f"collision_{kind}" in row]
 
 
-def _cell(value: float, error: float | None, digits: int) -> str:
-    if math.isnan(value):
+def number_cell(value: float | None, error: float | None, digits: int) -> str:
+    """A number with its standard error; a dash for none."""
+    if value is None or math.isnan(value):
         return "–"
     text = f"{value:.{digits}f}"
     return text if error is None or math.isnan(error) else f"{text} ± {error:.{digits}f}"

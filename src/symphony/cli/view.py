@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from symphony.cli.tables import short_name
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.render import Clip
-    from symphony.simulation.saved import SavedRollouts
     from symphony.simulation.saved_files import RolloutFolder
 
 PANELS = 6
@@ -56,6 +55,7 @@ class View:
         Console().print(f"written: {out}", soft_wrap=True)
 
     def _draw(self, folder: RolloutFolder, out: Path) -> None:
+        from symphony.evaluation.pictures import saved_clip
         from symphony.render import animate_rollouts, plot_grid, plot_rollout
         from symphony.render.film import FILMS, write_film
         from symphony.render.style import ANIMATIONS, FORMATS, picture_path
@@ -65,7 +65,8 @@ class View:
         names = self.segments or tuple(folder.ids[:PANELS])
         if not names:
             raise ConfigError(f"{self.folder} holds no rollouts to draw")
-        clips = [clip_of(folder.of(name), self.rollouts or (1 if moving else None)) for name in names]
+        count, agent = self.rollouts or (1 if moving else None), title_of(folder.about.agent)
+        clips = [saved_clip(folder.of(name), count, f"{agent}: {name}") for name in names]
         if kind in FILMS:
             write_film(clips, out)
         elif moving:
@@ -94,22 +95,6 @@ def write_view(folder: RolloutFolder, out: Path, segments: tuple[str, ...] = ())
     return found.totals()
 
 
-def clip_of(saved: SavedRollouts, count: int | None) -> Clip:
-    """The first so many rollouts of a segment, to be drawn."""
-    from symphony.render import Clip
-
-    # The first state is the log's.
-    state = saved.state[:count, 1:].swapaxes(1, 2)
-    counted, collision, offroad = (
-        part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad)
-    )
-    return Clip(
-        saved.segment,
-        state[..., :2],
-        state[..., 2],
-        saved.agents,
-        saved.start + 1,
-        counted,
-        collision,
-        offroad,
-    )
+def title_of(agent: str) -> str:
+    """Who drove, without folders, to be put before the name of a segment."""
+    return " among ".join(short_name(part) for part in agent.split(" among "))

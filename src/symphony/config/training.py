@@ -154,6 +154,12 @@ class RunConfig:
     """Go on from the last checkpoint in `out`; without it a folder that holds a run is refused."""
     wandb: Literal["offline", "online", "disabled"] = "offline"
     """Where Weights & Biases keeps the curves; a plain file has them in any case."""
+    wandb_project: str = "symphony"
+    """Its project."""
+    wandb_group: str = ""
+    """Its group of runs, such as the seeds of one experiment; empty for none."""
+    wandb_tags: tuple[str, ...] = ()
+    """Its tags."""
     device: str = "cpu"
     """`cpu`, `cuda` or `cuda:N`."""
 

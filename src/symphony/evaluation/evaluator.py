@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,6 +113,7 @@ def evaluate(
     config: EvaluateConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
     *,
+    items: Sequence[int] | None = None,
     baselines: bool = False,
     observe: Callable[[EvaluatedBatch], None] | None = None,
 ) -> Evaluation:
@@ -123,6 +124,7 @@ def evaluate(
         data: a store, or its folder.
         config: how.
         progress: called with the segments done and their total.
+        items: only these run segments of the store, by their numbers.
         baselines: evaluate :data:`BASELINES` on the same segments, too.
         observe: called with every batch of rollouts in this process, to draw or keep them.
 
@@ -139,6 +141,7 @@ def evaluate(
         store,
         config.interactive or agent.interactive,
         agent.dynamics,
+        items,
         routes=agent.goals is not None,
         duration=config.duration or agent.duration,
         keep=config.batch,

@@ -20,7 +20,7 @@ from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.rollouts import Rollouts, start_states
-from symphony.simulation.saved import saved_rollouts
+from symphony.simulation.saved import SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import RolloutWriter
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
@@ -104,6 +104,26 @@ def clip_of(
     )
     agents = torch.where(scenes.interactive_valid[row], scenes.interactive[row], -1).numpy()
     return Clip(segment, state[..., :2], state[..., 2], agents, 1, counted, collision, offroad, title=title)
+
+
+def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None = None) -> Clip:
+    """The first so many of the saved rollouts of a segment, all by default, to be drawn or animated."""
+    # The first state is the log's.
+    state = saved.state[:count, 1:].swapaxes(1, 2)
+    counted, collision, offroad = (
+        part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad)
+    )
+    return Clip(
+        saved.segment,
+        state[..., :2],
+        state[..., 2],
+        saved.agents,
+        saved.start + 1,
+        counted,
+        collision,
+        offroad,
+        title=title,
+    )
 
 
 def check_picture(path: Path) -> None:

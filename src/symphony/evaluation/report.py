@@ -312,14 +312,14 @@ def total_numbers(rows: Sequence[Row]) -> Row:
         if of == "red_lights":
             value = (value > 0).astype(np.float64)
         weight = known * np.array([1.0 if by is None else row[by] for row in good], np.float64)
-        out[name], out[f"{name}_se"] = _grouped_mean(scale * value, weight, group)
+        out[name], out[f"{name}_se"] = grouped_mean(scale * value, weight, group)
     for name in _PEAKS:
         out[name] = max((row[name] for row in good if row[name] is not None), default=None)
     out["min_ttc"] = min((row["min_ttc"] for row in good if row["min_ttc"] is not None), default=None)
     return out
 
 
-def _grouped_mean(
+def grouped_mean(
     value: NDArray[np.float64], weight: NDArray[np.float64], group: NDArray[np.int64]
 ) -> tuple[float | None, float | None]:
     """Weighted mean and its standard error over groups (linearised: groups are what was drawn independently)."""

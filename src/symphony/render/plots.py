@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -17,7 +18,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, RunSegment
-from symphony.render.agents import draw_boxes, draw_trails, pieces
+from symphony.render.agents import CORNERS, draw_boxes, draw_trails, pieces, place
 from symphony.render.roads import draw_roads, draw_signals
 from symphony.render.style import (
     INK,
@@ -32,6 +33,7 @@ from symphony.render.style import (
     picture_path,
     save,
     view_around,
+    with_aspect,
 )
 
 LOG_DASHES = (0, (4, 2))
@@ -55,7 +57,7 @@ def plot_segment(
         target: file to write (png, pdf or svg) or axes to draw on.
         step: when the boxes and lights are shown; by default the segment's ``current_step``.
         interactive: agents in colour, along with the ego; by default the segment's ``interest``.
-        view: limits in metres; by default around the trails of the agents in colour.
+        view: limits in metres; by default around the trails of the agents in colour, on given axes a square.
         title: by default the segment's id.
         legend: whether to explain the colours.
 
@@ -69,7 +71,7 @@ def plot_segment(
     chosen = _highlighted(segment, segment.interest.tolist() if interactive is None else interactive)
     position, valid = segment.position[..., :2], segment.valid
     trails = position[chosen][valid[chosen]]
-    view = view or view_around(trails)
+    view = view or _own_view(trails, target)
     axes, path = open_target(target, view)
 
     entries = draw_roads(axes, segment.road, view) + draw_signals(axes, segment, step, view)
@@ -116,7 +118,7 @@ def plot_rollout(
 ) -> Axes:
     """Draw K rollouts of the interactive agents over the log, with boxes where they end.
 
-    Playback agents, and the lights, are shown as logged at the last step.
+    Playback agents, and the lights, are shown as logged at the last step; those that were hit also where that was.
 
     Args:
         segment: the log.
@@ -128,7 +130,7 @@ def plot_rollout(
         valid: [N, T] or [K, N, T] bool, all by default; steps that are not are left out.
         collision: [K, N, T] bool, crossed out where each collision begins.
         offroad: [K, N, T] bool, marked by a triangle where each departure begins.
-        view: limits in metres; by default around rollouts and log of those agents.
+        view: limits in metres; by default around rollouts and log of those agents, on given axes a square.
         title: by default the segment's id.
         legend: whether to explain the colours.
 
@@ -142,23 +144,25 @@ def plot_rollout(
     log = segment.position[runs.agents, start : last + 1, :2]
     logged = segment.valid[runs.agents, start : last + 1]
     trails = np.concatenate([runs.position[runs.valid], log[logged]])
-    view = view or view_around(trails)
+    view = view or _own_view(trails, target)
     axes, path = open_target(target, view)
 
     entries = draw_roads(axes, segment.road, view) + draw_signals(axes, segment, last, view)
-    draw_playback(axes, segment, last, np.setdiff1d(np.arange(segment.num_agents), runs.agents))
+    others = np.setdiff1d(np.arange(segment.num_agents), runs.agents)
+    draw_playback(axes, segment, last, others)
+    hit = draw_hit(axes, segment, runs, others, start)
     for rank, (agent, color) in enumerate(zip(runs.agents, colors_of(segment, runs.agents), strict=True)):
         shown = np.where(logged[rank, :, None], log[rank], np.nan)
         axes.plot(*shown.T, color=INK, linestyle=LOG_DASHES, linewidth=1.4, zorder=9, gid=f"log-{agent}")
         _draw_agent(axes, runs, rank, segment.size[agent], color)
     marks = [draw_events(axes, runs, *event) for event in EVENTS]
-    rollouts = f"{len(runs.position)} rollout{'s' if len(runs.position) > 1 else ''}"
-    subtitle = f"{describe(segment)}   ·   {rollouts} of {(steps - 1) * segment.dt:.1f} s"
+    subtitle = f"{describe(segment)}   ·   {runs.words()} of {(steps - 1) * segment.dt:.1f} s"
     frame(axes, view, title or segment.segment_id, subtitle)
     if legend:
         logline = Line2D([], [], color=INK, linestyle=LOG_DASHES, linewidth=1.4, label="log")
         playback = playback_entry("playback, at the end")
-        explained = [*agent_entries(segment, runs.agents), logline, playback, *filter(None, marks), *entries]
+        found = filter(None, [hit, *marks])
+        explained = [*agent_entries(segment, runs.agents), logline, playback, *found, *entries]
         add_legend(axes, explained, trails)
     if path is not None:
         save(axes.figure, path)
@@ -192,6 +196,12 @@ def plot_grid(
         draw(figure.add_subplot(grid[k // columns, k % columns]))
     save(figure, file)
     return figure
+
+
+def _own_view(trails: NDArray[Any], target: Target) -> View:
+    """Around trails [P, 2]; a square where it is one panel among others, so that all are of one size."""
+    view = view_around(trails)
+    return with_aspect(view) if isinstance(target, Axes) else view
 
 
 @dataclass(frozen=True)
@@ -240,6 +250,20 @@ class Rollouts:
         cut = [None if array is None else array[:, kept] for array in events]
         return cls(position[:, kept], heading[:, kept], seen[:, kept], agents[kept], cut[0], cut[1])
 
+    @property
+    def distinct(self) -> int:
+        """How many of the rollouts differ: leaves of a search may share all of their history."""
+        known = self.valid[..., None]
+        state = np.concatenate([self.position, self.heading[..., None]], -1)
+        rows = np.concatenate([np.where(known, state, 0.0), known], -1).reshape(len(state), -1)
+        return len(np.unique(rows, axis=0))
+
+    def words(self) -> str:
+        """Such as `16 rollouts, 3 distinct`."""
+        count = len(self.position)
+        same = f", {self.distinct} distinct" if self.distinct < count else ""
+        return f"{count} rollout{'s' if count > 1 else ''}{same}"
+
     def until(self, step: int) -> Rollouts:
         """As if they ended after a step."""
         past = slice(0, step + 1)
@@ -273,18 +297,22 @@ def _draw_agent(axes: Axes, runs: Rollouts, rank: int, size: NDArray[Any], color
     if ends:
         k, t = np.asarray(ends).T
         sizes = np.broadcast_to(size, (len(k), len(size)))
-        place = runs.position[k, rank, t], runs.heading[k, rank, t], sizes
-        draw_boxes(axes, *place, color, alpha=max(alpha, 0.45), gid=f"ends-{agent}")
+        at = runs.position[k, rank, t], runs.heading[k, rank, t], sizes
+        draw_boxes(axes, *at, color, alpha=max(alpha, 0.45), gid=f"ends-{agent}")
+
+
+def beginnings(runs: Rollouts, name: str) -> NDArray[np.bool_]:
+    """[K, N, T] where each run of true steps of an event begins; nowhere if it is not known."""
+    event = getattr(runs, name)
+    if event is None:
+        return np.zeros_like(runs.valid)
+    happening = event & runs.valid
+    return happening & ~np.pad(happening[..., :-1], ((0, 0), (0, 0), (1, 0)))
 
 
 def draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str) -> Line2D | None:
     """Mark where each run of true steps of an event begins; None where there is none."""
-    event = getattr(runs, name)
-    if event is None:
-        return None
-    happening = event & runs.valid
-    before = np.pad(happening[..., :-1], ((0, 0), (0, 0), (1, 0)))
-    points = runs.position[happening & ~before]
+    points = runs.position[beginnings(runs, name)]
     if len(points) == 0:
         return None
     style: dict[str, Any] = {"marker": marker, "linewidths": 0.9, "edgecolors": "white"}
@@ -292,12 +320,42 @@ def draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str) 
     return Line2D([], [], linestyle="none", marker=marker, color=INK, markersize=6.5, label=label)
 
 
+def draw_hit(
+    axes: Axes, segment: RunSegment, runs: Rollouts, others: NDArray[Any], start: int
+) -> Patch | None:
+    """Outline the playback agents among ``others`` [K] that were hit, where they were when it began.
+
+    Returns:
+        Legend entry, None where nobody was hit.
+    """
+    found: set[tuple[int, int]] = set()
+    for rollout, rank, at in np.argwhere(beginnings(runs, "collision")).tolist():
+        step = start + at
+        near = others[segment.valid[others, step]]
+        boxes = [_box(segment.position[a, step], segment.heading[a, step], segment.size[a]) for a in near]
+        own = _box(
+            runs.position[rollout, rank, at], runs.heading[rollout, rank, at], segment.size[runs.agents[rank]]
+        )
+        found |= {(int(agent), step) for agent, box in zip(near, boxes, strict=True) if own.intersects(box)}
+    if not found:
+        return None
+    agent, step = np.array(sorted(found)).T
+    corners = place(CORNERS, segment.position[agent, step], segment.heading[agent, step], segment.size[agent])
+    style: dict[str, Any] = {"facecolors": [to_rgba(PLAYBACK, 0.55)], "edgecolors": INK, "linewidths": 0.8}
+    axes.add_collection(PolyCollection(list(corners), zorder=7.8, gid="hit", **style), autolim=False)
+    return Patch(facecolor=to_rgba(PLAYBACK, 0.55), edgecolor=INK, label="playback, when it was hit")
+
+
+def _box(position: NDArray[Any], heading: float, size: NDArray[Any]) -> shapely.Polygon:
+    return shapely.Polygon(place(CORNERS, position[None], np.array([heading]), size[None])[0])
+
+
 def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[Any]) -> None:
     """Draw those of the agents [K] that are seen at a step, in grey."""
     shown = agents[segment.valid[agents, step]]
     if len(shown):
-        place = segment.position[shown, step, :2], segment.heading[shown, step], segment.size[shown]
-        draw_boxes(axes, *place, PLAYBACK, zorder=7.5, gid="playback")
+        at = segment.position[shown, step, :2], segment.heading[shown, step], segment.size[shown]
+        draw_boxes(axes, *at, PLAYBACK, zorder=7.5, gid="playback")
 
 
 def _highlighted(segment: RunSegment, interactive: Sequence[int]) -> list[int]:

@@ -21,7 +21,16 @@ from symphony.files import replacing
 
 # From Okabe and Ito's and Tol's palettes: apart from each other, from playback and from the road for the
 # common kinds of colour blindness too.
-AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#882255", "#332288", "#D9C400")
+AGENT_COLORS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#882255",
+    "#332288",
+    "#D9C400",
+    "#FF80FF",
+    "#9ADE6B",
+)
 """Ego first, then the interactive agents; repeats after the last."""
 PLAYBACK = "#A9AEB5"
 INK = "#2B2F36"
@@ -97,6 +106,14 @@ def view_around(points: NDArray[Any], margin: float = 20.0, least: float = 70.0)
     longer = max(float(sides.max()), least)
     width, height = np.maximum(sides, 0.6 * longer).tolist() if longer > least else (least, least)
     return (x - width) / 2, (x + width) / 2, (y - height) / 2, (y + height) / 2
+
+
+def with_aspect(view: View, aspect: float = 1.0) -> View:
+    """The view, grown about its middle until its height is so many times its width."""
+    width, height = view[1] - view[0], view[3] - view[2]
+    x, y = (view[0] + view[1]) / 2, (view[2] + view[3]) / 2
+    width, height = max(width, height / aspect), max(height, width * aspect)
+    return x - width / 2, x + width / 2, y - height / 2, y + height / 2
 
 
 def frame(axes: Axes, view: View, title: str, subtitle: str) -> None:

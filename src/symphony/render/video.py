@@ -45,6 +45,7 @@ from symphony.render.style import (
     new_figure,
     picture_path,
     view_around,
+    with_aspect,
 )
 
 FRAMES = 51
@@ -146,6 +147,7 @@ class _Panel:
         log, logged = segment.position[runs.agents, within, :2], segment.valid[runs.agents, within]
         self.log = np.where(logged[..., None], log, np.nan)
         self.trails = np.concatenate([runs.position[runs.valid], log[logged]])
+        self.given = clip.view is not None
         self.view = clip.view or view_around(self.trails)
 
     @property
@@ -161,7 +163,8 @@ class _Panel:
         for agent, way in zip(agents, self.log, strict=True):
             axes.plot(*way.T, zorder=5, gid=f"log-{agent}", **line)
         # The blanks are room for the seconds.
-        frame(axes, self.view, self.title, describe(self.segment) + " " * 12)
+        caption = f"{describe(self.segment)}   ·   {self.runs.words()}"
+        frame(axes, self.view, self.title, caption + " " * 12)
         axes.set_anchor("N")
         self.still = set(axes.get_children())
         marks = self._draw_moving(self.steps - 1)
@@ -225,7 +228,11 @@ class _Panel:
 
 
 def _lay_out(panels: Sequence[_Panel], columns: int, size: float) -> Figure:
-    """A figure with the panels settled in it, rows as high as their views need."""
+    """A figure with the panels settled in it, all of one size as far as nobody said what they show."""
+    aspect = min(1.0, max(panel.aspect for panel in panels))
+    for panel in panels:
+        if not panel.given:
+            panel.view = with_aspect(panel.view, aspect)
     lines = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     heights = [size * min(1.0, max(panel.aspect for panel in line)) + HEAD for line in lines]
     figure = new_figure(size * columns, sum(heights))

@@ -22,6 +22,7 @@ from symphony.envs.dynamics import bicycle_step
 from symphony.envs.observation import objects_at
 from symphony.errors import ConfigError
 from symphony.simulation.planner import Planner, Traffic, checked_plan, fixed, scenario_of
+from symphony.simulation.planner_calls import SECONDS, answer, plans_of
 from symphony.streams import fold_in
 
 _PLANNERS = (1 << 40) + 3
@@ -55,10 +56,17 @@ class EgoPlanners:
         name: of the planner.
         make: makes one.
         segments: behind the scenes, in their order; the first interactive agent of each is its ego.
+        seconds: that a planner has for one answer.
     """
 
-    def __init__(self, name: str, make: Callable[[], Planner], segments: Sequence[RunSegment]) -> None:
-        self.name, self.make, self.segments = name, make, segments
+    def __init__(
+        self,
+        name: str,
+        make: Callable[[], Planner],
+        segments: Sequence[RunSegment],
+        seconds: float = SECONDS,
+    ) -> None:
+        self.name, self.make, self.segments, self.seconds = name, make, segments, seconds
 
     def begin(
         self, env: DrivingEnv, start: TensorDictBase, *, seed: int, keep_every: int = 0
@@ -113,12 +121,11 @@ class EgoPolicy(TensorDictModuleBase):
         routes = [self._route(row) for row in range(len(egos.segments))]
         for number, row in enumerate(scene):
             made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))
-            try:
-                planner = egos.make()
-                planner.reset(made)
-                self._held[number] = planner
-            except Exception as error:  # whatever a user's planner raises
-                self._held[number] = Failure(0, f"reset: {_words(error)}")
+            planner = answer(egos.make, seconds=egos.seconds)
+            error = planner if isinstance(planner, Exception) else None
+            error = error or answer(planner.reset, made, seconds=egos.seconds)
+            failed = isinstance(error, Exception)
+            self._held[number] = Failure(0, f"reset: {_words(error)}") if failed else planner
         self._next = len(scene)
 
     def _route(self, row: int) -> NDArray[np.float32]:
@@ -142,17 +149,21 @@ class EgoPolicy(TensorDictModuleBase):
         moves, there = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
         # One that is over, or has failed, keeps its speed.
         control, target = np.zeros((len(rows), 2)), np.full((len(rows), 4), np.nan)
+        asked: list[tuple[int, Planner, Traffic]] = []
         for m, row in enumerate(rows):
             planner = self._held[numbers[m]]
-            if not going[m] or isinstance(planner, Failure):
-                continue
-            seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m])
-            try:
-                plan = checked_plan(planner.plan(seen), seen.state, self.env.dt)
-            except Exception as error:  # whatever a user's planner raises
-                self._held[numbers[m]] = Failure(steps[m], f"step {steps[m]}: {_words(error)}")
+            if going[m] and not isinstance(planner, Failure):
+                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m])
+                asked.append((m, planner, seen))
+        plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
+        for (m, _, seen), given in zip(asked, plans, strict=True):
+            found = given
+            if not isinstance(given, Exception):
+                found = answer(checked_plan, given, seen.state, self.env.dt)
+            if isinstance(found, Exception):
+                self._held[numbers[m]] = Failure(steps[m], f"step {steps[m]}: {_words(found)}")
             else:
-                (control if len(plan) == 2 else target)[m] = plan
+                (control if len(found) == 2 else target)[m] = found
         length = [float(self.egos.segments[row].size[self.egos.segments[row].ego, 0]) for row in rows]
         pulled, turned = torch.from_numpy(control).unbind(-1)
         driven = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)

@@ -6,9 +6,13 @@ read-only. Legend: A agents of the segment, Q lights, P points, T logged steps.
 
 from __future__ import annotations
 
+import inspect
 import math
+import shlex
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -16,7 +20,7 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import Polylines, RoadMap, RunSegment
 from symphony.errors import ConfigError
-from symphony.imports import build_object, load_object
+from symphony.imports import load_object
 
 Reals = NDArray[np.float64]
 
@@ -100,6 +104,7 @@ class Scenario:
         road: lanes with their successors and speed limits, boundary and marks.
         signal_lane: [Q] index of the lane each light controls.
         signal_point: [Q, 2] its stop point.
+        agent_id: [A] the source's ids.
         log: [T, 4] what the ego did, for planners that play it back.
         log_valid: [T].
         seed: for random numbers of the planner's own, which should come from nothing else; another for each rollout.
@@ -116,6 +121,7 @@ class Scenario:
     road: RoadMap
     signal_lane: NDArray[np.int32]
     signal_point: Reals
+    agent_id: NDArray[np.int64]
     log: Reals
     log_valid: NDArray[np.bool_]
     seed: int = 0
@@ -127,6 +133,9 @@ class Scenario:
 class Planner(Protocol):
     """Drives the ego of one rollout. It is made without arguments.
 
+    A class may also have ``plan_batch(planners, traffics)``, a class method: all its planners of a batch of rollouts
+    and what each of them sees, lists of one length; it gives back as many plans. Then ``plan`` is not called.
+
     A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. A copy
     draws the same random numbers as the one it was made of, if it draws them as :attr:`Scenario.seed` says. One that
     raises an exception, or gives back what is not finite, of another length or a target farther away than
@@ -137,40 +146,81 @@ class Planner(Protocol):
         """Begin a rollout; called once, before the first plan."""
         ...
 
-    def plan(self, traffic: Traffic) -> Target | Control | Sequence[float] | NDArray[Any]:
-        """What the ego does until the next step: 4 numbers are a :class:`Target`, 2 a :class:`Control`."""
+    def plan(self, traffic: Traffic) -> Target | Control | Sequence[float] | Sequence[Target] | NDArray[Any]:
+        """What the ego does until the next step: 4 numbers are a :class:`Target`, 2 a :class:`Control`.
+
+        Of several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
+        """
         ...
 
 
 NAMES = {"idm": "symphony.simulation.planners:IDMPlanner", "log": "symphony.simulation.planners:LogPlanner"}
 """Planners with names of their own."""
+PIPE = "pipe:"
+"""Before the command of a planner in another process."""
 
 
-def planner_maker(name: str) -> Callable[[], Planner]:
+def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
     """What makes planners, one for each rollout.
 
     Args:
-        name: ``idm``, ``log``, or the import path of a class or function, such as ``my.planner:Planner``.
+        planner: a class with ``reset`` and ``plan``, a function that makes such objects, or a function from an
+            :class:`~symphony.simulation.planner_view.Observation` to a plan; or the name of one: ``idm``, ``log``, an
+            import path such as ``my.planner:Planner``, a file such as ``my.py:plan``, or ``pipe:COMMAND`` (see
+            :mod:`symphony.simulation.planner_process`).
 
     Raises:
         ConfigError: there is no such planner, or it has no ``reset`` and ``plan``.
     """
-    path = NAMES.get(name, name)
-    if ":" not in path:
-        names = ", ".join(NAMES)
-        raise ConfigError(
-            f"planner is one of {names} or an import path such as my.planner:Planner, not '{name}'"
-        )
+    name, given = planner_name(planner), planner
+    if isinstance(given, str):
+        if given.startswith(PIPE):
+            return _process_maker(given.removeprefix(PIPE))
+        path = NAMES.get(given, given)
+        if ":" not in path:
+            raise ConfigError(
+                f"planner is one of {', '.join(NAMES)}, an import path such as my.planner:Planner, a file such as "
+                f"my.py:plan, or {PIPE}COMMAND, not '{name}'"
+            )
+        given = load_object(path)
+    if not inspect.isclass(given) and len(_needed(given)) == 1:
+        from symphony.simulation.planner_view import FunctionPlanner  # noqa: PLC0415 - builds on this module
+
+        return partial(FunctionPlanner, given)
     try:
-        made = build_object(path)
-    except ConfigError:
-        raise
+        made = given()
     except Exception as error:  # whatever a user's planner raises
         raise ConfigError(f"planner '{name}' can't be made: {type(error).__name__}: {error}") from error
     missing = [part for part in ("reset", "plan") if not callable(getattr(made, part, None))]
     if missing:
         raise ConfigError(f"planner '{name}' has no {' and no '.join(missing)}")
-    return load_object(path)
+    return given
+
+
+def planner_name(planner: str | Callable[..., Any]) -> str:
+    """What a planner is called in records."""
+    if isinstance(planner, str):
+        return planner
+    return f"{getattr(planner, '__module__', '')}:{getattr(planner, '__qualname__', type(planner).__name__)}"
+
+
+def _process_maker(command: str) -> Callable[[], Planner]:
+    from symphony.simulation.planner_process import ProcessPlanner  # noqa: PLC0415 - builds on this module
+
+    words = shlex.split(command)
+    if not words or shutil.which(words[0]) is None:
+        raise ConfigError(f"planner '{PIPE}{command}': there is no command '{words[0] if words else ''}'")
+    return partial(ProcessPlanner, command)
+
+
+def _needed(function: Callable[..., Any]) -> list[str]:
+    """Arguments by position that a function can't do without."""
+    by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    try:
+        found = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # not everything says
+        return []
+    return [one.name for one in found if one.kind in by_place and one.default is one.empty]
 
 
 def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
@@ -199,6 +249,7 @@ def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], s
         road=_fixed_road(segment.road),
         signal_lane=fixed(segment.signal_lane),
         signal_point=fixed(segment.signal_point[:, :2].astype(np.float64)),
+        agent_id=fixed(segment.agent_id.astype(np.int64)),
         log=fixed(np.concatenate([position, heading[:, None], speed[:, None]], -1)),
         log_valid=fixed(valid),
         seed=seed,
@@ -224,7 +275,7 @@ def _fixed_road(road: RoadMap) -> RoadMap:
 
 
 def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
-    """What a planner gave back as 2 or 4 finite numbers.
+    """What a planner gave back as 2 or 4 finite numbers: of a trajectory, its first state.
 
     Args:
         plan: as it came.
@@ -235,11 +286,17 @@ def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
         ValueError: it is something else, or a target out of reach.
     """
     numbers = np.asarray(plan, np.float64)
-    if numbers.shape not in ((2,), (4,)):
+    trajectory = numbers.ndim == 2 and numbers.shape[1] == 4 and len(numbers) > 0
+    if numbers.shape not in ((2,), (4,)) and not trajectory:
         shape = "x".join(map(str, numbers.shape)) or "single"
-        raise ValueError(f"a plan is 4 numbers (a state) or 2 (acceleration, steering), not a {shape} one")
+        raise ValueError(
+            "a plan is 4 numbers (a state), several such states, or 2 numbers (acceleration, steering), "
+            f"not a {shape} one"
+        )
     if not np.isfinite(numbers).all():
         raise ValueError(f"a plan that is not finite: {numbers.tolist()}")
+    if trajectory:
+        numbers = numbers[0]
     if len(numbers) == 4:
         away = math.dist(numbers[:2], state[:2])
         if max(away / dt, abs(numbers[3])) > MAX_SPEED:

@@ -18,7 +18,8 @@ from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.planned import EgoPlanners
-from symphony.simulation.planner import planner_maker
+from symphony.simulation.planner import planner_maker, planner_name
+from symphony.simulation.planner_calls import SECONDS
 from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
 from symphony.simulation.workers import batches, naming, shared
@@ -34,7 +35,8 @@ def save_simulation(
     config: EvaluateConfig,
     *,
     keep_tree: bool = True,
-    planner: str = "",
+    planner: str | Callable[..., Any] = "",
+    planner_seconds: float = SECONDS,
     progress: Callable[[int, int], None] | None = None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset and keep the rollouts, segment by segment.
@@ -47,8 +49,10 @@ def save_simulation(
         dataset: in the agent's action space, with routes if it follows goals.
         config: how it is simulated.
         keep_tree: of a search keep all branches with their scores, too.
-        planner: of the ego, ``idm``, ``log`` or an import path; then the dataset holds routes and the agent drives
-            the other interactive agents. Segments whose ego can't be driven are put on record as failed.
+        planner: of the ego, or its name, as of :func:`symphony.simulation.planner.planner_maker`; then the dataset
+            holds routes and the agent drives the other interactive agents. Segments whose ego can't be driven are put
+            on record as failed.
+        planner_seconds: that it has for one answer; more fails the run.
         progress: called with the segments done and their total.
 
     Raises:
@@ -64,13 +68,13 @@ def save_simulation(
         plain_settings(config, dataset.interactive, dataset.duration),
         seed=config.seed,
     )
-    writer = RolloutWriter(path, about.with_ego(planner) if planner else about)
+    writer = RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about)
     names = [dataset.store.ids[i] for i in dataset.indices]
     todo = [i for i, name in enumerate(names) if not writer.has(name)]
     if planner:
         todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
-    drive = _Drive(agent, dataset, config, keep_tree, planner)
+    drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds)
     with closing(shared(drive, batches(todo, config), config)) as results:
         for saved in results:
             for one in saved:
@@ -89,7 +93,8 @@ class _Drive:
     dataset: SceneDataset
     config: EvaluateConfig
     keep_tree: bool
-    planner: str
+    planner: str | Callable[..., Any]
+    planner_seconds: float
 
     def __call__(self, items: list[int]) -> list[SavedRollouts]:
         """What they did in each."""
@@ -98,7 +103,8 @@ class _Drive:
             segments = [self.dataset.segment(i) for i in items]
             egos = None
             if self.planner:
-                egos = EgoPlanners(self.planner, planner_maker(self.planner), segments)
+                name, make = planner_name(self.planner), planner_maker(self.planner)
+                egos = EgoPlanners(name, make, segments, self.planner_seconds)
             try:
                 found = driven_by(self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos)
             except NotFiniteError as error:
@@ -120,7 +126,9 @@ class _Drive:
 
     def _drivers(self) -> str | list[str]:
         name = PLAYBACK if self.agent.policy is None else self.agent.name
-        return [self.planner, *[name] * (self.dataset.interactive - 1)] if self.planner else name
+        if not self.planner:
+            return name
+        return [planner_name(self.planner), *[name] * (self.dataset.interactive - 1)]
 
 
 def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:

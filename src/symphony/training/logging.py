@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,9 @@ class Tracker:
         settings: shown by Weights & Biases beside the curves.
         wandb: ``offline``, ``online`` or ``disabled``. The environment variable ``WANDB_MODE`` overrides it, as
             it does everywhere else.
+        project: of Weights & Biases.
+        group: of runs there; empty for none.
+        tags: of the run there.
         after: keep only records up to this step of an earlier, interrupted run.
 
     Attributes:
@@ -34,6 +37,10 @@ class Tracker:
         folder: Path,
         settings: dict[str, Any],
         wandb: Literal["offline", "online", "disabled"] = "offline",
+        *,
+        project: str = "symphony",
+        group: str = "",
+        tags: Sequence[str] = (),
         after: int = 0,
     ) -> None:
         self.path = folder / "metrics.jsonl"
@@ -48,7 +55,9 @@ class Tracker:
             import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
             self._run = tracking.init(
-                project="symphony",
+                project=project,
+                group=group or None,
+                tags=list(tags) or None,
                 name=folder.name,
                 dir=str(folder),
                 config=settings,

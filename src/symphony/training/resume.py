@@ -11,7 +11,20 @@ from symphony.agents.choice import choose, split_name
 from symphony.config import RunConfig, read_json
 from symphony.errors import ConfigError
 
-FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every")
+FREE = (
+    "out",
+    "data",
+    "steps",
+    "resume",
+    "device",
+    "wandb",
+    "wandb_project",
+    "wandb_group",
+    "wandb_tags",
+    "preview",
+    "checkpoint_every",
+    "log_every",
+)
 """Settings that may be others when a run goes on."""
 
 

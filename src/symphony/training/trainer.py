@@ -125,7 +125,16 @@ class Trainer:
         if self.world.leads:
             # The process before may have died between a checkpoint and the removal of old ones.
             self._prune()
-            self.tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
+            settings = json.loads(to_json(config))
+            self.tracker = Tracker(
+                config.out,
+                settings,
+                config.wandb,
+                project=config.wandb_project,
+                group=config.wandb_group,
+                tags=config.wandb_tags,
+                after=step,
+            )
             self.alarms = Alarms(self.tracker.kept)
         try:
             with self.progress:

@@ -96,8 +96,8 @@ function resize() {
 }
 function legend(r) {
   const rows = Array.from(new Set([r.ego, ...r.agents])).filter(row => r.rank.has(row));
-  const entries = rows.slice(0, 6).map(row => `<div><b style="background:${r.color(row)}"></b>${row === r.ego ? "ego" : "interactive"} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
-  if (rows.length > 6) entries.push(`<div>and ${rows.length - 6} more driven</div>`);
+  const entries = rows.slice(0, 8).map(row => `<div><b style="background:${r.color(row)}"></b>${row === r.ego ? "ego" : "interactive"} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
+  if (rows.length > 8) entries.push(`<div>and ${rows.length - 8} more driven</div>`);
   $("legend").innerHTML = entries.join("") + `<div><b style="background:${PLAYBACK}"></b>playback</div><div><b class="dash"></b>log</div>`;
 }
 

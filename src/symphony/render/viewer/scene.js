@@ -1,5 +1,5 @@
 // What moves: boxes, the ways they took, lights, events and branches of a search.
-const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#882255", "#332288", "#d9c400"];
+const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#882255", "#332288", "#d9c400", "#ff80ff", "#9ade6b"];
 const PLAYBACK = "#a9aeb5", INK = "#2b2f36", DARK = { 2: "#7d8794", 3: "#8b9097" };
 const LIGHTS = { 1: "stop", 4: "stop", 7: "stop", 2: "caution", 5: "caution", 8: "caution", 3: "go", 6: "go" };
 const LIGHT_COLORS = { stop: STOP, caution: "#e69f00", go: "#009e73" };

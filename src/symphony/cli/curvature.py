@@ -1,4 +1,4 @@
-"""Draw the paper's figures from runs."""
+"""Draw how often runs visit branching regions of each average curvature."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ import tyro
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 
-app = tyro.extras.SubcommandApp()
 
-
-@app.command(name="curvature")
 @dataclass(frozen=True)
 class Curvature:
     """Draw how often the policy, and the log, visit branching regions of each average curvature.

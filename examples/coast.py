@@ -1,0 +1,11 @@
+"""The shortest planner there is, and one to compare others with: it keeps its speed and never turns.
+
+symphony simulate pretrained:bc_ts_h --planner examples/coast.py:plan --data STORE --out sim
+"""
+
+from symphony.simulation.planner_view import Observation
+
+
+def plan(observation: Observation) -> tuple[float, float]:
+    """No acceleration, no steering."""
+    return 0.0, 0.0

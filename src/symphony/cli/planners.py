@@ -1,0 +1,71 @@
+"""Compare planners among crowds."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from symphony.cli.tables import write_numbers
+from symphony.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Planners:
+    """Compare planners, each among several crowds: one table, and which planner is first in each crowd.
+
+    The score of a run is its progress relative to the log's, in percent, at most 100; 0 if it failed, if the planner
+    is at fault in a collision, runs a red light or leaves the road.
+    """
+
+    found: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SIM|FILE ...", help_behavior_hint="(required)"),
+    ]
+    """Folders of rollouts that `symphony simulate --planner` made, or records that `symphony evaluate --planner
+    --json` wrote."""
+    format: Literal["text", "markdown"] = "text"
+    """How the table is written."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write it to; otherwise it is printed."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File to write all numbers to; - for standard output, in place of the table."""
+
+    def __post_init__(self) -> None:
+        if not self.found:
+            raise ConfigError("no rollouts and no records given")
+
+    def run(self) -> None:
+        """Judge what is not judged yet, and write the table."""
+        from symphony.evaluation.planners import planner_record, read_planner_record
+        from symphony.files import write_file
+        from symphony.simulation.saved_files import load_rollouts
+
+        records = [
+            planner_record(load_rollouts(path)) if path.is_dir() else read_planner_record(path)
+            for path in self.found
+        ]
+        if self.json is not None:
+            write_numbers(self.json, {"records": records})
+        text = table_text(records, self.format)
+        if self.out is not None:
+            write_file(self.out, text)
+        elif str(self.json) != "-":
+            sys.stdout.write(text)
+
+
+def table_text(records: Sequence[dict[str, Any]], form: Literal["text", "markdown"] = "text") -> str:
+    """The table of some records, and which planner is first in each crowd."""
+    from symphony.evaluation.planners import planner_grid, winners
+
+    grid, sentences = planner_grid(records), winners(records)
+    if form == "markdown":
+        lines = [f"| {' | '.join(line)} |" for line in grid]
+        return "\n".join([lines[0], "| --- " * len(grid[0]) + "|", *lines[1:], "", *sentences]) + "\n"
+    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
+    rows = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in grid]
+    return "\n".join([*(row.rstrip() for row in rows), "", *sentences]).rstrip() + "\n"

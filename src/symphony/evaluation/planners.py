@@ -1,0 +1,216 @@
+"""Planners among crowds: a record for each pair, and one table of all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.errors import DataError
+from symphony.evaluation.report import grouped_mean, report, total_numbers
+from symphony.files import locating
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.saved_files import RolloutFolder
+
+FORMAT = 1
+"""Version of a record."""
+COLUMNS = (
+    ("score", "score", 1),
+    ("collision_rate", "collisions %", 1),
+    ("at_fault_collision_rate", "at fault %", 1),
+    ("red_light_rate", "red lights %", 1),
+    ("offroad_time", "off-road %", 1),
+    ("progress_ratio", "progress", 2),
+    ("failed_runs", "failed", 0),
+)
+"""Numbers of the table, their headings and digits."""
+_KEPT = (
+    "segment",
+    "rollout",
+    "group",
+    "failed",
+    "collision",
+    "at_fault_collision",
+    "red_lights",
+    "offroad_time",
+    "progress_ratio",
+)
+"""Of each run, in a record."""
+
+Record = dict[str, Any]
+
+
+def run_score(run: Record) -> float:
+    """0 to 100 of one run: the progress relative to the log's, at most all of it; 0 for a run that failed, with a
+    collision at fault, a red light, or time off the road. Where the log stays in place there is no progress to make.
+    """
+    if run["failed"] or run["at_fault_collision"] or run["red_lights"] or run["offroad_time"]:
+        return 0.0
+    ratio = 1.0 if run["progress_ratio"] is None else run["progress_ratio"]
+    return 100.0 * min(max(float(ratio), 0.0), 1.0)
+
+
+def planner_record(folder: RolloutFolder) -> Record:
+    """How the planner in a folder of rollouts drove.
+
+    Returns:
+        ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
+        ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
+        judged; ``score``, the mean of :func:`run_score`, and ``score_se``; ``search``, what :func:`selection` says,
+        None where no search was kept; ``per_run``.
+
+    Raises:
+        DataError: there is no planner in it, or a file of it can't be read.
+    """
+    drivers = folder.about.drivers
+    if "ego" not in drivers:
+        raise DataError("no planner drove here: simulate with --planner", file=folder.path, field="drivers")
+    found = report(folder, "ego")
+    per_run = [{name: row[name] for name in _KEPT} for row in found.rows]
+    groups: list[str] = [row["group"] or row["segment"] for row in found.rows]
+    number = np.unique(groups, return_inverse=True)[1] if groups else np.zeros(0, np.int64)
+    scores = np.array([run_score(row) for row in per_run], np.float64)
+    score, error = grouped_mean(scores, np.ones_like(scores), number)
+    return {
+        "format": FORMAT,
+        "planner": drivers["ego"],
+        "crowd": drivers["interactive"],
+        "settings": dict(folder.about.settings),
+        # The path is of no use elsewhere.
+        "store": {"name": _store_name(folder.about.store), "checksum": folder.about.store["checksum"]},
+        **total_numbers(found.rows),
+        "score": score,
+        "score_se": error,
+        "search": selection(saved for saved in folder if saved.trees is not None),
+        "per_run": per_run,
+    }
+
+
+def _store_name(store: Any) -> str:
+    return "/".join(Path(store["path"]).parts[-2:])
+
+
+def selection(found: Iterable[SavedRollouts]) -> Record | None:
+    """Whether searches flatter the ego, which they don't judge: how often it begins to collide, per 100 steps without
+    a collision, in all that was ``simulated`` and in what was ``kept`` (the leaves); None without any search.
+    """
+    counts = sum((_begun(saved) for saved in found), np.zeros((2, 2)))
+    if not counts.any():
+        return None
+    out: Record = {}
+    for name, (begun, steps) in zip(("simulated", "kept"), counts.tolist(), strict=True):
+        out |= {name: 100.0 * begun / steps if steps else None, f"{name}_steps": int(steps)}
+    return out
+
+
+def _begun(saved: SavedRollouts) -> NDArray[np.float64]:
+    """[2, 2] collisions of the ego that begin, and the steps at which one could, in all slots and in leaves."""
+    trees = saved.trees
+    if trees is None:
+        return np.zeros((2, 2))
+    hit = trees.collision[..., 0]
+    before = np.zeros_like(hit)
+    before[..., 1:] = hit[..., :-1]
+    # The first step of a period follows the slot it was continued from.
+    for period in range(1, trees.parents.shape[1]):
+        step = period * trees.prune_every
+        if step < hit.shape[-1]:
+            before[..., step] = np.take_along_axis(hit[..., step - 1], trees.parents[:, period - 1], -1)
+    own = saved.collision[..., 0] & saved.counted[..., 0]
+    own_before = np.zeros_like(own)
+    own_before[:, 1:] = own[:, :-1]
+    going = saved.counted[..., 0]
+    return np.array(
+        [
+            [float((hit & ~before).sum()), float((~before).sum())],
+            [float((own & ~own_before).sum()), float((going & ~own_before).sum())],
+        ]
+    )
+
+
+def read_planner_record(path: Path) -> Record:
+    """A record from a file.
+
+    Raises:
+        DataError: it can't be read, or is no such record.
+    """
+    with locating(path):
+        found = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(found, dict) or found.get("format") != FORMAT or "planner" not in found:
+        raise DataError("no record of a planner (format 1)", file=path, field="format")
+    missing = [name for name in ("crowd", "per_run", *(name for name, _, _ in COLUMNS)) if name not in found]
+    if missing:
+        raise DataError("missing in this record of a planner", file=path, field=missing[0])
+    return found
+
+
+def crowd_name(record: Record) -> str:
+    """The crowd in few words: its agent, how many were driven, and whether they were searched."""
+    name = str(record["crowd"]).rpartition("/")[2].removeprefix("pretrained:")
+    if name == "playback":
+        return "log"
+    settings = record["settings"]
+    search = "" if settings.get("search", "agent") == "agent" else f", search {settings['search']}"
+    return f"{name}, {int(settings['interactive']) - 1} driven{search}"
+
+
+def planner_grid(records: Sequence[Record]) -> list[list[str]]:
+    """A line for each record, its heading first; planners of a crowd beside each other, the best score first."""
+    order = {name: k for k, name in reversed(list(enumerate(crowd_name(one) for one in records)))}
+    ranked = sorted(records, key=lambda one: (order[crowd_name(one)], -(one["score"] or 0.0)))
+    grid = [["crowd", "planner", *(heading for _, heading, _ in COLUMNS)]]
+    for one in ranked:
+        cells = []
+        for name, _, digits in COLUMNS:
+            value, error = one[name], one.get(f"{name}_se")
+            text = "–" if value is None else f"{value:.{digits}f}"
+            cells.append(text if value is None or error is None else f"{text} ± {error:.{digits}f}")
+        grid.append([crowd_name(one), planner_title(one), *cells])
+    return grid
+
+
+def planner_title(record: Record) -> str:
+    """The planner's name without its folder."""
+    return str(record["planner"]).rpartition("/")[2]
+
+
+def winners(records: Sequence[Record]) -> list[str]:
+    """For each crowd a sentence: which planner scores best, by how much over the next one, paired over the runs of
+    the segments that both drove (± standard error over groups), and whether that is more than two standard errors.
+    """
+    crowds: dict[str, list[Record]] = {}
+    for one in records:
+        crowds.setdefault(crowd_name(one), []).append(one)
+    found = []
+    for crowd, members in crowds.items():
+        first, *rest = sorted(members, key=lambda one: -(one["score"] or 0.0))
+        if not rest:
+            continue
+        difference, error = paired_difference(first, rest[0])
+        clear = error is not None and difference is not None and difference > 2 * error
+        by = "–" if difference is None else f"{difference:.1f}"
+        by += "" if error is None else f" ± {error:.1f}"
+        verb = "wins" if clear else "is first, within the error"
+        found.append(f"{crowd}: {planner_title(first)} {verb}, {by} above {planner_title(rest[0])}")
+    return found
+
+
+def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None]:
+    """Mean score of the first less that of the second, paired over segments, and its standard error over groups."""
+    means = []
+    for record in (one, other):
+        by_segment: dict[str, list[float]] = {}
+        for run in record["per_run"]:
+            by_segment.setdefault(run["segment"], []).append(run_score(run))
+        means.append({segment: float(np.mean(scores)) for segment, scores in by_segment.items()})
+    both = sorted(set(means[0]) & set(means[1]))
+    of = {run["segment"]: run["group"] or run["segment"] for run in one["per_run"]}
+    number = (
+        np.unique([of[segment] for segment in both], return_inverse=True)[1] if both else np.zeros(0, int)
+    )
+    apart = np.array([means[0][segment] - means[1][segment] for segment in both], np.float64)
+    return grouped_mean(apart, np.ones_like(apart), number)

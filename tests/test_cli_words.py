@@ -1,0 +1,71 @@
+"""What commands tell: names whole, numbers in one place, what to do next."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from helpers_runs import tiny
+from helpers_segments import straight_road
+from helpers_store import fill
+from symphony.cli import main
+from symphony.cli.tables import print_table
+from symphony.cli.train import last_words
+from symphony.config import ValidationConfig
+from symphony.recipes import train
+from symphony.training.logging import Tracker
+
+
+@pytest.mark.parametrize("width", [20, 80, 300])
+def test_tables_never_break_a_name(width: int) -> None:
+    name, title = "runs/" + "long_name_" * 9, "/path/" + "of_a_store_" * 12
+    table = Table("agent", "number", title=title)
+    table.add_row(name, "1.0")
+    file = io.StringIO()
+    console = Console(file=file, width=width)
+    print_table(table, console)
+    lines = file.getvalue().splitlines()
+    assert sum(name in line for line in lines) == 1
+    assert sum(title in line for line in lines) == 1
+    assert console.width == width
+
+
+def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["doctor", "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["simulation"]["rollouts"] == 2
+    assert found["packages"]["torch"]
+    assert set(found["extras"]) == {"sumo", "argoverse2", "ray", "video", "gym"}
+    assert "bc_ts_h" in found["agents"]["included"]
+
+
+def test_training_ends_with_what_to_know(tmp_path: Path) -> None:
+    fill(tmp_path / "store", [straight_road(4, seed=k, steps=8) for k in range(2)])
+    config = tiny("bc", tmp_path / "store", tmp_path / "runs")
+    lines = dict(line.split(maxsplit=1) for line in last_words(train(config), config))
+    assert lines["checkpoint"].startswith(f"step-{config.steps:012d}: the last one; nothing was validated")
+    validation = ValidationConfig(data=tmp_path / "store", segments=2, rollouts=1)
+    config = replace(config, out=tmp_path / "validated", validation=validation)
+    lines = dict(line.split(maxsplit=1) for line in last_words(train(config), config))
+    assert f"% on segments of {tmp_path / 'store'} (at most 2)" in lines["checkpoint"]
+
+
+def test_weights_and_biases_is_told_project_group_and_tags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import wandb
+
+    told: dict[str, Any] = {}
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setattr(wandb, "init", lambda **given: told.update(given))
+    Tracker(tmp_path, {}, "offline", project="mine", group="seeds", tags=["a", "b"]).close()
+    assert (told["project"], told["group"], told["tags"]) == ("mine", "seeds", ["a", "b"])
+    Tracker(tmp_path, {}, "offline").close()
+    assert (told["project"], told["group"], told["tags"]) == ("symphony", None, None)

@@ -1,0 +1,339 @@
+"""Planners of every kind: functions, files, batches, other processes, slow ones; and what compares them."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers_segments import crossing, straight_road
+from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.cli import main
+from symphony.config import EvaluateConfig
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation.planners import planner_record, read_planner_record, run_score, winners
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.planner import Control, Scenario, Target, Traffic, checked_plan, planner_maker
+from symphony.simulation.planner_calls import answer
+from symphony.simulation.planner_view import Observation
+from symphony.simulation.saved_files import RolloutFolder, load_rollouts
+from symphony.simulation.saving import save_simulation
+
+AGENT = "pretrained:bc_ts_h"
+
+BRAKE = """
+import sys
+from beside import BRAKING
+
+def plan(observation):
+    return (-BRAKING, 0.0)
+"""
+PIPED = """
+import json, sys
+for line in sys.stdin:
+    told = json.loads(line)
+    if "reset" in told:
+        scene = told["reset"]
+        print("{}", flush=True)
+    elif told["plan"]["step"] == int(sys.argv[1]):
+        print(sys.argv[2], flush=True)
+    else:
+        ego, dt = told["plan"]["ego"], scene["dt"]
+        assert len(told["plan"]["agents"]["x"]) == len(told["plan"]["agents"]["type"])
+        print(json.dumps([-1.0, 0.0]), flush=True)
+"""
+
+
+def brakes(observation: Observation) -> Control:
+    return Control(-1.0, 0.0)
+
+
+class Together:
+    """Brakes; all of a batch are asked at once."""
+
+    asked: list[int] = []  # noqa: RUF012 - counted over all
+
+    def reset(self, scenario: Scenario) -> None:
+        self.number = len(self.asked)
+
+    def plan(self, traffic: Traffic) -> Any:
+        raise AssertionError("asked alone")
+
+    @classmethod
+    def plan_batch(cls, planners: list[Any], traffics: list[Traffic]) -> Any:
+        assert len(planners) == len(traffics)
+        cls.asked.append(len(planners))
+        return np.tile([-1.0, 0.0], (len(planners), 1))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("planners") / "store"
+    fill(path, [crossing(4, steps=16), straight_road(4, steps=16)])
+    return path
+
+
+def run(store: Path, out: Path, planner: Any, agent: str = AGENT, **settings: Any) -> RolloutFolder:
+    known = load_agent(agent)
+    count = 1 if known.policy is None else 2
+    data = SceneDataset(SegmentStore(store), count, known.dynamics, routes=True, duration=3)
+    seconds = settings.pop("planner_seconds", 60.0)
+    config = EvaluateConfig(**{"rollouts": 2, "search": "none", **settings})
+    return save_simulation(out, known, data, config, planner=planner, planner_seconds=seconds)
+
+
+def states(folder: RolloutFolder) -> np.ndarray[Any, Any]:
+    return np.stack([saved.state for saved in folder])
+
+
+def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -> None:
+    """A function, a function in a file, a batch, a process and a class that plan the same lead to the same states."""
+    (tmp_path / "beside.py").write_text("BRAKING = 1.0\n")
+    (tmp_path / "my.py").write_text(BRAKE)
+    (tmp_path / "piped.py").write_text(PIPED)
+    kinds: dict[str, Any] = {
+        "function": brakes,
+        "file": f"{tmp_path}/my.py:plan",
+        "batch": Together,
+        "process": f"pipe:{sys.executable} {tmp_path}/piped.py -1 -",
+    }
+    found = {name: run(store, tmp_path / name, planner) for name, planner in kinds.items()}
+    first = states(found["function"])
+    assert (np.diff(first[..., 0, 3], axis=2) <= 0).all()
+    for name, folder in found.items():
+        np.testing.assert_array_equal(states(folder), first, err_msg=name)
+        assert not any(saved.failed for saved in folder)
+    assert max(Together.asked) == 4
+    assert found["function"].about.drivers["ego"] == f"{__name__}:brakes"
+    assert found["file"].about.drivers["ego"] == kinds["file"]
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ("[NaN, 0.0]", "not finite"),
+        ('{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
+        ("what?", "step 2: JSONDecodeError"),
+        ("null", "step 2: "),
+    ],
+)
+def test_what_another_process_says_wrong_fails_the_run(
+    store: Path, tmp_path: Path, said: str, why: str
+) -> None:
+    (tmp_path / "piped.py").write_text(PIPED)
+    command = f"pipe:{sys.executable} {tmp_path}/piped.py 2 '{said}'"
+    folder = run(store, tmp_path / "sim", command, "playback", rollouts=1)
+    for saved in folder:
+        assert why in saved.failed[0]
+        assert saved.counted[0].sum() == 2
+
+
+def test_a_process_that_ends_fails_its_run_and_cannot_be_forked(store: Path, tmp_path: Path) -> None:
+    folder = run(store, tmp_path / "one", f"pipe:{sys.executable} -c pass", "playback", rollouts=1)
+    assert all("ended (status 0) without an answer" in saved.failed[0] for saved in folder)
+    (tmp_path / "piped.py").write_text(PIPED)
+    command = f"pipe:{sys.executable} {tmp_path}/piped.py -1 -"
+    with pytest.raises(ConfigError, match=r"a process can't be copied.*--search none"):
+        run(store, tmp_path / "two", command, search="tree", branches=4, rule="best", prune_every=4)
+
+
+@pytest.mark.parametrize("how", ["busy", "sleeping", "stubborn"])
+def test_one_that_takes_too_long_fails_its_run(store: Path, tmp_path: Path, how: str) -> None:
+    def slow(observation: Observation) -> tuple[float, float]:
+        while observation.step == 3:
+            try:
+                if how != "busy":
+                    time.sleep(60)
+            except Exception:
+                if how == "stubborn":
+                    continue
+                raise
+        return 0.0, 0.0
+
+    folder = run(store, tmp_path / "sim", slow, "playback", rollouts=1, planner_seconds=0.1)
+    for saved in folder:
+        assert saved.failed[0].startswith(
+            "step 3: TimeoutError: took more than 0.1 s (test_planner_kinds.py:"
+        )
+        assert saved.counted[0].sum() == 3
+
+
+def test_time_limits_leave_other_alarms_as_they_were() -> None:
+    import signal
+
+    rung = []
+    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(1))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        assert answer(lambda: 3, seconds=60) == 3
+        assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 0.05
+        deadline = time.monotonic() + 10
+        while not rung and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert rung
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_of_a_trajectory_the_first_state_is_driven() -> None:
+    poses = [Target(1.0 + k, 2.0, 0.1, 5.0) for k in range(4)]
+    at = np.array([0.0, 2.0, 0.1, 5.0])
+    assert checked_plan(poses, at, 0.2).tolist() == list(poses[0])
+    for wrong in (np.zeros((0, 4)), np.zeros((3, 2)), np.zeros((2, 2, 4))):
+        with pytest.raises(ValueError, match="a plan is"):
+            checked_plan(wrong, at, 0.2)
+    with pytest.raises(ValueError, match="not finite"):
+        checked_plan([poses[0], (np.nan, 0, 0, 0)], at, 0.2)
+
+
+def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None:
+    seen: list[Observation] = []
+
+    def looks(observation: Observation) -> tuple[float, float]:
+        seen.append(observation)
+        return 0.0, 0.0
+
+    folder = run(store, tmp_path / "sim", looks, "playback", rollouts=1)
+    by_segment = {saved.segment.segment_id: saved for saved in folder}
+    assert {one.segment_id for one in seen} == set(by_segment)
+    for one in seen:
+        saved = by_segment[one.segment_id]
+        segment, t = saved.segment, one.step
+        others = segment.valid[:, t].copy()
+        others[segment.ego] = False
+        assert one.time == pytest.approx(t * segment.dt)
+        assert one.dt == pytest.approx(segment.dt)
+        np.testing.assert_allclose(one.ego[:4], saved.state[0, t, 0], atol=1e-4)
+        np.testing.assert_allclose(one.ego[4:], segment.size[segment.ego, :2])
+        agents = one.agents
+        np.testing.assert_allclose(
+            np.stack([agents.x, agents.y], -1), segment.position[others, t, :2], atol=1e-4
+        )
+        np.testing.assert_allclose(
+            np.stack([agents.vx, agents.vy], -1), segment.velocity[others, t], atol=1e-4
+        )
+        assert agents.id.tolist() == segment.agent_id[others].tolist()
+        assert set(agents.type) == {"vehicle"}
+        assert len(one.lanes) == len(segment.road.lanes)
+        assert {n for lane in one.lanes for n in lane.successors} <= {lane.id for lane in one.lanes}
+        assert one.route.ndim == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "score"),
+    [
+        ({}, 50.0),
+        ({"progress_ratio": 1.4}, 100.0),
+        ({"progress_ratio": -0.1}, 0.0),
+        ({"progress_ratio": None}, 100.0),
+        ({"failed": "why"}, 0.0),
+        ({"at_fault_collision": True}, 0.0),
+        ({"collision": True}, 50.0),
+        ({"red_lights": 1}, 0.0),
+        ({"offroad_time": 2.0}, 0.0),
+    ],
+)
+def test_the_score_of_a_run(changes: dict[str, Any], score: float) -> None:
+    fine = {
+        "failed": "",
+        "collision": False,
+        "at_fault_collision": False,
+        "red_lights": 0,
+        "offroad_time": 0.0,
+        "progress_ratio": 0.5,
+    }
+    assert run_score(fine | changes) == score
+
+
+def test_the_command_compares_planners_among_crowds(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A record that `evaluate` writes and the folder that it keeps say the same, and the table has both planners."""
+    words = ["--data", str(store), "--rollouts", "2", "--search", "none", "--duration", "3"]
+    record, sim = tmp_path / "idm.json", tmp_path / "sim"
+    assert (
+        main(
+            [
+                "evaluate",
+                AGENT,
+                "--planner",
+                "idm",
+                *words,
+                "--json",
+                str(record),
+                "--save-rollouts",
+                str(sim),
+            ]
+        )
+        == 0
+    )
+    assert planner_record(load_rollouts(sim)) == read_planner_record(record)
+    assert main(["simulate", AGENT, "--planner", "log", *words, "--out", str(tmp_path / "log")]) == 0
+    capsys.readouterr()
+    assert main(["planners", str(record), str(tmp_path / "log"), "--json", "-"]) == 0
+    records = json.loads(capsys.readouterr().out)["records"]
+    assert [one["planner"] for one in records] == ["idm", "log"]
+    assert all(len(one["per_run"]) == 4 for one in records)
+    assert main(["planners", str(record), str(tmp_path / "log"), "--format", "markdown"]) == 0
+    table = capsys.readouterr().out.splitlines()
+    assert table[0].startswith("| crowd | planner | score |")
+    assert sorted(line.split(" | ")[1] for line in table[2:4]) == ["idm", "log"]
+    assert table[-1] == winners(records)[0]
+    assert main(["planners", str(store)]) == 1
+
+
+def test_a_first_place_is_clear_only_beyond_two_standard_errors() -> None:
+    def record(planner: str, scores: list[float]) -> dict[str, Any]:
+        runs = [
+            {
+                "segment": f"s{k}",
+                "rollout": 0,
+                "group": f"g{k}",
+                "failed": "",
+                "collision": False,
+                "at_fault_collision": False,
+                "red_lights": 0,
+                "offroad_time": 0.0,
+                "progress_ratio": score,
+            }
+            for k, score in enumerate(scores)
+        ]
+        mean = 100 * float(np.mean(scores))
+        return {"planner": planner, "crowd": "playback", "settings": {}, "score": mean, "per_run": runs}
+
+    clear = winners([record("a", [0.5, 0.5, 0.6]), record("b", [0.9, 1.0, 1.0])])
+    assert clear == ["log: b wins, 43.3 ± 3.3 above a"]
+    (close,) = winners([record("a", [0.9, 0.0, 1.0]), record("b", [0.9, 1.0, 0.1])])
+    assert "b is first, within the error, 3.3" in close
+
+
+def test_a_search_that_is_kept_says_whether_it_flatters_the_ego(store: Path, tmp_path: Path) -> None:
+    folder = run(store, tmp_path / "sim", "idm", search="tree", branches=4, rule="best", prune_every=4)
+    found = planner_record(folder)["search"]
+    assert found["simulated_steps"] + 0 <= 2 * 4 * 15
+    assert found["kept_steps"] <= 2 * 2 * 15
+    assert 0 <= found["simulated"] <= 100
+    assert planner_record(run(store, tmp_path / "none", "idm"))["search"] is None
+
+
+def test_a_folder_without_a_planner_is_refused(store: Path, tmp_path: Path) -> None:
+    folder = run(store, tmp_path / "sim", "")
+    with pytest.raises(DataError, match="no planner drove here"):
+        planner_record(folder)
+
+
+def test_files_that_cannot_be_run_are_named(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    with pytest.raises(ConfigError, match=r"broken.py can't be imported: ZeroDivisionError"):
+        planner_maker(f"{tmp_path}/broken.py:plan")
+    (tmp_path / "empty.py").write_text("")
+    with pytest.raises(ConfigError, match=r"no attribute 'plan'"):
+        planner_maker(f"{tmp_path}/empty.py:plan")
