@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fuzz_targets import FOREIGN, TARGETS, Files, Target
+from fuzz_base import FOREIGN, Files, Target
+from fuzz_targets import TARGETS
 
 SECONDS, MEMORY = 10, 1 << 30
 """What one input may take."""

@@ -20,15 +20,16 @@ pytestmark = pytest.mark.skipif(
 if sys.platform.startswith("linux"):
     import fuzz_run
     import fuzz_targets
+    from fuzz_base import Target
     from fuzz_run import BAD, Counts, attempt, from_json, fuzz, inputs, to_json
-    from fuzz_targets import TARGETS, Target
+    from fuzz_targets import TARGETS
 
 NEEDS = {"argoverse2": "pyarrow"}
 INPUTS = 30
 
 
 NAMES = ["womd", "commonroad", "argoverse2", "interaction", "test_area", "scenarionet"]
-NAMES += ["store", "checkpoint", "configuration"]
+NAMES += ["store", "checkpoint", "configuration", "submission", "rollouts"]
 
 
 @pytest.fixture(params=NAMES)
