@@ -96,7 +96,7 @@ def _facts(data: bytes) -> dict[str, Any]:
     try:
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
         facts = json.loads(header["__metadata__"][KEY])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError("damaged or missing", field=KEY) from error
     if not isinstance(facts, dict):
         raise DataError("not a JSON object", field=KEY)
