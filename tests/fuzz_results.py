@@ -19,7 +19,7 @@ import fuzz_mutations as change
 from fuzz_base import ABSURD, ACCEPTED, REFUSED, Files, Rng, Target, written
 
 NAMES = ("aaaa", "bbbb")
-BOMB = 200 << 20
+BOMB = 32 << 20
 """Bytes of zeros in a member of an archive, at times."""
 
 

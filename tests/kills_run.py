@@ -129,6 +129,12 @@ def end_group(group: int) -> None:
         return
 
 
+def spent_alone(process: int) -> float:
+    """CPU seconds of a process."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / TICKS
+
+
 def spent(group: int) -> float:
     """CPU seconds of the processes of a group, those that have ended included."""
     total = 0

@@ -72,14 +72,14 @@ def _generate(out: Path) -> None:
 
 
 def _convert(logs: Path, out: Path) -> None:
+    if (out / "store").exists():  # it was done when it was killed, and would be refused
+        return
     convert(FakeReader(), sorted(logs.glob("*.scene")), out / "store")
 
 
 def _train(method: Any, store: Path, out: Path) -> None:
     judged = ValidationConfig(data=store, segments=1, rollouts=1)
-    # Somewhere else each time, but for what is compared.
-    config = helpers_runs.tiny(method, store, out, steps=8, validation=judged, resume=True)
-    train(config)
+    train(helpers_runs.tiny(method, store, out, steps=8, validation=judged, resume=True))
 
 
 def _train_by_two(store: Path, out: Path) -> None:

@@ -84,7 +84,7 @@ def write_json(path: Path, result: Any) -> None:
 
 def json_text(result: Any) -> str:
     """A result as JSON; numbers that are not finite become null."""
-    return json.dumps(_finite(result), indent=2, allow_nan=False) + "\n"
+    return json.dumps(finite(result), indent=2, allow_nan=False) + "\n"
 
 
 def lock(path: Path) -> BinaryIO:
@@ -130,11 +130,12 @@ def locating(path: str | Path) -> Iterator[None]:
         raise
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """A result with null for numbers that are not finite."""
     if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
+        return {name: finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
