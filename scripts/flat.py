@@ -6,6 +6,7 @@ The smallest networks and segments: what grows with the number of updates or seg
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import resource
 import sys
@@ -34,6 +35,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--updates", type=int, default=2000)
     parser.add_argument("--segments", type=int, default=2000, help="to evaluate")
     parser.add_argument("--method", choices=METHODS, default="bc")
+    parser.add_argument("--out", type=Path, default=Path("out/flat.json"), help="where the numbers are kept")
     given = parser.parse_args(args)
     with tempfile.TemporaryDirectory(prefix="symphony-flat-") as place:
         os.fsync = lambda descriptor: None  # nothing here is to last
@@ -63,6 +65,9 @@ def main(args: list[str] | None = None) -> int:
         segments, at_segment = samples(given.segments)
         how = EvaluateConfig(rollouts=2, search="none")
         evaluate(trainer.agent, store, how, lambda done, total: at_segment(done))
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    record = {"method": given.method, "updates": updates, "segments": segments}
+    given.out.write_text(json.dumps(record) + "\n", encoding="utf-8")
     good = [report("updates", updates), report("segments", segments)]
     return 0 if all(good) else 1
 
