@@ -23,10 +23,19 @@ from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
-from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds
+from symphony.metrics import (
+    Choice,
+    CollisionKinds,
+    RolloutMetrics,
+    Standing,
+    choices,
+    collision_kinds,
+    route_turns,
+    standing_at_end,
+)
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.simulation.demonstrations import SceneDataset, logged
-from symphony.simulation.driving import driven_by, search_kind
+from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.rollouts import Rollouts
 from symphony.simulation.workers import batches, naming, shared
@@ -234,7 +243,7 @@ class _BatchEvaluator:
                 seconds = time.process_time() - began
                 part = dataclasses.replace(blank, metrics=RolloutMetrics(), own={}, seconds=seconds)
                 own = {path: load_object(path) for path in blank.config.metric}
-                _add(part, self.dataset, items, scenes, found.rollouts, own)
+                _add(part, self.dataset, items, scenes, found, own)
                 parts.append(part)
                 if self.seen and seen is None:
                     seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
@@ -246,11 +255,12 @@ def _add(
     dataset: SceneDataset,
     items: list[int],
     scenes: SceneBatch,
-    rollouts: Rollouts,
+    found: Simulation,
     own: dict[str, Metric],
 ) -> None:
     """Add the rollouts of some run segments to what was found."""
-    log, log_valid = logged(scenes)
+    rollouts, (log, log_valid) = found.rollouts, logged(scenes)
+    standing = standing_at_end(rollouts.state, log, log_valid, scenes.last_step)
     kinds = _kinds(scenes, rollouts, log_valid if evaluation.search == "log" else None)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     for path, metric in own.items():
@@ -278,7 +288,22 @@ def _add(
         kinds=kinds,
         # Segments of one recording share its traffic, so errors are over recordings.
         groups=[segment.group or segment.segment_id for segment in segments],
+        standing=Standing(*(part.cpu() for part in standing)),
+        choices=_choices(scenes, found),
     )
+
+
+def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
+    """What a search made of the goals; None without search or without goals."""
+    if found.search is None or found.drawn is None or not scenes.route.shape[2]:
+        return None
+    # The rollouts of a tree are the first of its leaves.
+    each = found.goal.shape[1] // found.drawn.shape[1]
+    first = found.search.slots[..., 0, :each].sort(-1).values
+    founders = 1 + (first.diff(dim=-1) != 0).sum(-1)
+    turn = route_turns(scenes.route, scenes.route_count)
+    drawn = found.drawn.flatten(1, 2)
+    return choices(drawn.cpu(), found.goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
 
 
 def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> CollisionKinds:
