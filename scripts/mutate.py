@@ -1,7 +1,7 @@
 """Change single operators, numbers and names in functions, and tell which changes no test notices. POSIX only.
 
 Each change is made in a process of its own, forked from one that has imported everything, and the tests of that
-module are run there until the first that fails. Changes at the level of a module (constants, decorators) are not made.
+module are run there until the first that fails. Changes outside of functions (constants, decorators) are not made.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ TESTED = {
     "metrics.order": "test_metrics_order.py",
 }
 """Modules of ``symphony`` and the tests that are to notice."""
+QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
@@ -71,7 +72,6 @@ def changes(tree: ast.Module) -> Iterator[tuple[str, int, Any]]:
             elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not | ast.Invert):
                 yield "sign or negation gone", line, lambda n=node: setattr(n, "op", ast.UAdd())
             elif isinstance(node, ast.Attribute) and node.attr in NAMES:
-                new_name = NAMES[node.attr]
                 yield (
                     f"{node.attr} becomes {NAMES[node.attr]}",
                     line,
@@ -119,10 +119,10 @@ def noticed(module: ModuleType, number: int, test: str) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
 
 
-def tests(name: str, *more: str) -> int:
+def tests(name: str) -> int:
     """Run a file of tests quietly."""
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        return int(pytest.main([str(ROOT / "tests" / name), "-x", "-q", "-p", "no:cacheprovider", *more]))
+        return int(pytest.main([str(ROOT / "tests" / name), "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
 
 
 def main(args: list[str] | None = None) -> int:
