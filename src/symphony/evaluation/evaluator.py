@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -326,7 +326,9 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> 
     )
 
 
-def _curvatures(graph: LaneGraph, state: Tensor, counted: Tensor) -> NDArray[np.float64]:
+def _curvatures(
+    graph: LaneGraph, state: Float[Tensor, "*b U N 4"], counted: Bool[Tensor, "*b T N"]
+) -> NDArray[np.float64]:
     """Average curvature of every branching region that each trajectory visits.
 
     Args:
