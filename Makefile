@@ -14,7 +14,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $
 SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo table test test-lowest fuzz bench lint format docs clean
+.PHONY: help setup demo table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
 
 help:  ## what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
@@ -36,6 +36,29 @@ FUZZ_ARGS ?= --inputs 2000
 
 fuzz: $(DEV)  ## feed damaged files to everything that reads files; goes on where it stopped
 	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/fuzz.py $(FUZZ_ARGS)
+
+KILLS_ARGS ?= --kills 30
+
+kills: $(DEV)  ## kill everything that writes at random moments, go on, and compare with undisturbed work
+	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/kills.py $(KILLS_ARGS)
+
+MUTATE_ARGS ?= --changes 10
+
+mutate: $(DEV)  ## change operators in geometry, pruning rules, losses and metrics; tell which changes no test notices
+	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/mutate.py $(MUTATE_ARGS)
+
+# Not among the development packages, as nothing else needs it; processes of their own are not counted.
+coverage: $(DEV)  ## run the tests in one process and say which branches of src they take; slow
+	$(INSTALL) 'coverage>=7.6'
+	OMP_NUM_THREADS=1 $(BIN)/python -m coverage run --branch --source=src/symphony -m pytest -q
+	$(BIN)/python -m coverage report --skip-covered --sort=cover
+
+flat: $(DEV)  ## train and evaluate for long and tell whether memory and open files grow
+	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/flat.py
+
+audit: $(DEV)  ## ask a public database for known vulnerabilities of the pinned packages
+	$(INSTALL) 'pip-audit>=2.7'
+	$(BIN)/python -m pip_audit --strict --no-deps --disable-pip -r $(CONSTRAINTS)
 
 # Python itself is tested in one version, and torch too: any other build of it is gigabytes.
 test-lowest:  ## run the tests with the lowest versions that pyproject.toml promises, in a .venv of their own

@@ -21,10 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fuzz_targets import FOREIGN, TARGETS, Files, Target
+from fuzz_base import FOREIGN, Files, Target
+from fuzz_targets import TARGETS
+from kills_run import spent_alone as spent
 
 SECONDS, MEMORY = 10, 1 << 30
-"""What one input may take."""
+"""What one input may take; CPU time, as the machine may be busy."""
+WAIT = 20
+"""So many times longer may an input take that does nothing, or is not let."""
 BATCH = 200
 """Inputs per process."""
 OUTCOMES = ("accepted", "refused", "foreign", "hang", "memory", "crash", "absurd")
@@ -121,15 +125,19 @@ def _batch(name: str, counts: Counts, stop: int, seed: int, until: float) -> Non
     os.close(write)
     try:
         with os.fdopen(read, "rb", buffering=0) as pipe:
-            data = b""
+            data, began, told = b"", time.monotonic(), spent(child)
             while counts.inputs < stop:
-                ready, _, _ = select.select([pipe], [], [], SECONDS)
+                ready, _, _ = select.select([pipe], [], [], SECONDS / 2)
+                late = time.monotonic() - began > WAIT * SECONDS
+                if not ready and not late and spent(child) - told < SECONDS:
+                    continue
                 chunk = pipe.read(1 << 16) if ready else b""
                 if not chunk:
                     lost = ("crash", "the process ended") if ready else ("hang", f"more than {SECONDS} s")
                     counts.add(counts.inputs, *lost)
                     return
                 *lines, data = (data + chunk).split(b"\n")
+                began, told = time.monotonic(), spent(child)
                 for line in lines:
                     counts.add(counts.inputs, *json.loads(line))
                 if time.monotonic() > until:

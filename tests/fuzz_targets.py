@@ -12,35 +12,15 @@ import json
 import tempfile
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import fuzz_mutations as change
-from fuzz_mutations import Rng
+import fuzz_results
+from fuzz_base import ABSURD, ACCEPTED, FOREIGN, REFUSED, Files, Rng, Target, written
 from symphony.data.segment import RunSegment
-
-Files = dict[str, bytes]
-
-ACCEPTED, REFUSED, ABSURD, FOREIGN = "accepted", "refused", "absurd", "foreign"
-
-
-@dataclass(frozen=True)
-class Target:
-    """One thing that reads files.
-
-    Attributes:
-        good: its files, by name; the first is the one that is opened.
-        mutate: changes some of them.
-        run: reads them from a folder and says what came of it, with what is wrong where something is; raises
-            whatever it raises.
-    """
-
-    good: Callable[[], Files]
-    mutate: Callable[[Rng, Files], Files]
-    run: Callable[[Path, str], tuple[str, str]]
 
 
 def reader(name: str, good: Callable[[], Files], **mutations: Callable[[Rng, bytes], bytes]) -> Target:
@@ -189,18 +169,6 @@ def _argoverse2() -> Files:
         path = helpers.write(Path(folder))
         city = path.with_name(f"log_map_archive_{helpers.NAME}.json")
         return {path.name: path.read_bytes(), city.name: city.read_bytes()}
-
-
-def _written(write: Callable[[Path], Path]) -> Callable[[], Files]:
-    """The files that a function writes into a folder, the one it returns first."""
-
-    def files() -> Files:
-        with tempfile.TemporaryDirectory() as folder:
-            log = write(Path(folder))
-            paths = sorted((p for p in Path(folder).rglob("*") if p.is_file()), key=lambda path: path != log)
-            return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
-
-    return files
 
 
 def _interaction(folder: Path) -> Path:
@@ -423,10 +391,12 @@ TARGETS: dict[str, Target] = {
     "womd": reader("womd", _womd),
     "commonroad": reader("commonroad", _commonroad),
     "argoverse2": reader("argoverse2", _argoverse2),
-    "interaction": reader("interaction", _written(_interaction)),
-    "test_area": reader("interaction", _written(_test_area)),
-    "scenarionet": reader("scenarionet", _written(_scenarionet)),
+    "interaction": reader("interaction", written(_interaction)),
+    "test_area": reader("interaction", written(_test_area)),
+    "scenarionet": reader("scenarionet", written(_scenarionet)),
     "store": Target(functools.cache(_store), _change_store, _read_store),
     "checkpoint": Target(functools.cache(_checkpoint), _change_checkpoint, _load_checkpoint),
     "configuration": Target(functools.cache(_configuration), _change_one, _read_configuration),
+    "submission": fuzz_results.submission(_records),
+    "rollouts": fuzz_results.saved_rollouts(),
 }

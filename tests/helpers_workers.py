@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -22,6 +23,12 @@ def travelled(scenes: SceneBatch, rollouts: Rollouts) -> Tensor:
 def short_scenes_fail(scenes: SceneBatch, rollouts: Rollouts) -> Tensor:
     if (scenes.last_step < 8).any():
         raise ZeroDivisionError("too short for me")
+    return travelled(scenes, rollouts)
+
+
+def short_scenes_kill(scenes: SceneBatch, rollouts: Rollouts) -> Tensor:
+    if (scenes.last_step < 8).any():
+        os.kill(os.getpid(), signal.SIGKILL)
     return travelled(scenes, rollouts)
 
 

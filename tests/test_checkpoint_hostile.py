@@ -120,6 +120,8 @@ def test_no_manifest_makes_loading_fail_otherwise(saved: Path) -> None:
         (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), -1.0, "param_groups.lr"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), "fast", "param_groups.lr"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "amsgrad"), 7, "param_groups.amsgrad"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "amsgrad"), True, "param_groups.amsgrad"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "maximize"), True, "param_groups.maximize"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "params"), [1, 0], "param_groups"),
         (
             ("parts", "optimizer.adam", "state", "param_groups", 0, "betas", "items"),

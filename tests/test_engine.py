@@ -17,7 +17,7 @@ import pytest
 from helpers_convert import FakeReader
 from symphony.data import parts
 from symphony.data.convert import convert
-from symphony.data.engine import ordered_map
+from symphony.data.engine import WorkerError, ordered_map
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 
@@ -110,6 +110,10 @@ def test_an_error_comes_through_whole_and_ends_the_workers(workers: int) -> None
 def test_a_worker_that_is_killed_is_told() -> None:
     with pytest.raises(SymphonyError, match="a worker process ended before its task was done"):
         list(ordered_map(die_at_three, range(1000), workers=2))
+    with pytest.raises(WorkerError) as died:
+        list(ordered_map(die_at_three, range(4), workers=2))
+    assert 3 in died.value.tasks
+    assert len(died.value.tasks) <= 2
     assert not multiprocessing.active_children()
 
 
@@ -132,7 +136,7 @@ def test_leaving_early_abandons_what_is_under_way(tmp_path: Path) -> None:
 SCRIPT = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from symphony.data.engine import ordered_map
+from symphony.data.engine import WorkerError, ordered_map
 from test_engine import sleep_or_return
 if __name__ == "__main__":
     for pid in ordered_map(sleep_or_return, [0.0, 0.0, 30.0, 30.0, 30.0, 30.0], workers=2):

@@ -164,6 +164,8 @@ def put(value: Any) -> Any:
     [
         ("state", None, "missing"),
         ("state", put(np.nan), "not finite"),
+        ("state", put(2e3), "speed"),
+        ("state", lambda a: np.zeros((10**6, 9, 0, 4), "f4"), "along a dimension"),
         ("state", lambda a: a.astype("f8"), "dtype"),
         ("state", lambda a: a[:, :-1], "states for"),
         ("counted", lambda a: a[..., :1], "expected"),
@@ -222,6 +224,36 @@ def test_damage_is_found_and_named(tmp_path: Path) -> None:
     (tmp_path / "sim" / "manifest.json").write_text('{"format": 9}')
     with pytest.raises(DataError, match="format 1"):
         load_rollouts(tmp_path / "sim")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"file": ["segments/a"]}, "file.*wrong type"),
+        ({"file": "segments/\0"}, "no file of this folder"),
+        ({"rollouts": 10**9}, "rollouts"),
+        ({"failed": 3}, "failed.*wrong type"),
+        (None, "line 1 is damaged"),
+    ],
+)
+def test_an_index_that_lies_is_refused(change: Any, message: str, tmp_path: Path) -> None:
+    folder = save_rollouts(tmp_path / "sim", ABOUT, [played(straight_road())])
+    entry = dataclasses.asdict(folder.entries[0])
+    text = "[" * 100_000 if change is None else json.dumps(entry | change)
+    (tmp_path / "sim" / "index.jsonl").write_text(text + "\n")
+    with pytest.raises(DataError, match=message):
+        load_rollouts(tmp_path / "sim")
+
+
+@pytest.mark.parametrize("name", ["agent", "seed", "drivers", "settings", "store"])
+def test_a_manifest_of_other_types_is_refused(name: str, tmp_path: Path) -> None:
+    save_rollouts(tmp_path / "sim", ABOUT, [])
+    manifest = tmp_path / "sim" / "manifest.json"
+    held = json.loads(manifest.read_text())
+    for bad in (json.dumps(held | {name: [3]}), "[" * 100_000):
+        manifest.write_text(bad)
+        with pytest.raises(DataError, match=r"manifest\.json"):
+            load_rollouts(tmp_path / "sim")
 
 
 def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import pickle
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -336,8 +335,8 @@ def test_reading_from_several_processes(folder: Path, monkeypatch: pytest.Monkey
 # --- size --------------------------------------------------------------------------------------------------
 
 
-def test_a_hundred_thousand_segments_open_at_once(folder: Path) -> None:
-    """The files of a large store are made by repeating one record, so that only opening is timed."""
+def test_a_hundred_thousand_segments_open_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Segments are found and counted without any of them being read; all are one record, repeated."""
     from symphony.data.store_format import SEGMENTS
 
     count = 100_000
@@ -354,14 +353,9 @@ def test_a_hundred_thousand_segments_open_at_once(folder: Path) -> None:
             path.write_bytes("".join(f"name-{k:06d}" for k in range(count)).encode())
         else:
             os.truncate(path, len(raw) * count)
-    start = time.perf_counter()
     store = SegmentStore(folder, check=False)  # the names are made up: nothing would match its hash
-    segment = store[count - 1]
-    opened = time.perf_counter() - start
-    assert segment.segment_id == "name-099999"
+    assert store[count - 1].segment_id == "name-099999"
+    monkeypatch.delattr(SegmentStore, "__getitem__")
     assert store.index_of("name-054321") == 54_321
     assert len(store.checksum()) == 64
-    indexed = time.perf_counter() - start - opened
-    assert opened < 1.0
-    assert indexed < 3.0
     json.dumps(store.summary())

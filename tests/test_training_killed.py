@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import helpers_killed
-from helpers_runs import same_weights, tiny, weights
+from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
 from symphony.agents.choice import choose
@@ -23,6 +23,7 @@ from symphony.data.store import StoreWriter
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.files import write_file
 from symphony.recipes import train
+from symphony.training import trainer as training
 from symphony.training.logging import Tracker, read_metrics
 
 METHODS = ("bc", "bc_ts")
@@ -109,7 +110,7 @@ def test_a_folder_that_is_read_only_is_named(run: Path, store: Path, tmp_path: P
     before = learned(part)
     part.chmod(0o555)
     try:
-        with pytest.raises(DataError, match=r"config\.json: can't be written: Permission denied"):
+        with pytest.raises(DataError, match=r"run\.lock: can't be written: Permission denied"):
             train(tiny("bc", store, part, resume=True, steps=6))
     finally:
         part.chmod(0o755)
@@ -166,6 +167,50 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_starts_over(
     train(tiny("bc", store, part, resume=True))
     assert learned(part) == learned(run)
     assert records(part) == records(run)
+
+
+LOCKED = """
+import sys, time
+from pathlib import Path
+from symphony.files import lock
+held = lock(Path(sys.argv[1]))
+print("held", flush=True)
+time.sleep(600)
+"""
+
+
+def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process(
+    run: Path, store: Path, tmp_path: Path
+) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    shutil.rmtree(choose(part, "4"))
+    before, settings = learned(part), tiny("bc", store, part, resume=True)
+    command = [sys.executable, "-c", LOCKED, str(part / training.LOCK)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(DataError, match=r"part: is being written by another process"):
+            train(settings)
+        assert (learned(part), records(part)) == (before, records(run))
+        other.kill()
+    train(settings)
+    assert learned(part) == learned(run)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_who_comes_second_does_not_go_on_from_what_it_saw_at_first(
+    run: Path, store: Path, tmp_path: Path, resume: bool
+) -> None:
+    """Two processes that look at the folder before either of them writes there."""
+    part = tmp_path / "part"
+    if resume:
+        shutil.rmtree(choose(shutil.copytree(run, part), "4"))
+    first, second = (build(tiny("bc", store, part, resume=resume)) for _ in range(2))
+    first.run()
+    done = learned(part)
+    with pytest.raises(ConfigError, match=r"part.*(holds a run already|another process went on)"):
+        second.run()
+    assert learned(part) == done == learned(run)
 
 
 def test_records_are_kept_up_to_the_checkpoint_and_never_lost_in_between(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from PIL import Image
 from helpers_saved import played, random_trees, searched
 from helpers_segments import crossing, hide, random_segment, straight_road
 from symphony.cli import main
+from symphony.errors import DataError
 from symphony.evaluation.report import Report, add_segment
 from symphony.render.viewer import Event, packed, unpacked, view_page
 from symphony.simulation.saved import SavedRollouts
@@ -68,6 +69,13 @@ def test_a_packed_segment_holds_its_numbers(number: int) -> None:
         np.testing.assert_allclose(arrays["tree.x"].swapaxes(2, 3), saved.trees.state[..., 0], atol=6e-4)
         np.testing.assert_array_equal(arrays["tree.totals"], saved.trees.totals)
         np.testing.assert_array_equal(arrays["tree.parents"], saved.trees.parents)
+
+
+def test_numbers_too_large_for_a_page_are_named() -> None:
+    saved = played(straight_road())
+    saved.state[0, 2, 0, 3] = 400.0
+    with pytest.raises(DataError, match=r"segment straight-0, field sim\.s: numbers beyond"):
+        packed(saved)
 
 
 def test_damaged_text_is_refused() -> None:

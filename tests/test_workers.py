@@ -22,7 +22,7 @@ from symphony import keys
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore, StoreWriter
 from symphony.envs import Bicycle
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import EvaluatedBatch, Evaluation, evaluate
 from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
 from symphony.simulation.demonstrations import SceneDataset
@@ -159,6 +159,18 @@ def test_errors_of_workers_are_those_of_one_process(store: SegmentStore) -> None
     with pytest.raises(ZeroDivisionError, match="too short for me") as own:
         evaluate(make_agent(), store, replace(config, metric=("helpers_workers:short_scenes_fail",)))
     assert own.value.__notes__ == [f"in one of the run segments {', '.join(store.ids[:3])}"]
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_names_the_segments_at_hand(store: SegmentStore) -> None:
+    config = replace(CONFIG, workers=2, metric=("helpers_workers:short_scenes_kill",), batch=1)
+    with pytest.raises(
+        SymphonyError, match=r"a worker process ended .*; at hand were the run segments "
+    ) as error:
+        evaluate(make_agent(), store, config)
+    named = str(error.value).rpartition(" segments ")[2].split(", ")
+    assert store.ids[2] in named
+    assert len(named) <= 2
 
 
 def test_what_is_sent_comes_back_whole(store: SegmentStore) -> None:

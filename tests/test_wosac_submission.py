@@ -252,6 +252,17 @@ def test_names_of_shards(tmp_path: Path, rename: Callable[[str], str], text: str
     assert any(text in problem for problem in problems(pack(tmp_path / "wrong.tar.gz", shards)))
 
 
+@pytest.mark.parametrize(("content", "text"), [
+    (bytes(1 << 20), "no field has the number 0"),
+    (b"\x10\x00" * (1 << 20), "beside the scenarios"),
+])  # fmt: skip
+def test_a_shard_of_padding_is_refused_soon(tmp_path: Path, content: bytes, text: str) -> None:
+    """However large it is; read to the end, gigabytes of zeros took minutes."""
+    shards = named(good_shards()) | {shard_name(1, 2): content}
+    found = problems(pack(tmp_path / "wrong.tar.gz", shards))
+    assert any(text in problem for problem in found)
+
+
 def test_shards_may_be_counted_from_one(tmp_path: Path) -> None:
     names = (shard_name(1, 2), shard_name(2, 2))
     shards = dict(zip(names, named(good_shards()).values(), strict=True))

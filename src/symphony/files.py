@@ -9,9 +9,14 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from symphony.errors import DataError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -79,7 +84,27 @@ def write_json(path: Path, result: Any) -> None:
 
 def json_text(result: Any) -> str:
     """A result as JSON; numbers that are not finite become null."""
-    return json.dumps(_finite(result), indent=2, allow_nan=False) + "\n"
+    return json.dumps(finite(result), indent=2, allow_nan=False) + "\n"
+
+
+def lock(path: Path) -> BinaryIO:
+    """Keep other writers out of a folder until the file that is returned is closed, or this process ends.
+
+    Args:
+        path: the file in the folder that stands for it; it stays there.
+
+    Raises:
+        DataError: another process is in there, or the disk refuses; names the folder.
+    """
+    with naming(path):
+        file = path.open("ab")
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            raise DataError("is being written by another process", file=path.parent) from error
+    return file
 
 
 @contextmanager
@@ -105,11 +130,12 @@ def locating(path: str | Path) -> Iterator[None]:
         raise
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """A result with null for numbers that are not finite."""
     if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
+        return {name: finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

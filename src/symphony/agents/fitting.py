@@ -94,9 +94,9 @@ def _match_group(file: Path, own: dict[str, Any], group: dict[str, Any]) -> None
 
 
 def _is_setting(own: Any, value: Any) -> bool:
-    """Whether a value is of the kind of an optimizer's own: flags, or numbers that are finite and not negative."""
-    if own is None or isinstance(own, bool):
-        return value is None or isinstance(value, bool)
+    """Whether a value is of the kind of an optimizer's own: the same flag, finite numbers that are not negative."""
+    if own is None or isinstance(own, bool):  # another one would need other moments, or climb the loss
+        return value is own
     if isinstance(own, tuple | list):
         return (
             isinstance(value, tuple | list)

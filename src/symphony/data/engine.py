@@ -30,6 +30,21 @@ IN_FLIGHT = 2
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 
 
+class WorkerError(SymphonyError):
+    """A worker process ended before its task was done.
+
+    Args:
+        tasks: numbers, from 0, of those that were under way, one of which it was.
+    """
+
+    def __init__(self, tasks: list[int]) -> None:
+        self.tasks = tasks
+        super().__init__(
+            "a worker process ended before its task was done: killed (out of memory?), crashed, or started "
+            "from a script without `if __name__ == '__main__':`"
+        )
+
+
 def ordered_map(
     function: Callable[[T], R], tasks: Iterable[T], *, workers: int = 1, engine: Engine = "local"
 ) -> Generator[R, None, None]:
@@ -51,7 +66,8 @@ def ordered_map(
 
     Raises:
         ConfigError: ``workers`` or ``engine`` can't be used, or Ray is not installed.
-        SymphonyError: a worker process died, while iterating; what ``function`` raises comes through unchanged.
+        WorkerError: a worker process of this machine did, while iterating.
+        SymphonyError: a worker of Ray failed, while iterating; what ``function`` raises comes through unchanged.
     """
     if workers < 1:
         raise ConfigError(f"workers must be at least 1, is {workers}")
@@ -83,15 +99,15 @@ def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int) -> 
         ):  # processes are started here, as they are needed
             return pool.submit(_interruptible, function, task)
 
+    pending: deque[Any] = deque()
+    done = 0
     try:
         for pending in _ahead(submit, tasks, IN_FLIGHT * workers):
             yield pending[0].result()
+            done += 1
     except BrokenProcessPool as error:
-        message = (
-            "a worker process ended before its task was done: killed (out of memory?), crashed, or started "
-            "from a script without `if __name__ == '__main__':`"
-        )
-        raise SymphonyError(message) from error
+        lost = [done + k for k, task in enumerate(pending) if not task.done() or task.exception() is not None]
+        raise WorkerError(lost[:workers]) from error  # they are begun in their order
     finally:
         stop.close()
         pool.shutdown(wait=True, cancel_futures=True)

@@ -26,13 +26,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony import files
 from symphony.errors import DataError
 from symphony.files import locating
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 FORMAT = "symphony segment store"
 VERSION = 1
@@ -393,14 +389,7 @@ def lock(folder: Path) -> BinaryIO:
     Raises:
         DataError: another process is in there.
     """
-    file = (folder / LOCK).open("ab")
-    if fcntl is not None:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.close()
-            raise DataError("is being written by another process", file=folder) from error
-    return file
+    return files.lock(folder / LOCK)
 
 
 def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:

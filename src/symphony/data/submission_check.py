@@ -25,6 +25,8 @@ _SCENARIO_KEY = (1 << 3) | 2
 """Tag on the wire of a shard's field ``scenario_rollouts``."""
 _DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError)
 _NAMED, _KEPT = 5, 1000
+_MAX_REST = 1 << 16
+"""Bytes of a shard that are no scenarios: some lines of text."""
 
 
 @dataclass
@@ -126,15 +128,17 @@ def _check_member(
     if name in shards:
         report.add(DataError("more than once in the archive", file=where))
     shards[name] = where
-    rest = b""
+    rest = bytearray()
     try:
         for scenario, raw in _messages(stream, member.size):
             if scenario is None:
                 rest += raw
+                if len(rest) > _MAX_REST:
+                    raise DecodeError(f"more than {_MAX_REST} bytes beside the scenarios")
             else:
                 report.add(*_scenario_problems(scenario, where, report.scenarios, required))
                 report.scenarios.add(scenario.scenario_id)
-        meta = pb.SimAgentsChallengeSubmission.FromString(rest)
+        meta = pb.SimAgentsChallengeSubmission.FromString(bytes(rest))
     except (DecodeError, UnicodeDecodeError) as error:
         message = f"not a SimAgentsChallengeSubmission message, or damaged: {error}"
         report.add(DataError(message, file=where))
@@ -147,6 +151,8 @@ def _messages(stream: IO[bytes], size: int) -> Iterator[tuple[pb.ScenarioRollout
     """The scenarios of a shard one by one, then what else it holds as it is."""
     while size > 0:
         key, used = _varint(stream)
+        if key >> 3 == 0:
+            raise DecodeError("no field has the number 0")
         if key != _SCENARIO_KEY:
             # All fields but the scenarios are small, and writers put them last or first: kind 0 or 2.
             head = _encoded(key)

@@ -188,7 +188,7 @@ def evaluate_dataset(
         load_object(path)  # or complain before anything is simulated
     seconds = [0.0] * len(everyone)
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
-    with closing(shared(evaluator, batches(range(len(dataset)), config), config)) as results:
+    with closing(shared(evaluator, batches(range(len(dataset)), config), config, dataset)) as results:
         for batch in results:
             for k, part in enumerate(batch.parts):
                 found[k].metrics.merge(part.metrics)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import NoneType
 from typing import Any, overload
 from urllib.parse import quote
 
@@ -20,11 +21,20 @@ from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 from symphony.files import naming, replacing, write_json
 from symphony.simulation.saved import SavedRollouts
-from symphony.simulation.saved_tensors import KEY, read_tensors, tensors_of
+from symphony.simulation.saved_tensors import KEY, MAX_LENGTH, read_tensors, tensors_of
 
 FORMAT = 1
 MANIFEST, INDEX, SEGMENTS = "manifest.json", "index.jsonl", "segments"
 _LONGEST = 120
+_KINDS: dict[str, tuple[type, ...]] = {
+    "segment": (str,),
+    "rollouts": (int,),
+    "file": (str,),
+    "sha256": (str,),
+    "dt": (int, float),
+    "failed": (str, NoneType),
+}
+"""Of the values of an entry."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +177,10 @@ class RolloutFolder(Sequence[SavedRollouts]):
         missing = sorted(names - manifest.keys())
         if missing:
             raise DataError("is missing", file=self.path / MANIFEST, field=missing[0])
+        kinds = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
+        for name, kind in kinds.items():
+            if type(manifest[name]) is not kind:
+                raise DataError(f"must be {kind.__name__}", file=self.path / MANIFEST, field=name)
         self.about = About(**{name: manifest[name] for name in names})
         found = _read_index(self.path).values()
         self.entries = [entry for entry in found if entry.failed is None]
@@ -258,7 +272,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(f"no folder of rollouts: it has no {MANIFEST}", file=path)
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"not valid JSON ({error})", file=file) from error
     if not isinstance(values, dict):
         raise DataError("not a JSON object", file=file)
@@ -278,12 +292,15 @@ def _read_index(path: Path) -> dict[str, Entry]:
         try:
             values = json.loads(line)
             entry = Entry(**values)
-        except (ValueError, TypeError, AttributeError) as error:
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(f"line {number} is damaged ({error})", file=file) from error
-        if not isinstance(entry.segment, str) or not isinstance(entry.rollouts, int):
-            raise DataError(f"line {number} names no segment or no number of rollouts", file=file)
+        for name, kinds in _KINDS.items():
+            if type(getattr(entry, name)) not in kinds:
+                raise DataError(f"line {number}: of a wrong type", file=file, field=name)
+        if not 0 <= entry.rollouts <= MAX_LENGTH:
+            raise DataError(f"line {number}: {entry.rollouts} rollouts", file=file, field="rollouts")
         if entry.failed is None and not (
-            entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1
+            entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1 and entry.file.isprintable()
         ):
             raise DataError(f"line {number} names no file of this folder", file=file, segment=entry.segment)
         found.pop(entry.segment, None)

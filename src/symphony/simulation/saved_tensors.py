@@ -19,6 +19,12 @@ from symphony.simulation.saved import SavedRollouts, SavedTrees
 KEY = "symphony"
 """Of the JSON in the header of a file."""
 
+MAX_PLACE, MAX_TURN, MAX_SPEED = 1e5, 1e4, 1e3
+"""Metres, radians and m/s that a simulated state may have: some times those of a log, as nobody steers it back."""
+
+MAX_LENGTH = 100_000
+"""Rollouts, steps or agents."""
+
 _LINES = ("lanes", "boundary", "marks")
 _ROAD = tuple(item.name for item in fields(RoadMap) if item.name not in _LINES)
 _SCALARS = ("segment_id", "source", "dt", "ego", "current_step", "file", "group")
@@ -90,7 +96,7 @@ def _facts(data: bytes) -> dict[str, Any]:
     try:
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
         facts = json.loads(header["__metadata__"][KEY])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError("damaged or missing", field=KEY) from error
     if not isinstance(facts, dict):
         raise DataError("not a JSON object", field=KEY)
@@ -177,7 +183,7 @@ def _checked(saved: SavedRollouts, facts: dict[str, Any], segment_id: str) -> Sa
     if any(number >= sizes["K"] for number in saved.failed):
         raise DataError(f"names a rollout outside the {sizes['K']}", field="failed")
     there = np.concatenate([saved.counted[:, :1], saved.counted], 1)
-    _check_finite("state", saved.state[there])
+    _check_state("state", saved.state[there])
     if saved.trees is not None:
         _check_trees(saved.trees, sizes)
     return saved
@@ -194,7 +200,7 @@ def _check_trees(trees: SavedTrees, sizes: dict[str, int]) -> None:
     if sizes["R"] * sizes["L"] != sizes["K"]:
         message = f"{sizes['R']} trees of {sizes['L']} leaves are not {sizes['K']} rollouts"
         raise DataError(message, field="tree.slots")
-    _check_finite("tree.state", trees.state)
+    _check_state("tree.state", trees.state)
     if np.isinf(trees.score).any():
         raise DataError("holds an infinite number", field="tree.score")
 
@@ -205,6 +211,8 @@ def _check_shape(name: str, value: NDArray[Any], dtype: Any, shape: str, sizes: 
         raise DataError(f"dtype {value.dtype}, expected {np.dtype(dtype)}", field=name)
     if value.ndim != len(shape):
         raise DataError(f"shape {list(value.shape)}, expected {len(shape)} dimensions", field=name)
+    if max(value.shape) > MAX_LENGTH:  # arrays without elements have any shape
+        raise DataError(f"shape {list(value.shape)}, at most {MAX_LENGTH} along a dimension", field=name)
     for letter, size in zip(shape, value.shape, strict=True):
         if sizes.setdefault(letter, size) != size:
             raise DataError(
@@ -221,6 +229,17 @@ def _check_finite(name: str, value: NDArray[Any]) -> None:
     bad = int((~np.isfinite(value)).sum())
     if bad:
         raise DataError(f"{bad} numbers that are not finite", field=name)
+
+
+def _check_state(name: str, value: NDArray[Any]) -> None:
+    _check_finite(name, value)
+    far, most = (
+        np.abs(value).max(tuple(range(value.ndim - 1)), initial=0),
+        (MAX_PLACE, MAX_PLACE, MAX_TURN, MAX_SPEED),
+    )
+    for what, found, bound in zip(("x", "y", "heading", "speed"), far.tolist(), most, strict=True):
+        if found > bound:
+            raise DataError(f"a {what} of {found:.4g}, at most {bound:g} is plausible", field=name)
 
 
 def _check_lines(lines: Polylines) -> None:

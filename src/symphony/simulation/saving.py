@@ -75,7 +75,7 @@ def save_simulation(
         todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
     drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds)
-    with closing(shared(drive, batches(todo, config), config)) as results:
+    with closing(shared(drive, batches(todo, config), config, dataset)) as results:
         for saved in results:
             for one in saved:
                 writer.add(one)

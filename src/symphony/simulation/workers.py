@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 from symphony import allocator
 from symphony.config import EvaluateConfig
-from symphony.data.engine import ordered_map
+from symphony.data.engine import WorkerError, ordered_map
 from symphony.errors import ConfigError, SymphonyError
 from symphony.simulation.demonstrations import SceneDataset
 
@@ -25,14 +25,19 @@ def batches(items: Sequence[int], config: EvaluateConfig) -> list[list[int]]:
     return [list(items[first : first + config.batch]) for first in range(0, len(items), config.batch)]
 
 
-def shared(work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig) -> Generator[R, None, None]:
+def shared(
+    work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig, dataset: SceneDataset | None = None
+) -> Generator[R, None, None]:
     """The results of some work on every task, in the order of the tasks, by ``config.workers`` processes.
+
+    With a dataset, tasks are a list of batches of its items.
 
     One local worker is this very process. ``close`` ends the others.
 
     Raises:
         ConfigError: the work can't be sent to another process, or Ray is not installed.
-        SymphonyError: a worker process died; what the work raises comes through unchanged.
+        SymphonyError: a worker process died, with the run segments at hand if the dataset is given; what the work
+            raises comes through unchanged.
     """
     if config.workers == 1 and config.engine == "local":
         yield from map(work, tasks)
@@ -43,8 +48,15 @@ def shared(work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig) -> Gene
         raise ConfigError(f"can't be shared among processes: {error}") from error
     pairs = ((sent, task) for task in tasks)
     with closing(ordered_map(_done, pairs, workers=config.workers, engine=config.engine)) as results:
-        for result in results:
-            yield cast(R, pickle.loads(result))  # noqa: S301  (from our own worker)
+        try:
+            for result in results:
+                yield cast(R, pickle.loads(result))  # noqa: S301  (from our own worker)
+        except WorkerError as error:
+            if dataset is None:
+                raise
+            batched = cast("Sequence[list[int]]", tasks)
+            names = _names(dataset, [i for number in error.tasks for i in batched[number]])
+            raise SymphonyError(f"{error}; at hand were the run segments {names}") from error
 
 
 @contextmanager
@@ -55,9 +67,12 @@ def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
     except SymphonyError:
         raise
     except Exception as error:
-        names = ", ".join(dataset.store.ids[dataset.indices[i]] for i in items)
-        error.add_note(f"in one of the run segments {names}")
+        error.add_note(f"in one of the run segments {_names(dataset, items)}")
         raise
+
+
+def _names(dataset: SceneDataset, items: Sequence[int]) -> str:
+    return ", ".join(dataset.store.ids[dataset.indices[i]] for i in items)
 
 
 @lru_cache(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import random
@@ -22,7 +23,7 @@ from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoin
 from symphony.agents.choice import Best
 from symphony.config import RunConfig, to_json
 from symphony.errors import ConfigError, DataError
-from symphony.files import write_file
+from symphony.files import lock, write_file
 from symphony.simulation import SceneDataset, SearchReplay
 from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.training.logging import Tracker
@@ -34,6 +35,8 @@ from symphony.training.validation import Validator
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""
+LOCK = "run.lock"
+"""Held by the process that trains."""
 _SEED_STRIDE = 1_000_003
 
 
@@ -101,17 +104,28 @@ class Trainer:
             The run's folder: ``config.json``, ``agent.json``, ``metrics.jsonl``, ``checkpoints/`` and ``media/``.
 
         Raises:
-            DataError: if the disk refuses.
+            ConfigError: if another process has begun or gone on with the run since this trainer was made.
+            DataError: if another process is at it, or the disk refuses.
             TrainingError: if gradients stay infinite or undefined.
         """
+        with contextlib.ExitStack() as held:
+            # No process writes before all have looked at what there is.
+            self.world.wait()
+            if self.world.leads:
+                self.config.out.mkdir(parents=True, exist_ok=True)
+                held.enter_context(lock(self.config.out / LOCK))
+                if checkpoint_to_resume(self.config) != self.done:
+                    raise ConfigError(
+                        f"{self.config.out}: another process went on with this run in the meantime"
+                    )
+            return self._run()
+
+    def _run(self) -> Path:
         config, step = self.config, 0
         # Kept with checkpoints like torch's, which the recipe has seeded: those of equal runs are equal files.
         random.seed(config.seed)
         np.random.seed(config.seed % 2**32)  # noqa: NPY002
-        # No process writes before all have looked at what there is.
-        self.world.wait()
         if self.world.leads:
-            config.out.mkdir(parents=True, exist_ok=True)
             write_file(config.out / "config.json", to_json(config))
             write_file(config.out / FILE, to_json(self.agent.spec))
         if self.done is not None:

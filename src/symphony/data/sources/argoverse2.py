@@ -154,7 +154,7 @@ def read_columns(data: bytes) -> Columns:
         texts = [name for name, kind in _COLUMNS.items() if kind == _TEXT]
         source = pa.BufferReader(data)
         file = parquet.ParquetFile(source, read_dictionary=texts, page_checksum_verification=True)
-        _check_size(file.metadata)
+        _check_size(file)
         table = file.read(columns=list(_COLUMNS), use_threads=False)
         table.validate(full=True)
         return {name: _column(pa, table[name], name, kind) for name, kind in _COLUMNS.items()}
@@ -163,15 +163,19 @@ def read_columns(data: bytes) -> Columns:
         raise DataError(f"not a readable Parquet file: {str(error)[:200]}") from error
 
 
-def _check_size(metadata: Any) -> None:
+def _check_size(file: Any) -> None:
     """Refuse what would take gigabytes once it is read."""
+    metadata = file.metadata
     if metadata.num_rows > MAX_ROWS:
         raise DataError(f"{metadata.num_rows} rows, at most {MAX_ROWS} are read")
     size = 0
     for k in range(metadata.num_row_groups):
+        # Opening the columns raises where their descriptions are damaged; asking for those ends the process.
+        next(file.iter_batches(1, [k], [name for name in _COLUMNS if name in file.schema_arrow.names]), None)
         group = metadata.row_group(k)
-        chunks = [group.column(j) for j in range(group.num_columns)]
-        size += sum(chunk.total_uncompressed_size for chunk in chunks if chunk.path_in_schema in _COLUMNS)
+        paths = [metadata.schema.column(j).path for j in range(group.num_columns)]
+        chunks = [group.column(j) for j, path in enumerate(paths) if path in _COLUMNS]
+        size += sum(chunk.total_uncompressed_size for chunk in chunks)
     if size > MAX_BYTES:
         raise DataError(f"{size} bytes in its columns, at most {MAX_BYTES} are read")
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, Polylines, RunSegment
+from symphony.errors import DataError
 from symphony.render.roads import BIKE_WIDTH, DEFAULT_WIDTH
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ class _Packer:
             whole = np.diff(whole, axis=-1, prepend=0.0) if whole.size else whole
         packed_values = np.ascontiguousarray(whole, dtype=_TYPES[kind])
         if kind != "f32" and not np.array_equal(packed_values, whole):
-            raise ValueError(f"{name}: numbers beyond what {kind} holds")
+            raise DataError(f"numbers beyond what {kind} holds", field=name)
         item: dict[str, Any] = {"name": name, "type": kind, "shape": list(array.shape), "offset": self.offset}
         item |= ({"scale": scale} if scale else {}) | ({"delta": True} if delta else {})
         self.arrays.append(item)
@@ -106,7 +107,18 @@ class _Packer:
 
 
 def packed(saved: SavedRollouts, events: Sequence[Event] = ()) -> str:
-    """One run segment with its rollouts, as the page holds it."""
+    """One run segment with its rollouts, as the page holds it.
+
+    Raises:
+        DataError: a number is too large for the page; names the segment and the array.
+    """
+    try:
+        return _packed(saved, events)
+    except DataError as error:
+        raise error.at(segment=saved.segment.segment_id) from None
+
+
+def _packed(saved: SavedRollouts, events: Sequence[Event]) -> str:
     segment, packer = saved.segment, _Packer()
     facts: dict[str, Any] = {
         "id": segment.segment_id,

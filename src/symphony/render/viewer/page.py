@@ -8,6 +8,7 @@ from html import escape
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from symphony.files import finite
 from symphony.render.viewer.pack import Event, packed
 
 if TYPE_CHECKING:
@@ -51,8 +52,8 @@ def template(name: str) -> str:
 
 
 def script_json(value: Any) -> str:
-    """JSON that can stand within a script element."""
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, default=str).replace("<", "\\u003c")
+    """JSON that can stand within a script element; numbers that are not finite become null."""
+    return json.dumps(finite(value), ensure_ascii=False, allow_nan=False, default=str).replace("<", "\\u003c")
 
 
 def filled(page: str, parts: Mapping[str, str]) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from symphony import files
 from symphony.data import store_format
 from symphony.errors import DataError
 
@@ -35,7 +36,7 @@ def scratch() -> Iterator[Path]:
 
 def _remove_left(folder: Path) -> None:
     """Remove a folder whose lock nobody holds: its owner is dead, on whichever machine or in which container."""
-    if store_format.fcntl is None:
+    if files.fcntl is None:
         return
     with contextlib.suppress(OSError, DataError):
         state = folder.lstat()

@@ -1,0 +1,156 @@
+"""Change single operators, numbers and names in functions, and tell which changes no test notices. POSIX only.
+
+Each change is made in a process of its own, forked from one that has imported everything, and the tests of that
+module are run there until the first that fails. Changes outside of functions (constants, decorators) are not made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import inspect
+import io
+import os
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TESTED = {
+    "geometry.boxes": "test_geometry_boxes.py",
+    "geometry.frames": "test_geometry_frames.py",
+    "collectors.rules": "test_collectors_rules.py",
+    "objectives.bc": "test_objectives_bc.py",
+    "objectives.distillation": "test_objectives_distillation.py",
+    "metrics.realism": "test_metrics_realism.py",
+    "metrics.order": "test_metrics_order.py",
+}
+"""Modules of ``symphony`` and the tests that are to notice."""
+QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+OPERATORS: dict[type, type] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
+    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+NAMES = {"amax": "amin", "max": "min", "any": "all", "sin": "cos", "maximum": "minimum", "sum": "mean"}
+NAMES |= {other: name for name, other in NAMES.items()}
+
+
+def changes(tree: ast.Module) -> Iterator[tuple[str, int, Any]]:
+    """Every possible change inside functions: what, in which line, and a function that makes it."""
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for node in (inner for statement in function.body for inner in ast.walk(statement)):
+            line = getattr(node, "lineno", function.lineno)
+            if isinstance(node, ast.Compare) and type(node.ops[0]) in OPERATORS:
+                new = OPERATORS[type(node.ops[0])]()
+                yield (
+                    f"comparison becomes {type(new).__name__}",
+                    line,
+                    lambda n=node, o=new: n.ops.__setitem__(0, o),
+                )
+            elif isinstance(node, ast.BinOp | ast.BoolOp) and type(node.op) in OPERATORS:
+                new = OPERATORS[type(node.op)]()
+                yield (
+                    f"operator becomes {type(new).__name__}",
+                    line,
+                    lambda n=node, o=new: setattr(n, "op", o),
+                )
+            elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                yield (
+                    f"{node.value} becomes {node.value + 1}",
+                    line,
+                    lambda n=node: setattr(n, "value", n.value + 1),
+                )
+            elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not | ast.Invert):
+                yield "sign or negation gone", line, lambda n=node: setattr(n, "op", ast.UAdd())
+            elif isinstance(node, ast.Attribute) and node.attr in NAMES:
+                yield (
+                    f"{node.attr} becomes {NAMES[node.attr]}",
+                    line,
+                    lambda n=node: setattr(n, "attr", NAMES[n.attr]),
+                )
+
+
+def replace_code(module: ModuleType, source: ast.Module) -> None:
+    """Give the functions of a module the code of those of a changed one, wherever they are known by now."""
+    other = ModuleType(module.__name__)
+    other.__file__, other.__package__ = module.__file__, module.__package__
+    sys.modules["mutated"] = other
+    exec(compile(ast.fix_missing_locations(source), str(module.__file__), "exec"), other.__dict__)  # noqa: S102
+    places = [(module.__dict__, other.__dict__)]
+    places += [
+        (kind.__dict__, other.__dict__[name].__dict__)
+        for name, kind in module.__dict__.items()
+        if inspect.isclass(kind) and kind.__module__ == module.__name__
+    ]
+    for mine, new in places:
+        for name in list(mine):
+            plain, fresh = (_function(each.get(name)) for each in (mine, new))
+            if plain is not None and fresh is not None and plain.__module__ == module.__name__:
+                plain.__code__ = fresh.__code__
+
+
+def _function(value: Any) -> FunctionType | None:
+    value = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
+    value = inspect.unwrap(value) if callable(value) else value
+    return value if isinstance(value, FunctionType) else None
+
+
+def noticed(module: ModuleType, number: int, test: str) -> bool:
+    """Whether the tests fail with a change."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+            list(changes(tree))[number][2]()
+            replace_code(module, tree)
+            status = tests(test)
+        finally:
+            os._exit(int(status != 0))
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+
+
+def tests(name: str) -> int:
+    """Run a file of tests quietly."""
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        return int(pytest.main([str(ROOT / "tests" / name), "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Make changes in turns over the modules; status 1 if one was not noticed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--changes", type=int, default=10, help="of each module")
+    parser.add_argument("--modules", nargs="+", choices=list(TESTED), default=list(TESTED))
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(args)
+    made = missed = 0
+    for name in given.modules:
+        module = importlib.import_module(f"symphony.{name}")
+        if tests(TESTED[name]) != 0:
+            raise SystemExit(f"{TESTED[name]} fails as it is")
+        tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+        possible = list(changes(tree))
+        chosen = random.Random(given.seed).sample(range(len(possible)), min(given.changes, len(possible)))  # noqa: S311
+        for number in sorted(chosen):
+            made += 1
+            if not noticed(module, number, TESTED[name]):
+                missed += 1
+                print(f"not noticed: {name}, line {possible[number][1]}: {possible[number][0]}", flush=True)
+        print(f"{name}: {len(chosen)} of {len(possible)} changes made", flush=True)
+    print(f"{made} changes, {made - missed} noticed")
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,58 @@
+"""What the number of threads changes: no rollout, and weights by rounding only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from helpers_runs import same_weights, tiny, weights
+from helpers_segments import crossing, straight_road
+from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.config import EvaluateConfig
+from symphony.data.store import SegmentStore
+from symphony.recipes import train
+from symphony.simulation import SceneDataset
+from symphony.simulation.driving import simulated
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    fill(path, [straight_road(4, seed=0, steps=10), crossing(4, seed=0, steps=9)])
+    return path
+
+
+def test_rollouts_are_the_same_with_any_number_of_threads(store: Path) -> None:
+    agent = load_agent("pretrained:bc_ts_h")
+    dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            found.append(simulated(agent, dataset.scenes([0, 1]), EvaluateConfig(rollouts=2, branches=4)))
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_weights_repeat_with_as_many_threads_and_are_close_with_others(store: Path, tmp_path: Path) -> None:
+    found = []
+    for name, count in (("one", 1), ("two", 2), ("again", 2)):
+        with threads(count):
+            found.append(weights(train(tiny("bc_ts", store, tmp_path / name, steps=2))))
+    one, two, again = found
+    assert same_weights(two, again)
+    for name, value in one.items():
+        torch.testing.assert_close(two[name], value, rtol=1e-3, atol=1e-5)
