@@ -33,6 +33,9 @@ class Simulate:
     planner: str = ""
     """Drives the ego, the agent the other interactive agents: `idm`, `log`, or the import path of one of your own,
     such as `my.planner:Planner`. With `playback` as the agent all others play back the log."""
+    goal: tuple[str, ...] = ()
+    """Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
+    for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them."""
     tree: bool = True
     """Leave out the branches that a search pruned."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -45,7 +48,7 @@ class Simulate:
         from symphony.cli.evaluate import segments_bar
         from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore
-        from symphony.simulation.demonstrations import SceneDataset
+        from symphony.simulation.crowd import crowd_dataset
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
@@ -56,14 +59,13 @@ class Simulate:
         # Beside log playback nobody else is simulated.
         others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = [segment_index(store, name) for name in self.segments]
-        dataset = SceneDataset(
+        dataset = crowd_dataset(
             store,
-            config.interactive or others,
-            agent.dynamics,
+            agent,
+            config,
             chosen or None,
-            routes=agent.goals is not None or bool(self.planner),
-            duration=config.duration or agent.duration,
-            keep=config.batch,
+            default=others,
+            routes=bool(self.planner or self.goal),
         )
         with segments_bar(f"simulating {agent.name}") as advance:
             found = save_simulation(
@@ -73,6 +75,7 @@ class Simulate:
                 config,
                 keep_tree=self.tree,
                 planner=self.planner,
+                goals=self.goal,
                 progress=advance,
             )
         console = Console()

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,8 +23,9 @@ from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
-from symphony.metrics import CollisionKinds, RolloutMetrics, collision_kinds
+from symphony.metrics import AgentSteps, CollisionKinds, RolloutMetrics, collision_kinds
 from symphony.roadgraph import LaneGraph, visited_curvatures
+from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.demonstrations import SceneDataset, logged
 from symphony.simulation.driving import driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
@@ -63,7 +64,7 @@ class Evaluation:
         agent: its name.
         metrics: accumulated over all run segments.
         config: how it was evaluated.
-        interactive: agents per segment that acted.
+        interactive: agents per segment that acted, at most, or ``all``.
         search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
         own: mean of each metric of the user's own per run segment, by import path.
         seconds: CPU time of the simulation, what it costs.
@@ -73,7 +74,7 @@ class Evaluation:
     agent: str
     metrics: RolloutMetrics
     config: EvaluateConfig
-    interactive: int
+    interactive: int | Literal["all"]
     search: str
     own: dict[str, list[float]] = field(default_factory=dict)
     seconds: float = 0.0
@@ -119,22 +120,16 @@ def evaluate(
 
     Raises:
         ConfigError: if the agent learned another time step than the store has.
-        DataError: if the store is empty, or a segment has too few agents for so many interactive ones.
+        DataError: if the store is empty, or a segment has no ego at its first step.
     """
     config = EvaluateConfig() if config is None else config
     agent = load_agent(agent, config.device) if isinstance(agent, str) else agent
     store = data if isinstance(data, SegmentStore) else SegmentStore(data)
     if len(store) == 0:
         raise DataError("the store holds no run segments", file=store.path)
-    dataset = SceneDataset(
-        store,
-        config.interactive or agent.interactive,
-        agent.dynamics,
-        routes=agent.goals is not None,
-        duration=config.duration or agent.duration,
-        keep=config.batch,
+    return evaluate_dataset(
+        agent, crowd_dataset(store, agent, config), config, progress, baselines=baselines, observe=observe
     )
-    return evaluate_dataset(agent, dataset, config, progress, baselines=baselines, observe=observe)
 
 
 def evaluate_dataset(
@@ -167,9 +162,10 @@ def evaluate_dataset(
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.
     once = dataclasses.replace(config, rollouts=1, trees=1, search="none")
+    acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     hows = [config] + [once] * (len(everyone) - 1)
     found = [
-        Evaluation(one.name, RolloutMetrics(), how, dataset.interactive, search_kind(one, how))
+        Evaluation(one.name, RolloutMetrics(), how, acting, search_kind(one, how))
         for one, how in zip(everyone, hows, strict=True)
     ]
     for path in config.metric:
@@ -251,7 +247,9 @@ def _add(
 ) -> None:
     """Add the rollouts of some run segments to what was found."""
     log, log_valid = logged(scenes)
-    kinds = _kinds(scenes, rollouts, log_valid if evaluation.search == "log" else None)
+    judged = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
+    exists = _there(scenes, rollouts, log_valid if evaluation.search == "log" else None)
+    both = judged._replace(counted=judged.counted & log_valid[:, None, 1:])
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     for path, metric in own.items():
         values = metric(scenes, rollouts)
@@ -259,7 +257,16 @@ def _add(
             shape = tuple(rollouts.state.shape[:2])
             raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")
         evaluation.own.setdefault(path, []).extend(values.double().nanmean(-1).tolist())
-    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
+    kinds = _kinds(scenes, judged, exists)
+    single = AgentSteps(
+        judged.counted.transpose(2, 3),
+        log_valid[:, 1:].transpose(1, 2),
+        rollouts.offroad.transpose(2, 3),
+        _kinds(scenes, both, exists),
+        rollouts.state[..., 1:, :, 3].transpose(2, 3),
+        log[:, 1:, :, 3].transpose(1, 2),
+    )
+    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, judged.counted, log, log_valid))
     regions, regions_log = [], []
     for b, item in enumerate(items):
         graph = dataset.graph(item)
@@ -278,16 +285,22 @@ def _add(
         kinds=kinds,
         # Segments of one recording share its traffic, so errors are over recordings.
         groups=[segment.group or segment.segment_id for segment in segments],
+        single=single,
     )
 
 
-def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> CollisionKinds:
+def _there(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> Bool[Tensor, "B K N T+1"]:
+    """Which driven agents are there at each state; where the log is played back, those that it has."""
+    if log_valid is not None:
+        return log_valid.transpose(1, 2)[:, None]
+    first = scenes.interactive_valid & (scenes.enter == 0)
+    later = rollouts.counted.transpose(2, 3)
+    return torch.cat([first[:, None, :, None].expand(*later.shape[:-1], 1), later], -1)
+
+
+def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T+1"]) -> CollisionKinds:
     """Who ran into whom, in the first collision of each agent."""
     steps = rollouts.state.shape[-3]
-    if log_valid is None:
-        exists = scenes.interactive_valid[:, None, :, None].expand(-1, rollouts.state.shape[1], -1, steps)
-    else:
-        exists = log_valid.transpose(1, 2)[:, None]
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None]
     return collision_kinds(
         (rollouts.collision & rollouts.counted).transpose(2, 3),

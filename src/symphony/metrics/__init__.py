@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from symphony.metrics.agents import AgentResult, AgentSteps
 from symphony.metrics.curvature import curvature_histogram, jensen_shannon
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
@@ -9,6 +10,8 @@ from symphony.metrics.realism import collisions, displacement, offroad
 from symphony.metrics.summary import RolloutMetrics, SegmentResult
 
 __all__ = [
+    "AgentResult",
+    "AgentSteps",
     "CollisionKind",
     "CollisionKinds",
     "OrderStatistics",

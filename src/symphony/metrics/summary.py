@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.metrics.agents import AgentResult, AgentSteps, agent_rates, agent_results, speed_distance
 from symphony.metrics.curvature import BINS, curvature_histogram, jensen_shannon
 from symphony.metrics.kinds import CollisionKind, CollisionKinds
 
@@ -39,6 +40,7 @@ class SegmentResult:
             agents; None where kinds are.
         simulated: egos, and other interactive agents, in all rollouts.
         group: the recording the segment is part of; None where not given.
+        single: what became of single agents while their log exists; None where not asked for.
     """
 
     collided: int
@@ -53,6 +55,7 @@ class SegmentResult:
     agents: NDArray[np.int64] | None = None
     simulated: tuple[int, int] = (0, 0)
     group: str | None = None
+    single: AgentResult | None = None
 
 
 class RolloutMetrics:
@@ -77,6 +80,7 @@ class RolloutMetrics:
         curvature_log: Sequence[NDArray[Any]],
         kinds: CollisionKinds | None = None,
         groups: Sequence[str] | None = None,
+        single: AgentSteps | None = None,
     ) -> None:
         """Add the rollouts of some segments.
 
@@ -92,6 +96,7 @@ class RolloutMetrics:
             kinds: [B, K, N] of the collisions of simulated agents, the ego first, for all segments or for none.
             groups: [B] the recording each segment is part of (see ``RunSegment.group``), for all segments or for
                 none. Segments of one recording are no independent samples: standard errors are then over groups.
+            single: what single agents did, for all segments or for none.
 
         Raises:
             ValueError: for a segment that was added before, shapes that do not fit together, a displacement or
@@ -113,6 +118,7 @@ class RolloutMetrics:
         there = simulated.any(-1).sum(1)
         if groups is not None and len(groups) != len(segment_ids):
             raise ValueError(f"{len(groups)} groups for {len(segment_ids)} segments")
+        singles = None if single is None else agent_results(single)
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
         # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
@@ -133,6 +139,7 @@ class RolloutMetrics:
                 agents=None if by_agent is None else by_agent[b],
                 simulated=(int(there[b, 0]), int(there[b, 1:].sum())),
                 group=None if groups is None else groups[b],
+                single=None if singles is None else singles[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -186,6 +193,11 @@ class RolloutMetrics:
             ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
             themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
             ``others_collision_rate``, and by kind, ``ego_collision_into_leader`` and so on.
+            Where steps of single agents were given, of those at which an agent is driven and logged: the percent of
+            agents that collide, ``agent_collision_rate``, by kind and ``agent_collision_with_playback``;
+            ``agent_offroad_time``; metres driven in percent of the log's, ``agent_progress``; mean speed,
+            ``agent_speed``, and the percent of time that agents stand, ``agent_standing``, both also as ``*_log``;
+            and how far the speeds are from the log's, ``agent_speed_distance`` (Wasserstein, m/s).
             Where groups were given, ``groups`` is how many, and all standard errors are over them (as if each were
             one segment: cluster-robust, and a jackknife that leaves out a group).
 
@@ -199,6 +211,9 @@ class RolloutMetrics:
         def column(values: Sequence[float]) -> NDArray[np.float64]:
             return np.array(values, dtype=np.float64)
 
+        single = [s.single for s in found if s.single is not None]
+        if 0 < len(single) < len(found):
+            raise ValueError(f"steps of agents were given for {len(single)} of {len(found)} segments")
         logged = column([s.logged for s in found])
         parts = {
             "collision_rate": (
@@ -210,6 +225,7 @@ class RolloutMetrics:
             "min_sade": (column([s.error.min() for s in found]), logged),
             **_kind_rates(found),
             **_agent_rates(found),
+            **(agent_rates(single) if single else {}),
         }
         member = _groups(found)
         out: dict[str, Any] = {}
@@ -219,6 +235,8 @@ class RolloutMetrics:
             _summed(np.stack([s.histogram for s in found]), member),
             _summed(np.stack([s.histogram_log for s in found]), member),
         )
+        if single:
+            out["agent_speed_distance"] = speed_distance(single)
         out["segments"] = len(found)
         if member is not None:
             out["groups"] = int(member.max()) + 1

@@ -24,6 +24,8 @@ from symphony.simulation.rollouts import Rollouts
 
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
+BACKGROUND = "background:"
+"""What the names of drivers begin with whose agents nobody judges."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class SavedRollouts:
         segment: the log, its map and its lights.
         agents: [N] rows of the log that were driven; all others play back the log.
         state: [K, T + 1, N, 4] x, y, heading, speed, the first state included.
-        counted: [K, T, N] steps that are judged.
+        counted: [K, T, N] steps at which an agent is there, up to the end of a rollout that failed.
         collision: [K, T, N].
         offroad: [K, T, N].
         goal: [K, N] line of ``routes`` that an agent followed, -1 for none.
@@ -92,6 +94,12 @@ class SavedRollouts:
     drivers: tuple[str, ...] = ()
     failed: Mapping[int, str] = field(default_factory=dict)
     trees: SavedTrees | None = None
+
+    @property
+    def judged(self) -> NDArray[np.int64]:
+        """Places among the N driven agents of those that are no background."""
+        named = self.drivers or ("",) * len(self.agents)
+        return np.flatnonzero([not name.startswith(BACKGROUND) for name in named])
 
     @property
     def rollouts(self) -> int:

@@ -14,12 +14,13 @@ import torch
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
 from symphony.errors import DataError
+from symphony.simulation.control import given_goals
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.planned import EgoPlanners
 from symphony.simulation.planner import planner_maker
-from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
+from symphony.simulation.saved import BACKGROUND, PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
 from symphony.simulation.workers import batches, naming, shared
 
@@ -35,6 +36,7 @@ def save_simulation(
     *,
     keep_tree: bool = True,
     planner: str = "",
+    goals: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset and keep the rollouts, segment by segment.
@@ -49,11 +51,12 @@ def save_simulation(
         keep_tree: of a search keep all branches with their scores, too.
         planner: of the ego, ``idm``, ``log`` or an import path; then the dataset holds routes and the agent drives
             the other interactive agents. Segments whose ego can't be driven are put on record as failed.
+        goals: of agents, as :func:`symphony.simulation.control.given_goals` reads them; then the dataset has routes.
         progress: called with the segments done and their total.
 
     Raises:
         DataError: the folder holds something else, or the disk refuses.
-        ConfigError: the agent can't be simulated so.
+        ConfigError: the agent can't be simulated so, or a goal can't be reached.
         NotFiniteError: a network of the agent puts out a number that is not finite.
     """
     if planner:
@@ -61,7 +64,8 @@ def save_simulation(
     about = About.of(
         agent.name,
         dataset.store,
-        plain_settings(config, dataset.interactive, dataset.duration),
+        plain_settings(config, dataset.interactive, dataset.duration)
+        | ({"goal": list(goals)} if goals else {}),
         seed=config.seed,
     )
     writer = RolloutWriter(path, about.with_ego(planner) if planner else about)
@@ -70,7 +74,7 @@ def save_simulation(
     if planner:
         todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
-    drive = _Drive(agent, dataset, config, keep_tree, planner)
+    drive = _Drive(agent, dataset, config, keep_tree, planner, tuple(goals))
     with closing(shared(drive, batches(todo, config), config)) as results:
         for saved in results:
             for one in saved:
@@ -90,6 +94,7 @@ class _Drive:
     config: EvaluateConfig
     keep_tree: bool
     planner: str
+    goals: tuple[str, ...]
 
     def __call__(self, items: list[int]) -> list[SavedRollouts]:
         """What they did in each."""
@@ -99,8 +104,13 @@ class _Drive:
             egos = None
             if self.planner:
                 egos = EgoPlanners(self.planner, planner_maker(self.planner), segments)
+            given = (
+                given_goals(self.goals, segments, scenes, planned=bool(self.planner)) if self.goals else None
+            )
             try:
-                found = driven_by(self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos)
+                found = driven_by(
+                    self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos, given=given
+                )
             except NotFiniteError as error:
                 raise error.named(segments[error.row].segment_id) from error
             rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
@@ -112,15 +122,16 @@ class _Drive:
                     b,
                     goal=found.goal,
                     search=found.search if self.keep_tree else None,
-                    driver=self._drivers(),
+                    driver=self._drivers(on_cpu.background[b].tolist()),
                     failed=found.failed[b] if found.failed else None,
                 )
                 for b, segment in enumerate(segments)
             ]
 
-    def _drivers(self) -> str | list[str]:
+    def _drivers(self, background: Sequence[bool]) -> list[str]:
         name = PLAYBACK if self.agent.policy is None else self.agent.name
-        return [self.planner, *[name] * (self.dataset.interactive - 1)] if self.planner else name
+        names = [BACKGROUND + self.config.others if one else name for one in background]
+        return [self.planner, *names[1:]] if self.planner else names
 
 
 def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:
