@@ -346,6 +346,22 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:
         given_goals([f"{name[0]}=lane:108"], [segment], scenes, planned=True)
 
 
+def test_a_cold_draw_is_the_likeliest_action() -> None:
+    scenes = scene(straight_road(4), 3, LaneGraph(straight_road(4).road))
+
+    def rollouts(temperature: float) -> Tensor:
+        config = EvaluateConfig(rollouts=3, search="none", action_temperature=temperature, logged_goals=True)
+        return simulation(tiny(), scenes, config).rollouts.state
+
+    plain = simulation(tiny(), scenes, EvaluateConfig(rollouts=3, search="none", logged_goals=True))
+    assert torch.equal(rollouts(1.0 + 1e-9), plain.rollouts.state)
+    cold, warm = rollouts(1e-4), rollouts(3.0)
+    assert (cold == cold[:, :1]).all()
+    assert not (warm == warm[:, :1]).all()
+    with pytest.raises(ConfigError, match="no discrete actions"):
+        simulation(load_agent("constant_velocity"), scenes, EvaluateConfig(action_temperature=0.5))
+
+
 def test_padded_scenes_have_an_edge_of_their_own() -> None:
     small, large = crowded(row(cars(0))), crowded(crossing(4))
     both = collate([small, large])

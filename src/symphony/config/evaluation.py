@@ -51,6 +51,8 @@ class EvaluateConfig:
     `retry-above` (each time costs as much as the whole search)."""
     retry_above: float = 0.0
     """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
+    action_temperature: float = 1.0
+    """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
@@ -86,7 +88,7 @@ class EvaluateConfig:
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         one_of(self, "engine", get_args(Engine))
-        positive(self, "rollouts", "batch", "trees", "workers")
+        positive(self, "rollouts", "batch", "trees", "workers", "action_temperature")
         if self.engine == "ray" and self.device != "cpu":
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:

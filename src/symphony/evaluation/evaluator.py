@@ -161,7 +161,7 @@ def evaluate_dataset(
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.
-    once = dataclasses.replace(config, rollouts=1, trees=1, search="none")
+    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0)
     acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     hows = [config] + [once] * (len(everyone) - 1)
     found = [

@@ -1,4 +1,4 @@
-"""Goals that a user gives to single agents."""
+"""What a user changes in the agents: goals of single ones, and how bold their draws are."""
 
 from __future__ import annotations
 
@@ -9,14 +9,38 @@ import shapely
 import torch
 from jaxtyping import Int
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from symphony import keys
 from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
+from symphony.modules import inverse_cdf
 
 REACH = 3.0
 """Metres from a route, on average, within which it goes to the end of a lane or past a point."""
+
+
+class Tempered(TensorDictModuleBase):
+    """Draws actions anew from a policy's logits divided by a temperature, by the same numbers.
+
+    Args:
+        temperature: 1 for the policy's own draw.
+    """
+
+    in_keys = [keys.LOGITS, keys.NOISE]  # noqa: RUF012 - the type TensorDictModuleBase declares
+    out_keys = [keys.ACTION]  # noqa: RUF012
+
+    def __init__(self, temperature: float) -> None:
+        super().__init__()
+        self.temperature = temperature
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write actions [..., N]."""
+        logits = tensordict.get(keys.LOGITS) / self.temperature
+        return tensordict.set(keys.ACTION, inverse_cdf(logits, tensordict.get(keys.NOISE)))
 
 
 def given_goals(

@@ -23,6 +23,7 @@ from symphony.errors import ConfigError
 from symphony.metrics import collisions, offroad
 from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
+from symphony.simulation.control import Tempered
 from symphony.simulation.demonstrations import logged
 from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
@@ -98,6 +99,12 @@ def simulation(
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy")
+    if config.action_temperature != 1.0:
+        if keys.LOGITS not in policy.out_keys or not agent.dynamics.discrete:
+            raise ConfigError(
+                f"{agent.name} draws no discrete actions, so action-temperature means nothing to it"
+            )
+        actor = TensorDictSequential(actor, Tempered(config.action_temperature))
     if config.others in RULES:
         actor = TensorDictSequential(actor, RULES[config.others](env))
     start = start_states(

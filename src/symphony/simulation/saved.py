@@ -96,6 +96,16 @@ class SavedRollouts:
     trees: SavedTrees | None = None
 
     @property
+    def there(self) -> NDArray[np.bool_]:
+        """[K, T + 1, N] which agents are there at each state.
+
+        At the first one where the second counts and the log has them, too: who enters with the first step was not
+        there before.
+        """
+        first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
+        return np.concatenate([first, self.counted], 1)
+
+    @property
     def judged(self) -> NDArray[np.int64]:
         """Places among the N driven agents of those that are no background."""
         named = self.drivers or ("",) * len(self.agents)
