@@ -1,6 +1,6 @@
 """Write the tables of the pages from the records in `results/`, between their markers.
 
-    python scripts/results_page.py            # rewrites README.md, docs/results.md and docs/appendix.md
+    python scripts/results_page.py            # rewrites README.md and the pages of docs/ with tables
     python scripts/results_page.py --check    # says what differs, and fails if anything does
 
 A block is `<!-- table NAME -->`, the table, `<!-- end table -->`. What a name stands for is in TABLES below.
@@ -22,7 +22,7 @@ from symphony.evaluation.paper import paper_figures
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
-PAGES = ("README.md", "docs/results.md", "docs/appendix.md")
+PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/rollouts.md")
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 
 Record = dict[str, Any]
@@ -238,6 +238,44 @@ def searched(data: str) -> Grid:
     return grid
 
 
+CROWDS = (
+    ("2", "2"),
+    ("8", "8"),
+    ("16", "16"),
+    ("32", "32"),
+    ("all", "all"),
+    ("2, others at constant velocity", "2-constant_velocity"),
+    ("2, others IDM", "2-idm"),
+    ("2, others the agent", "2-learned"),
+)
+"""How many agents are driven, and the part of a record's name that says so."""
+AGENTS = {
+    "agent_collision_rate": ("collide %", 1),
+    "agent_collision_into_leader": ("into a leader", 1),
+    "agent_collision_rear_ended": ("rear-ended", 1),
+    "agent_collision_crossing": ("crossing", 1),
+    "agent_collision_with_playback": ("with playback", 1),
+    "agent_offroad_time": ("off-road %", 2),
+    "agent_progress": ("way of the log %", 0),
+    "agent_standing": ("standing %", 0),
+    "agent_speed_distance": ("speeds off by m/s", 2),
+}
+"""Figures of single agents: their headings, and the digits after their points."""
+
+
+def crowd(data: str) -> Grid:
+    """What becomes of single agents, the more of the traffic is theirs."""
+    grid = [["driven", "search", *(heading for heading, _ in AGENTS.values()), "CPU s"]]
+    for label, name in CROWDS:
+        for search, word in (("none", "no"), ("tree", "yes")):
+            (record,) = records(f"crowd/{data}-{name}-{search}")
+            cells = [f"{record[key]:.{digits}f}" for key, (_, digits) in AGENTS.items()]
+            error = record["agent_collision_rate_se"]
+            cells[0] += f" ± {error:.1f}"
+            grid.append([label, word, *cells, f"{record['cost']['simulation'] / record['segments']:.2f}"])
+    return grid
+
+
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
@@ -254,6 +292,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "sweep": sweep,
     "search-town": lambda: searched("town"),
     "search-ngsim": lambda: searched("ngsim"),
+    "crowd-town": lambda: crowd("town"),
+    "crowd-ngsim": lambda: crowd("ngsim"),
 }
 
 

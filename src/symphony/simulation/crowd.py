@@ -23,6 +23,7 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import beyond, map_edge
 from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, scene
+from symphony.errors import DataError
 from symphony.roadgraph import LaneGraph, lane_of
 from symphony.simulation.demonstrations import KEEP, SceneDataset
 from symphony.simulation.experts import IN_LANE
@@ -73,7 +74,7 @@ class Crowd:
         then by their distance.
 
         Raises:
-            DataError: the ego is not seen at the first step.
+            DataError: the ego is not seen at the first step, or in open traffic never within the map.
         """
         there = segment.valid
         if self.open_traffic:
@@ -83,6 +84,8 @@ class Crowd:
         first = there.argmax(1)
         away = _distance_at(segment, first)
         early = interactive_choice(segment, segment.num_agents, fewer=True).agents
+        if not there[segment.ego].any():
+            raise DataError("the ego is never within the map", segment=segment.segment_id, field="ego")
         early = early[there[early].any(1)]
         order = [*early[:PAIR], *early[PAIR:][self._near(segment, early[PAIR:])]]
         rest = np.setdiff1d(np.flatnonzero(moves | stands), early)
