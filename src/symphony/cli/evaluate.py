@@ -60,7 +60,9 @@ class Evaluate:
         if self.save_rollouts is not None:
             settings = plain_settings(self.config, agent.interactive, agent.duration)
             about = About.of(agent.name, store, settings, seed=self.config.seed)
-            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name))
+            keepers.append(
+                RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, self.config.others)
+            )
 
         def observe(batch: EvaluatedBatch) -> None:
             for keeper in keepers:

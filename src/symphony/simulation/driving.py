@@ -98,15 +98,7 @@ def simulation(
     trees, branches, taken = _plan(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
-    actor = watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy")
-    if config.action_temperature != 1.0:
-        if keys.LOGITS not in policy.out_keys or not agent.dynamics.discrete:
-            raise ConfigError(
-                f"{agent.name} draws no discrete actions, so action-temperature means nothing to it"
-            )
-        actor = TensorDictSequential(actor, Tempered(config.action_temperature))
-    if config.others in RULES:
-        actor = TensorDictSequential(actor, RULES[config.others](env))
+    actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
     start = start_states(
         env,
         goals,
@@ -165,6 +157,24 @@ def simulation(
     if planned is None or number is None:
         return Simulation(rollouts, goal, result)
     return _without_failed(Simulation(rollouts, goal, result), planned, number[:, :, :taken].flatten(1, 2))
+
+
+def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
+    """A policy with what a configuration changes in its draws, and with the rule that drives background agents.
+
+    Raises:
+        ConfigError: a temperature for a policy without discrete actions.
+    """
+    found = policy
+    if config.action_temperature != 1.0:
+        if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
+            raise ConfigError(
+                "this agent draws no discrete actions, so action-temperature means nothing to it"
+            )
+        found = TensorDictSequential(found, Tempered(config.action_temperature))
+    if config.others in RULES:
+        found = TensorDictSequential(found, RULES[config.others](env))
+    return found
 
 
 def _with_fixed_goals(

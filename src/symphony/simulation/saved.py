@@ -141,6 +141,7 @@ def saved_rollouts(
     goal: Tensor | None = None,
     search: BeamSearchResult | None = None,
     driver: str | Sequence[str] = "",
+    others: str = "",
     failed: Mapping[int, str] | None = None,
 ) -> SavedRollouts:
     """Rollouts of one run segment, ready to be written.
@@ -153,6 +154,7 @@ def saved_rollouts(
         goal: [B, K, N] number of the route that each agent followed among its feasible ones, -1 for none.
         search: of which the rollouts are the leaves, with leading dimensions [B, R] and its tree kept.
         driver: of all interactive agents, or of each [N].
+        others: what drives background agents.
         failed: see :class:`SavedRollouts`.
 
     Raises:
@@ -165,6 +167,8 @@ def saved_rollouts(
         for part in (rollouts.counted, rollouts.collision, rollouts.offroad)
     )
     names = [driver] * len(real) if isinstance(driver, str) else list(driver)
+    background = scenes.background[row].tolist()
+    names = [BACKGROUND + others if rule else name for name, rule in zip(names, background, strict=True)]
     number, routes = _routes(scenes, row, goal, len(counted))
     return SavedRollouts(
         segment=segment,

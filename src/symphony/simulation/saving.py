@@ -20,7 +20,7 @@ from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.planned import EgoPlanners
 from symphony.simulation.planner import planner_maker
-from symphony.simulation.saved import BACKGROUND, PLAYBACK, SavedRollouts, saved_rollouts
+from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
 from symphony.simulation.workers import batches, naming, shared
 
@@ -122,16 +122,16 @@ class _Drive:
                     b,
                     goal=found.goal,
                     search=found.search if self.keep_tree else None,
-                    driver=self._drivers(on_cpu.background[b].tolist()),
+                    driver=self._drivers(on_cpu.interactive.shape[1]),
+                    others=self.config.others,
                     failed=found.failed[b] if found.failed else None,
                 )
                 for b, segment in enumerate(segments)
             ]
 
-    def _drivers(self, background: Sequence[bool]) -> list[str]:
+    def _drivers(self, agents: int) -> str | list[str]:
         name = PLAYBACK if self.agent.policy is None else self.agent.name
-        names = [BACKGROUND + self.config.others if one else name for one in background]
-        return [self.planner, *names[1:]] if self.planner else names
+        return [self.planner, *[name] * (agents - 1)] if self.planner else name
 
 
 def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:
