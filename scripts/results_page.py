@@ -238,21 +238,13 @@ def searched(data: str) -> Grid:
     return grid
 
 
-CROWDS = (
-    ("2", "2"),
-    ("8", "8"),
-    ("16", "16"),
-    ("32", "32"),
-    ("all", "all"),
-    ("2, others at constant velocity", "2-constant_velocity"),
-    ("2, others IDM", "2-idm"),
-    ("2, others the agent", "2-learned"),
-)
-"""How many agents are driven, and the part of a record's name that says so."""
+CROWD = ("2", "8", "16", "32", "all")
+"""How many agents are driven."""
 AGENTS = {
     "agent_collision_rate": ("collide %", 1),
     "agent_collision_into_leader": ("into a leader", 1),
     "agent_collision_rear_ended": ("rear-ended", 1),
+    "agent_collision_sideswipe": ("sideswipe", 1),
     "agent_collision_crossing": ("crossing", 1),
     "agent_collision_with_playback": ("with playback", 1),
     "agent_offroad_time": ("off-road %", 2),
@@ -266,13 +258,13 @@ AGENTS = {
 def crowd(data: str) -> Grid:
     """What becomes of single agents, the more of the traffic is theirs."""
     grid = [["driven", "search", *(heading for heading, _ in AGENTS.values()), "CPU s"]]
-    for label, name in CROWDS:
+    for number in CROWD:
         for search, word in (("none", "no"), ("tree", "yes")):
-            (record,) = records(f"crowd/{data}-{name}-{search}")
+            (record,) = records(f"crowd/{data}-{number}-{search}")
             cells = [f"{record[key]:.{digits}f}" for key, (_, digits) in AGENTS.items()]
             error = record["agent_collision_rate_se"]
             cells[0] += f" ± {error:.1f}"
-            grid.append([label, word, *cells, f"{record['cost']['simulation'] / record['segments']:.2f}"])
+            grid.append([number, word, *cells, f"{record['cost']['simulation'] / record['segments']:.2f}"])
     return grid
 
 
