@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from symphony.evaluation.comparison import Entry
 from symphony.evaluation.paper import paper_figures
+from symphony.evaluation.relations import grid, relations
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
@@ -99,13 +101,6 @@ NGSIM = (
     ("BC+TS+H, freeways among the simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
 )
 NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
-RELATIONS = (
-    ("BC to BC+TS", "bc", "bc_ts"),
-    ("BC to BC+TS+H", "bc", "bc_ts_h"),
-    ("MGAIL to MGAIL+TS", "mgail", "mgail_ts"),
-    ("MGAIL+H to MGAIL+TS+H", "mgail_h", "mgail_ts_h"),
-    ("MGAIL to MGAIL+TS+H", "mgail", "mgail_ts_h"),
-)
 
 
 def records(pattern: str) -> list[Record]:
@@ -160,22 +155,24 @@ def setting(folder: str) -> Grid:
     return means(rows)
 
 
-def relations() -> Grid:
-    """How many times fewer collisions: the paper's two data sets, and ours by halving and by resampling."""
-    grid = [["", "paper, WOMD", "paper, own data", "here, halved", "here, resampled", "difference, points"]]
-    for label, before, after in RELATIONS:
-        cells = []
-        for dataset in ("womd", "proprietary"):
-            figures = paper_figures("main", dataset) or {}
-            cells.append(figures[before]["collision_rate"][0] / figures[after]["collision_rate"][0])
-        folder = before.split("_")[0]
-        first = records(f"{folder}/{before}-*-none")
-        for kind in ("tree", "often"):
-            second = records(f"{folder}/{after}-*-{kind}")
-            rates = [np.mean([row["collision_rate"] for row in rows]) for rows in (first, second)]
-            cells.append(rates[0] / rates[1])
-        grid.append([label, *(f"{cell:.1f}" for cell in cells), paired(first, second, "collision_rate", 1)])
-    return grid
+def held() -> Grid:
+    """The paper's relations as `symphony table --relations` has them, those that the records can tell."""
+    entries = []
+    for _, pattern in (*BC, *MGAIL):
+        entries += [_entry(record, pattern) for record in records(pattern)]
+    return grid([relation for relation in relations(entries) if relation.held is not None])
+
+
+def _entry(record: Record, pattern: str) -> Entry:
+    """A record as the comparison reads it; older ones keep a list per metric instead of a row per run segment."""
+    facts = record.get("run") or record
+    rows = record["per_segment"]
+    if isinstance(rows, dict):
+        columns = {name: json.loads(values) for name, values in rows.items()}
+        each = zip(*columns.values(), strict=True)
+        rows = [{"segment": f"{k:04d}"} | dict(zip(columns, row, strict=True)) for k, row in enumerate(each)]
+    config = {"method": facts["method"], "seed": facts["seed"]}
+    return Entry(RECORDS, config, pattern, {"curvature": {}} | record | {"per_segment": rows})
 
 
 def against_paper() -> Grid:
@@ -273,7 +270,7 @@ THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
     "short": lambda: means(BC),
     "methods": lambda: means((*BC, *MGAIL)),
-    "relations": relations,
+    "relations": held,
     "features": lambda: means(FEATURES),
     "ngsim": lambda: beside(NGSIM, PLACES, THREE),
     "halving": lambda: means(HALVING),

@@ -216,3 +216,22 @@ def test_bad_parameters_are_errors():
         Aggregate("median")
     with pytest.raises(ConfigError, match="agents is one of"):
         Aggregate("max", "last")
+
+
+@given(st.integers(1, 12), st.integers(0, 2**31), NOISE)
+def test_replace_bad_takes_a_goal_from_nobody_who_drives_well_with_it(branches, seed, noise):
+    """Goals are lost only with the last good branch that has them: what is judged is the driving, not the goal."""
+    torch.manual_seed(seed)
+    totals, groups = torch.randn(20, branches), torch.randint(4, (20, branches))
+    parents = ReplaceBad(0.0)(totals, torch.full((20,), noise), groups)
+    after, good = groups.gather(1, parents), totals <= 0
+    for row in range(20):
+        alive = set(groups[row][good[row]].tolist())
+        for group in range(4):
+            before, now = ((each[row] == group).sum() for each in (groups, after))
+            if alive == set(groups[row].tolist()) or not alive:
+                assert now == before
+            elif group in alive:
+                assert now >= before
+            else:
+                assert now == 0

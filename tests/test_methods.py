@@ -304,6 +304,24 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
     assert (rank == rank[..., :1]).all()
 
 
+def test_leaves_are_ranked_by_their_whole_history_and_the_best_alone_are_drawn(
+    store: Path, tmp_path: Path
+) -> None:
+    wide = SearchConfig(branches=4, segments=3, prune_every=2, updates=2, states=8, rule="replace")
+    _, replay = searched(store, tmp_path, search=wide)
+    score, rank = replay.leaves["collector", "beam_score"], replay.leaves["collector", "beam_rank"][..., 0]
+    worst = score.amax(-2).sum(-1)
+    by_rank = worst.gather(-1, rank.argsort(-1))
+    assert (by_rank[:, 1:] >= by_rank[:, :-1]).all()
+    last = replay.leaves["collector", "beam_total"][..., -1]
+    assert (last.argsort(stable=True) != worst.argsort(stable=True)).any(), "trial tells nothing"
+    rng, seen = torch.Generator().manual_seed(0), ROUTED
+    assert set(replay.survivors(64, rng, seen)[keys.RANK].flatten().tolist()) == {0, 1, 2, 3}
+    best = replay.survivors(64, rng, seen, "best")
+    assert len(best) == 64, "all that is drawn counts"
+    assert (best[keys.RANK] == 0).all()
+
+
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 def test_expert_batches_show_what_the_environment_shows_with_logged_goals(store: Path, dynamics: Any) -> None:
     dataset = SceneDataset(SegmentStore(store), 2, dynamics, routes=True)

@@ -67,12 +67,17 @@ POINTS: Key = ("agents", "observation", "points")
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
 ROUTE: Key = ("agents", "observation", "route")
 """[..., N, Fr] float: the agent's route as it sees it."""
-SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE)
-"""What an agent observes and could react to."""
 GAP: Key = ("agents", "observation", "gap")
 """[..., N, O] float: signed gap to the box of each object, metres."""
 GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")
 """[..., N, O, H] float: the same at some times ahead, were everyone to keep speed and course."""
+ALONG: Key = ("agents", "observation", "along")
+"""[..., N, O, Fa] float: where each object is along the agent's route, in bounded numbers."""
+LIGHTS: Key = ("agents", "observation", "lights")
+"""[..., N, L, Fp] float: the nearest lights, as points."""
+LIGHTS_MASK: Key = ("agents", "observation", "lights_mask")
+SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE, GAP, GAP_AHEAD, ALONG, LIGHTS)
+"""What an agent observes and could react to."""
 ROAD: Key = ("agents", "observation", "road")
 """[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
 

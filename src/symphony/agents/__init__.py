@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from symphony.agents.agent import Agent, build_agent, load_agent
 from symphony.agents.networks import (
+    bicycle,
     discriminator_network,
     dynamics_of,
     goal_network,
@@ -13,6 +14,7 @@ from symphony.agents.networks import (
 
 __all__ = [
     "Agent",
+    "bicycle",
     "build_agent",
     "discriminator_network",
     "dynamics_of",

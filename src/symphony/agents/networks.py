@@ -7,10 +7,10 @@ from typing import Any
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
 from symphony import keys
-from symphony.config import AgentSpec
+from symphony.config import AgentConfig, AgentSpec
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
-from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
+from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES
 from symphony.imports import build_object, load_object
 from symphony.modules import (
     FORESIGHT,
@@ -22,17 +22,15 @@ from symphony.modules import (
     goal_policy,
 )
 
-GROUPS = (
-    ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
-    ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
-)
-"""What every network sees around an agent."""
-DYNAMICS: dict[str, Bicycle | Displacement] = {"bicycle": Bicycle(), "displacement": Displacement()}
-
 
 def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
     """The action space: MGAIL needs one that its gradient can pass (paper, section V-A)."""
-    return DYNAMICS[spec.action_space]
+    return Displacement() if spec.action_space == "displacement" else bicycle(spec.agent)
+
+
+def bicycle(config: AgentConfig) -> Bicycle:
+    """The discrete actions of an agent."""
+    return Bicycle(num_acceleration=config.accelerations)
 
 
 def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> ObservationConfig:
@@ -43,13 +41,34 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         discriminator: whether the discriminator looks too; clearances are costly, and only it reads them.
     """
     features = spec.discriminator.features if discriminator and spec.discriminator is not None else "paper"
+    gaps = spec.agent.features != "paper"
     return ObservationConfig(
         num_objects=spec.agent.num_objects,
         num_points=spec.agent.num_points,
+        num_lights=spec.agent.num_lights,
         route=spec.goals,
+        along=gaps and spec.goals,
+        gaps=gaps,
         clearance=features != "paper",
-        foresight=FORESIGHT if features == "foresight" else (),
+        foresight=FORESIGHT if gaps or features == "foresight" else (),
     )
+
+
+def _groups(spec: AgentSpec, *, route: bool) -> tuple[ElementGroup, ...]:
+    """What a network sees around an agent, that follows a route or not."""
+    along, gaps = 0, 0
+    if spec.agent.features != "paper":
+        along, gaps = ALONG_FEATURES * (route and spec.goals), 3 * (1 + len(FORESIGHT))
+    objects = ElementGroup(
+        keys.OBJECTS,
+        keys.OBJECTS_MASK,
+        OBJECT_FEATURES + along + gaps,
+        more_keys=(keys.ALONG,) if along else (),
+        gap_keys=(keys.GAP, keys.GAP_AHEAD) if gaps else (),
+    )
+    points = ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES)
+    lights = ElementGroup(keys.LIGHTS, keys.LIGHTS_MASK, POINT_FEATURES)
+    return (objects, points, lights) if spec.agent.num_lights else (objects, points)
 
 
 def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
@@ -64,17 +83,21 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
         "own_keys": _own_keys(spec),
         "encoder": _encoder(spec),
     }
-    dynamics = dynamics_of(spec)
+    dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
-        return discrete_policy(_own_features(spec), GROUPS, actions=dynamics.num_actions, **sizes)
+        return discrete_policy(_own_features(spec), groups, actions=dynamics.num_actions, **sizes)
     scale = observation_of(spec).size_scale
-    return displacement_policy(_own_features(spec), GROUPS, dt=spec.dt, size_scale=scale, **sizes)
+    return displacement_policy(_own_features(spec), groups, dt=spec.dt, size_scale=scale, **sizes)
 
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Routes from first states, by an encoder of its own (paper, section III-B)."""
     return goal_policy(
-        SELF_FEATURES, GROUPS, CHOICE_FEATURES, hidden=spec.agent.hidden, encoder=_encoder(spec)
+        SELF_FEATURES,
+        _groups(spec, route=False),
+        CHOICE_FEATURES,
+        hidden=spec.agent.hidden,
+        encoder=_encoder(spec),
     )
 
 

@@ -135,6 +135,38 @@ class Convert:
         _print_report(report, self.out)
 
 
+@app.command(name="merge")
+@dataclass(frozen=True)
+class Merge:
+    """Copy the run segments of several stores into a new one, to learn from all of them."""
+
+    stores: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="DIR ...", help_behavior_hint="(required)"),
+    ]
+    """Folders of the stores; they must have the same time step and no segment in common."""
+    out: Path
+    """Folder of the new store."""
+
+    def __post_init__(self) -> None:
+        if not self.stores:
+            raise ConfigError("no stores given")
+
+    def run(self) -> None:
+        """Copy, showing how far it is, and print what there is."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+        from symphony.data.convert import info
+        from symphony.data.merge import merge
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task("Copying", total=None)
+            merge(self.stores, self.out, lambda done, total: bar.update(task, completed=done, total=total))
+        _print_info(info(self.out))
+
+
 @app.command(name="info")
 @dataclass(frozen=True)
 class Info:

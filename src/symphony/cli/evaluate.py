@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ import tyro
 
 from symphony.cli.tables import print_metrics
 from symphony.config import EvaluateConfig
+from symphony.errors import ConfigError
 from symphony.files import write_json
 
 if TYPE_CHECKING:
@@ -38,6 +40,11 @@ class Evaluate:
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder to keep the very rollouts in that are evaluated (see `symphony view`, `report` and `export`)."""
+    calibrate: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Store of other run segments that sets the threshold of rule `replace`: a quantile of what the discriminator
+    says of their logs, over as many steps as lie between two prunings."""
+    quantile: float = 0.99
+    """That quantile: a branch that drives as the log does is replaced once in a hundred prunings."""
     keep: bool = True
     """Leave the folder of the run as it is."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -55,22 +62,19 @@ class Evaluate:
         if self.figure is not None:
             check_picture(self.figure)
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
+        config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
         keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
         if self.save_rollouts is not None:
-            settings = plain_settings(self.config, agent.interactive, agent.duration)
-            about = About.of(agent.name, store, settings, seed=self.config.seed)
-            keepers.append(
-                RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, self.config.others)
-            )
+            settings = plain_settings(config, agent.interactive, agent.duration)
+            about = About.of(agent.name, store, settings, seed=config.seed)
+            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
 
         def observe(batch: EvaluatedBatch) -> None:
             for keeper in keepers:
                 keeper(batch)
 
-        found = evaluate_with_bar(
-            agent, store, self.config, observe=observe if keepers else None, baselines=True
-        )
+        found = evaluate_with_bar(agent, store, config, observe=observe if keepers else None, baselines=True)
         print_evaluation(found, self.data)
         record = evaluation_record(agent, found, store)
         if self.keep:
@@ -79,6 +83,34 @@ class Evaluate:
             write_json(self.json, record)
         if self.figure is not None:
             draw_clips(clips.clips, self.figure)
+
+    def _calibrated(self, agent: Agent, folder: Path) -> EvaluateConfig:
+        """With the threshold that the logs of a store give."""
+        from symphony.data.store import SegmentStore
+        from symphony.simulation.calibration import calibrated_threshold
+        from symphony.simulation.demonstrations import SceneDataset
+
+        config, search = self.config, self.config.pruning(agent.search)
+        if search.rule != "replace":
+            raise ConfigError(
+                f"only rule 'replace' has a threshold to calibrate, the rule is '{search.rule}'"
+            )
+        if config.threshold is not None:
+            raise ConfigError("the threshold is either given or calibrated")
+        if config.interactive == "all" or config.open_traffic or config.others != "log":
+            raise ConfigError(
+                "a threshold is calibrated for a fixed number of agents: give it as --threshold"
+            )
+        data = SceneDataset(
+            SegmentStore(folder),
+            config.interactive or agent.interactive,
+            agent.dynamics,
+            routes=agent.goals is not None,
+            duration=config.duration or agent.duration,
+        )
+        threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch), 3)
+        sys.stderr.write(f"threshold {threshold:g}: quantile {self.quantile:g} of the logs in {folder}\n")
+        return replace(config, threshold=threshold)
 
 
 def print_evaluation(found: Evaluation, data: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from symphony.config import Method, PaperData, Setting, TableFormat
+from symphony.config import Method, PaperData, Setting, TableColumns, TableFormat
 from symphony.errors import ConfigError
 from symphony.files import write_file
 
@@ -32,10 +32,17 @@ class Table:
     evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Which evaluation of a run counts, where it keeps several (in its folder `evaluations`); * and ? stand for
     anything. Of several names, the first that fits one decides."""
+    each: bool = False
+    """A row for each way that a method was simulated in (of those that `evaluation` fits), with the cost of each."""
+    columns: tuple[TableColumns, ...] = ()
+    """More columns: `split`, collisions with playback agents and the rest; `standing`, agents that stand at the end;
+    `corrected`, the divergence without its bias; `goals`, what the search made of the drawn goals."""
     paper: PaperData | None = None
     """Show the paper's own figures on this data set beside ours."""
     paired: Annotated[Method | None, tyro.conf.arg(metavar="METHOD")] = None
     """Also print every method less this one, paired over run segments."""
+    relations: bool = False
+    """Print, instead of the table, which of the paper's relations between the methods hold, with paired errors."""
     format: TableFormat = "text"
     """How it is written."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -44,6 +51,12 @@ class Table:
     def __post_init__(self) -> None:
         if not self.runs:
             raise ConfigError("no runs given: --runs DIR ...")
+        if self.each and (self.relations or self.paired is not None):
+            raise ConfigError(
+                "relations and paired differences are of one evaluation of each run, not of each"
+            )
+        if self.relations and self.format == "latex":
+            raise ConfigError("relations are written as text, markdown or json")
 
     def run(self) -> None:
         """Collect, compare and write."""
@@ -52,18 +65,24 @@ class Table:
         from symphony.evaluation.comparison import collect, compare
         from symphony.evaluation.formats import FORMATS, print_text
         from symphony.evaluation.paired import differences
+        from symphony.evaluation.relations import RELATION_FORMATS, relations
 
-        entries, left_out = collect(self.runs, self.setting, self.evaluation)
+        entries, left_out = collect(self.runs, self.setting, self.evaluation, each=self.each)
         for reason, folders in left_out.items():
             more = f" and {len(folders) - NAMED} more" if len(folders) > NAMED else ""
             sys.stderr.write(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}\n")
-        comparison = compare(entries, self.setting, self.paper)
+        comparison = compare(entries, self.setting, self.paper, self.columns)
         if self.paired is not None:
             for difference in differences(entries, self.paired):
                 sys.stderr.write(f"{difference.text()}\n")
-        if self.out is not None:
-            write_file(self.out, FORMATS[self.format](comparison))
-        elif self.format == "text" and (console := Console()).is_terminal:
+        if self.relations:
+            text = RELATION_FORMATS[self.format](relations(entries, self.setting))
+        elif self.out is None and self.format == "text" and (console := Console()).is_terminal:
             print_text(comparison, console)
+            return
         else:
-            sys.stdout.write(FORMATS[self.format](comparison))
+            text = FORMATS[self.format](comparison)
+        if self.out is not None:
+            write_file(self.out, text)
+        else:
+            sys.stdout.write(text)

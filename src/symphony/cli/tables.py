@@ -58,6 +58,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
             console.print(
                 f"{escape(short_name(str(row['agent'])))}: collisions, % of rollouts: {parts}", style="dim"
             )
+        for line in _more(row):
+            console.print(f"{escape(short_name(str(row['agent'])))}: {line}", style="dim")
     for row in rows:
         if first["interactive"] not in (1, 2) and row.get("agent_collision_rate", math.nan) > 0:
             console.print(
@@ -70,6 +72,31 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
         f"± standard error over recordings; seed {first['seed']}",
         style="dim",
     )
+
+
+def _more(row: dict[str, Any]) -> list[str]:
+    """What else there is to say of an agent, in lines."""
+    lines: list[str] = []
+    if row.get("search") == "log":
+        return lines
+    if not math.isnan(row.get("curvature_jsd_floor", math.nan)):
+        lines.append(
+            f"JSD {row['curvature_jsd']:.4f}, corrected for sampling {row['curvature_jsd_corrected']:.4f} ± "
+            f"{row['curvature_jsd_se']:.4f}; another log of this size would score {row['curvature_jsd_floor']:.4f}"
+        )
+    if not math.isnan(row.get("standing", math.nan)):
+        lines.append(f"{row['standing']:.1f} % stand at the end, {row['standing_log']:.1f} % in the log")
+    if "goals_founders" in row:
+        turns = ("left", "straight", "right")
+        each = (
+            " / ".join(f"{row[f'goals_{kind}_{turn}']:.0f}" for turn in turns) for kind in ("drawn", "kept")
+        )
+        lines.append(
+            f"goals {' / '.join(turns)}, %: drawn {next(each)}, kept {next(each)}; moved by the search: turns "
+            f"{row['goals_turn_variation']:.2f}, goals {row['goals_variation']:.2f}; first branches left "
+            f"{row['goals_founders']:.1f}"
+        )
+    return lines
 
 
 def short_name(agent: str) -> str:

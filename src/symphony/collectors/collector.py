@@ -40,8 +40,8 @@ class BeamSearchCollector(Collector):
     - ``("collector", "mask")`` [..., T] bool: False after the end of an episode that did not last T steps;
       TorchRL's losses leave such steps out. With ``trajs_per_batch`` they are dropped.
     - with `keep_tree`, ``("collector", "beam_rank")`` [..., T] int64: place of the leaf among those of its tree by
-      the totals of their last periods, 0 for the best; and ``"tree"``, a TensorDict [*env.batch_size, S, T] of all
-      that was simulated, by slot, pruned branches included, with their ``("collector", "beam_score")``.
+      the aggregate of their whole histories, 0 for the best; and ``"tree"``, a TensorDict [*env.batch_size, S, T]
+      of all that was simulated, by slot, pruned branches included, with their ``("collector", "beam_score")``.
 
     Frames are counted as returned; `simulated_frames` counts what was simulated for them, about S / L times as
     many.
@@ -176,7 +176,8 @@ class BeamSearchCollector(Collector):
         leaves.set(("collector", "beam_total"), totals.transpose(-1, -2)[..., period])
         leaves.set(("collector", "beam_slot"), found.slots.transpose(-1, -2)[..., period])
         if found.tree is not None:
-            order = totals[..., -1, :].argsort(dim=-1, stable=True)
+            # The last period alone would say nothing of how a leaf came there.
+            order = self._aggregate(found.scores).argsort(dim=-1, stable=True)
             rank = order.argsort(dim=-1, stable=True)
             leaves.set(("collector", "beam_rank"), rank[..., None].expand(leaves.shape).clone())
             found.tree.set(("collector", "beam_score"), found.simulated_scores)

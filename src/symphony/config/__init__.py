@@ -7,13 +7,14 @@ of a training; what an agent is and how it is simulated travels with the agent.
 from __future__ import annotations
 
 from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
-from symphony.config.evaluation import EvaluateConfig, PaperData, Search, Setting, TableFormat
+from symphony.config.evaluation import EvaluateConfig, PaperData, Search, Setting, TableColumns, TableFormat
 from symphony.config.files import FORMAT, from_dict, read_json, to_json
 from symphony.config.profiles import PROFILES, Profile
 from symphony.config.training import (
     METHODS,
     Method,
     MGAILConfig,
+    PerturbConfig,
     PreviewConfig,
     RunConfig,
     TrainConfig,
@@ -32,12 +33,14 @@ __all__ = [
     "MGAILConfig",
     "Method",
     "PaperData",
+    "PerturbConfig",
     "PreviewConfig",
     "Profile",
     "RunConfig",
     "Search",
     "SearchConfig",
     "Setting",
+    "TableColumns",
     "TableFormat",
     "TrainConfig",
     "ValidationConfig",

@@ -28,6 +28,13 @@ class AgentConfig:
     """Nearest other agents it sees."""
     num_points: int = 200
     """Nearest map and light points it sees (the paper: 1 000)."""
+    num_lights: int = 0
+    """Nearest lights it sees beside the points, as a group of their own, however far they are (the paper: none)."""
+    features: Literal["paper", "gaps"] = "paper"
+    """`paper`: objects and points around; `gaps`: also how far it is from the boxes of objects, now and within the
+    next 2 s, were everyone to keep speed and course, and with goals where they are along its route."""
+    accelerations: int = 7
+    """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
     hidden: int = 64
     """Width of the element encoders."""
     head: int = 128
@@ -40,6 +47,10 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
+        not_negative(self, "num_lights")
+        one_of(self, "features", ["paper", "gaps"])
+        if self.accelerations < 3 or self.accelerations % 2 == 0:
+            raise ConfigError(f"accelerations must be odd and at least 3, is {self.accelerations}")
         one_of(self, "encoder", ["paper"], path=True)
         one_of(self, "policy", ["paper"], path=True)
 

@@ -21,6 +21,10 @@ Setting = Literal["main", "long", "many"]
 PaperData = Literal["proprietary", "womd"]
 """Data sets whose figures the paper gives."""
 TableFormat = Literal["text", "markdown", "latex", "json"]
+TableColumns = Literal["split", "standing", "corrected", "goals"]
+"""Of a table, on request: collisions with playback agents and the rest, who stands at the end, divergence corrected
+for sampling, what the search made of the goals.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)

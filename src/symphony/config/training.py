@@ -83,6 +83,33 @@ class ValidationConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PerturbConfig:
+    """Logged states displaced, labelled with the action of a smooth return to the log."""
+
+    share: float = 0.0
+    """Of the expert states of an update (0: none, as in the paper)."""
+    begin: int = 0
+    """Updates before the first: a policy learns more from displaced states when it drives already."""
+    along: float = 1.5
+    """Standard deviation along the road, in metres, times a number between 0 and 1 drawn for each state."""
+    across: float = 0.5
+    """Likewise to the side, in metres; less below 4 m/s."""
+    heading: float = 0.1
+    """Likewise in radians; less below 4 m/s and above 8 m/s."""
+    speed: float = 1.5
+    """Likewise in m/s."""
+
+    def __post_init__(self) -> None:
+        not_negative(self, "share", "begin", "along", "across", "heading", "speed")
+        if self.share > 1:
+            raise ConfigError(f"share must not exceed 1, is {self.share}")
+
+    def at(self, step: int) -> PerturbConfig | None:
+        """What holds at an update; None where no state is displaced."""
+        return self if self.share and step >= self.begin else None
+
+
+@dataclass(frozen=True, kw_only=True)
 class PreviewConfig:
     """What a run lets see of its agent while it trains: animated rollouts, and distributions of what it does."""
 
@@ -153,6 +180,8 @@ class TrainConfig(RunConfig):
     """Run segments per update."""
     states: int = 1024
     """Expert states per update, drawn from those segments."""
+    perturb: PerturbConfig = field(default_factory=PerturbConfig)
+    """Displaced expert states."""
     goals: int = 128
     """Expert routes per update of the goal policy (methods with H)."""
     learning_rate: float = 1e-3

@@ -254,7 +254,7 @@ class SegmentStore(Sequence[RunSegment]):
         )
 
     def _check(self, row: int, segment: RunSegment) -> None:
-        if content_hash(segment) != self._segments["hash"][row].tobytes().hex():
+        if content_hash(segment) != self.content(row):
             raise DataError("content does not match its hash: the store was damaged", file=self.path)
         try:
             validate(segment)
@@ -286,6 +286,10 @@ class SegmentStore(Sequence[RunSegment]):
         for name in ("lanes", "boundary", "marks"):
             parts[name] = Polylines(parts.pop(f"{name}.points"), parts.pop(f"{name}.offsets"))
         return RoadMap(**parts)
+
+    def content(self, index: SupportsIndex) -> str:
+        """Hash of a segment's content, its map included, as it was written."""
+        return cast(str, self._segments["hash"][self._row(index)].tobytes().hex())
 
     def raw(self, index: SupportsIndex) -> tuple[str, Any, dict[str, NDArray[Any]], Any]:
         """A segment as it is stored: id, index record, rows of every column, index record of its map."""

@@ -26,7 +26,7 @@ from symphony.envs.observation import (
     objects_at,
     observe,
 )
-from symphony.envs.routes import ROUTE_FEATURES, pick_routes, route_ahead, route_choices
+from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, pick_routes, route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.tables import Tables
 from symphony.envs.traffic import entering, without
@@ -159,6 +159,7 @@ class DrivingEnv(EnvBase):
         for name, count, width in (
             ("objects", config.num_objects, OBJECT_FEATURES),
             ("points", config.num_points, POINT_FEATURES),
+            ("lights", config.num_lights, POINT_FEATURES),
         ):
             if count:
                 seen[name], seen[f"{name}_mask"] = floats(n, count, width), flags(n, count)
@@ -166,10 +167,12 @@ class DrivingEnv(EnvBase):
             seen["route"] = floats(n, ROUTE_FEATURES)
         if config.clearance:
             seen["road"] = floats(n, 5)
-            if config.num_objects:
-                seen["gap"] = floats(n, config.num_objects)
-                if config.foresight:
-                    seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
+        if config.num_objects and (config.clearance or config.gaps):
+            seen["gap"] = floats(n, config.num_objects)
+            if config.foresight:
+                seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
+        if config.num_objects and config.along:
+            seen["along"] = floats(n, config.num_objects, ALONG_FEATURES)
 
         def goals() -> Unbounded:
             return Unbounded(shape=(n,), dtype=torch.int64, device=device)
@@ -384,7 +387,11 @@ class DrivingEnv(EnvBase):
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
         index = self.scenes.interactive[row]
         objects = self.objects(row, at, moved, real)
-        seen = observe(self.scenes, row, at, objects, index, self.observation, self._kept())
+        routes = None
+        if self.observation.route or self.observation.along:
+            follows = goal.reshape(-1, goal.shape[-1])
+            routes = pick_routes(self.scenes.route, self.scenes.route_count, row, follows)
+        seen = observe(self.scenes, row, at, objects, index, self.observation, self._kept(), routes)
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
@@ -392,10 +399,6 @@ class DrivingEnv(EnvBase):
         for key in self.ends_on:
             terminated = terminated | flags[key].any(-1)
         observation = {name: value for name, value in seen._asdict().items() if value is not None}
-        if self.observation.route:
-            follows = goal.reshape(-1, goal.shape[-1])
-            points, count = pick_routes(self.scenes.route, self.scenes.route_count, row, follows)
-            observation["route"] = route_ahead(moved, points, count, self.observation.distance_scale)
 
         def back(value: Tensor) -> Tensor:
             return value.reshape((*shape, *value.shape[1:]))

@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.points import see_points
+from symphony.envs.points import see_lights, see_points
 from symphony.envs.road import road_distance
+from symphony.envs.routes import along_route, route_ahead
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners, box_gap
@@ -50,19 +51,25 @@ class ObservationConfig:
         distance_scale: metres that become 1.
         speed_scale: m/s that become 1.
         size_scale: metres of a box side that become 1.
+        num_lights: nearest lights seen beside the points, as a group of their own; 0 for none.
         route: whether it sees the route that is its goal.
+        along: whether it sees where the objects are along that route.
+        gaps: whether it sees how far its box is from others.
         clearance: whether it sees how far its box is from others and from the edge of the road.
         foresight: seconds ahead at which it also sees how far it would be from others, were everyone to keep
-            speed and course; with ``clearance`` only.
+            speed and course; with ``gaps`` or ``clearance`` only.
         own: whether it sees its own speed and size.
     """
 
     num_objects: int = 16
     num_points: int = 1000
+    num_lights: int = 0
     distance_scale: float = 20.0
     speed_scale: float = 10.0
     size_scale: float = 5.0
     route: bool = False
+    along: bool = False
+    gaps: bool = False
     clearance: bool = False
     foresight: tuple[float, ...] = ()
     own: bool = True
@@ -98,9 +105,13 @@ class Observation(NamedTuple):
         objects_mask: [M, N, O].
         points: [M, N, P, 23].
         points_mask: [M, N, P].
+        lights: [M, N, L, 23] likewise.
+        lights_mask: [M, N, L].
         gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked.
         gap_ahead: [M, N, O, H] likewise at H times ahead.
         road: [M, N, 5] metres of centre and corners off the road, negative on it.
+        route: [M, N, Fr], see :func:`symphony.envs.routes.route_ahead`.
+        along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
     """
 
     own: Tensor | None = None
@@ -108,9 +119,13 @@ class Observation(NamedTuple):
     objects_mask: Tensor | None = None
     points: Tensor | None = None
     points_mask: Tensor | None = None
+    lights: Tensor | None = None
+    lights_mask: Tensor | None = None
     gap: Tensor | None = None
     gap_ahead: Tensor | None = None
     road: Tensor | None = None
+    route: Tensor | None = None
+    along: Tensor | None = None
 
 
 def objects_at(
@@ -157,6 +172,7 @@ def observe(
     index: Int[Tensor, "M N"],
     config: ObservationConfig,
     tables: Tables | None = None,
+    routes: tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]] | None = None,
 ) -> Observation:
     """Observation of the agents ``index`` among ``objects``.
 
@@ -171,13 +187,15 @@ def observe(
         index: those that observe.
         config: what they see.
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
+        routes: points of the agents' routes and how many of them exist; without, nothing of routes is observed.
     """
     tables = Tables(scenes, config) if tables is None else tables
     own = _take(objects.state, index)
     own_size = _take(objects.size, index)
     origin, heading = own[..., :2], own[..., 2]
     speed = rotate(own[..., 3:], -heading)[..., 0]
-    features, points, points_mask, road = None, None, None, None
+    features, points, points_mask, road, route = None, None, None, None, None
+    lights, lights_mask = None, None
     if config.own:
         ends = (step >= scenes.last_step[scene]).to(own.dtype)
         features = torch.cat(
@@ -190,14 +208,30 @@ def observe(
         )
     seen = _Seen()
     if config.num_objects:
-        seen = _see_objects(tables, scene, objects, index, own, own_size)
+        seen = _see_objects(tables, scene, objects, index, own, own_size, routes)
     if config.num_points:
         points, points_mask = see_points(tables, scene, step, origin, heading, speed)
+    if config.num_lights:
+        lights, lights_mask = see_lights(tables, scene, step, origin, heading, speed)
+    if config.route and routes is not None:
+        pose = torch.cat([own[..., :3], speed[..., None]], -1)
+        route = route_ahead(pose, *routes, config.distance_scale)
     if config.clearance:
         corners = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
         road = road_distance(scenes, scene, corners.flatten(1, 2), tables).unflatten(1, corners.shape[1:3])
     return Observation(
-        features, seen.features, seen.mask, points, points_mask, seen.gap, seen.gap_ahead, road
+        own=features,
+        objects=seen.features,
+        objects_mask=seen.mask,
+        points=points,
+        points_mask=points_mask,
+        lights=lights,
+        lights_mask=lights_mask,
+        gap=seen.gap,
+        gap_ahead=seen.gap_ahead,
+        road=road,
+        route=route,
+        along=seen.along,
     )
 
 
@@ -206,10 +240,17 @@ class _Seen(NamedTuple):
     mask: Tensor | None = None
     gap: Tensor | None = None
     gap_ahead: Tensor | None = None
+    along: Tensor | None = None
 
 
 def _see_objects(
-    tables: Tables, scene: Tensor, objects: Objects, index: Tensor, own: Tensor, own_size: Tensor
+    tables: Tables,
+    scene: Tensor,
+    objects: Objects,
+    index: Tensor,
+    own: Tensor,
+    own_size: Tensor,
+    routes: tuple[Tensor, Tensor] | None,
 ) -> _Seen:
     config = tables.config
     origin, heading = own[..., :2], own[..., 2]
@@ -237,12 +278,19 @@ def _see_objects(
         -1,
     )
     features = features * mask[..., None]
-    if not config.clearance:
+    follows = config.along and routes is not None
+    measures = config.clearance or config.gaps
+    if not follows and not measures:
         return _Seen(features, mask)
     size = _take(objects.size, flat).unflatten(1, shape[1:])
+    along = None
+    if follows and routes is not None:
+        along = along_route(own, own_size, state, size, *routes) * mask[..., None]
+    if not measures:
+        return _Seen(features, mask, along=along)
     gap = _gaps(config.foresight, own, own_size, state, size)
     gap = torch.where(mask[..., None], gap, 0.0)
-    return _Seen(features, mask, gap[..., 0], gap[..., 1:] if config.foresight else None)
+    return _Seen(features, mask, gap[..., 0], gap[..., 1:] if config.foresight else None, along)
 
 
 def _gaps(

@@ -37,6 +37,28 @@ def see_points(
         return _features_in_place(tables, scene, step, flat, mask, origin, heading, speed), mask
 
 
+def see_lights(
+    tables: Tables,
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    origin: Float[Tensor, "M N 2"],
+    heading: Float[Tensor, "M N"],
+    speed: Float[Tensor, "M N"],
+) -> tuple[Float[Tensor, "M N L F"], Bool[Tensor, "M N L"]]:
+    """Features of the nearest lights in each agent's frame, however far, and which of them exist."""
+    count, position, number = tables.config.num_lights, *tables.light_points
+    if position.shape[1] == 0:
+        shape = (*origin.shape[:2], count)
+        return origin.new_zeros(*shape, POINT_FEATURES), torch.zeros(
+            shape, dtype=torch.bool, device=origin.device
+        )
+    with torch.no_grad():
+        squared = (position[scene][:, None] - origin[..., None, :]).square().sum(-1)
+        chosen, mask = nearest(squared, count)
+        flat = number[scene].gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
+    return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
+
+
 @torch.no_grad()
 def nearest_points(
     tables: Tables, scene: Int[Tensor, " M"], origin: Float[Tensor, "M N 2"]

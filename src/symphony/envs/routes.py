@@ -32,6 +32,9 @@ POINTS = 64
 AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
 """Points of its route that a vehicle sees, counted from the one nearest to it."""
 ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
+ALONG_FEATURES = 11
+BESIDE = 20.0
+"""Metres beside its route within which an agent sees where along it something is."""
 STRIDE = 4
 """Of the points of a route, the share (one in so many) by which the goal policy judges it."""
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
@@ -126,6 +129,79 @@ def route_ahead(
         [torch.ones_like(has), (offset / 5.0).clamp(-2.0, 2.0)[..., None], along, ahead.flatten(-2)], -1
     )
     return features * has
+
+
+def along_route(
+    own: Float[Tensor, "M N 5"],
+    own_size: Float[Tensor, "M N 2"],
+    others: Float[Tensor, "M N O 5"],
+    size: Float[Tensor, "M N O 2"],
+    points: Float[Tensor, "M N K 2"],
+    count: Int[Tensor, "M N"],
+) -> Float[Tensor, "M N O F"]:
+    """Where others are along each agent's route (Frenet coordinates), as bounded numbers.
+
+    Whether it can be said; the gap along the route between the boxes (three scales, positive ahead, 0 while they are
+    side by side); how far to the left of the route (two scales) and how far beside the agent's own width; how much
+    faster along the route (two scales); the share d / (d + 2) of the deceleration d in m/s^2 that keeps the agent
+    behind what it closes in on; whether it is ahead. All zero beyond the ends of the route, more than
+    :data:`BESIDE` metres from it, and without one. Every number is within [-1, 1] at any speed.
+
+    Args:
+        own: x, y, heading, velocity of the agents.
+        own_size: length and width of their boxes.
+        others: likewise.
+        size: likewise.
+        points: the agents' routes, :data:`SPACING` apart.
+        count: points of each route that exist; 0 for none.
+    """
+    place = torch.cat([own[..., None, :2], others[..., :2]], -2)
+    with torch.no_grad():
+        exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
+        # |p - q|^2 less |p|^2, about the agent so that numbers stay small: [M, N, 1 + O, K]
+        here, line = place - place[..., :1, :], points - place[..., :1, :]
+        squared = line.square().sum(-1)[..., None, :] - 2.0 * here @ line.mT
+        nearest = squared.masked_fill(~exists[..., None, :], torch.inf).argmin(-1)
+        start = nearest.minimum((count[..., None] - 2).clamp_min(0))
+    first, second = (
+        points.gather(2, index[..., None].expand(*index.shape, 2))
+        for index in (start, (start + 1).clamp_max(points.shape[2] - 1))
+    )
+    direction = second - first
+    direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-3)
+    away = place - first
+    beyond = (away * direction).sum(-1)
+    along = SPACING * start + beyond
+    left = direction[..., 0] * away[..., 1] - direction[..., 1] * away[..., 0]
+    velocity = torch.cat([own[..., None, 3:], others[..., 3:]], -2)
+    speed = (velocity * direction).sum(-1)
+    end = SPACING * (count[..., None] - 1)
+    known = (along > -SPACING) & (along < end + SPACING) & (left.abs() < BESIDE) & (count[..., None] > 1)
+    known = known[..., 1:] & known[..., :1]
+    ahead = along[..., 1:] - along[..., :1]
+    half = 0.5 * (size[..., 0] + own_size[..., None, 0])
+    gap = ahead - half * (ahead / half).clamp(-1.0, 1.0)
+    beside = left[..., 1:].abs() - 0.5 * (size[..., 1] + own_size[..., None, 1])
+    faster = speed[..., 1:] - speed[..., :1]
+    brake = (-faster).clamp_min(0.0).square() / (2.0 * gap.clamp_min(0.5))
+    in_front = (ahead > 0).to(own.dtype)
+    features = torch.stack(
+        [
+            torch.ones_like(gap),
+            (gap / 3.0).tanh(),
+            (gap / 12.0).tanh(),
+            (gap / 50.0).tanh(),
+            (left[..., 1:] / 1.5).tanh(),
+            (left[..., 1:] / 6.0).tanh(),
+            (beside / 0.5).tanh(),
+            (faster / 2.0).tanh(),
+            (faster / 8.0).tanh(),
+            brake / (brake + 2.0) * in_front,
+            in_front,
+        ],
+        -1,
+    )
+    return torch.where(known[..., None], features, 0.0)
 
 
 def route_choices(

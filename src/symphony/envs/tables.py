@@ -62,6 +62,21 @@ class Tables:
         return self.scenes.point_light.flatten() if self.scenes.light.shape[2] else None
 
     @cached_property
+    def light_points(self) -> tuple[Tensor, Tensor]:
+        """Positions [B, Q, 2] of the points that are lights, infinity where a scene has fewer, and their numbers
+        [B, Q] among all points.
+        """
+        scenes = self.scenes
+        is_light = (scenes.point_light >= 0) & scenes.point_valid
+        most = int(is_light.sum(1).max()) if self.light is not None else 0
+        # Lights first, each kind in the order of the scene.
+        order = is_light.to(torch.int8).argsort(stable=True, dim=1, descending=True)[:, :most]
+        position = scenes.point.gather(1, order[..., None].expand(*order.shape, 2))
+        position = position.masked_fill(~is_light.gather(1, order)[..., None], torch.inf)
+        first = torch.arange(len(order), device=order.device)[:, None] * scenes.point.shape[1]
+        return position, order + first
+
+    @cached_property
     def position(self) -> tuple[Tensor, Tensor]:
         """x and y [B, P] of the points; infinity where there is none."""
         nowhere = ~self.scenes.point_valid

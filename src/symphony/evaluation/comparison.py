@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, get_args
 
-from symphony.config import Method, PaperData, Setting
+from symphony.config import Method, PaperData, Setting, TableColumns
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.paper import METRICS, paper_figures
 from symphony.evaluation.records import (
@@ -18,7 +18,7 @@ from symphony.evaluation.records import (
     kept_evaluations,
     read_run,
     run_interactive,
-    simulation_name,
+    simulation_way,
     updates_done,
 )
 
@@ -47,13 +47,23 @@ _FREE = (
 
 @dataclass(frozen=True)
 class Column:
-    """A metric as it is shown: times ``scale``, with ``digits`` after the point."""
+    """A metric as it is shown: times ``scale``, with ``digits`` after the point.
+
+    Attributes:
+        key: its name in a record; that of a difference where ``less`` says of which two.
+        title: its heading.
+        unit: after scaling.
+        optional: not all records have it; where it is absent there is no number.
+        less: names of the metric it begins with and of the one that is taken away.
+    """
 
     key: str
     title: str
     unit: str
     scale: float = 1.0
     digits: int = 2
+    optional: bool = False
+    less: tuple[str, str] | None = None
 
     def shown(self, value: float) -> str:
         """The value as text."""
@@ -70,6 +80,37 @@ COLUMNS = (
 """In the paper's order and units."""
 COST = Column("cost", "CPU", "s/segment", digits=2)
 """Of the simulation of all rollouts of a segment."""
+
+
+AT_A_DISTANCE = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor", "curvature_jsd_corrected")
+"""What says nothing of the log itself."""
+FLOOR = Column("curvature_jsd_floor", "JSD floor", "10⁻³", 1000.0, optional=True)
+"""What another log of the same size would score, beside the divergence."""
+ASKED: dict[TableColumns, tuple[Column, ...]] = {
+    "split": (
+        Column("collision_with_playback", "with playback", "%", optional=True),
+        Column(
+            "collision_with_agents",
+            "the rest",
+            "%",
+            optional=True,
+            less=("collision_rate", "collision_with_playback"),
+        ),
+    ),
+    "standing": (
+        Column("standing", "standing", "%", digits=1, optional=True),
+        Column("standing_log", "in the log", "%", digits=1, optional=True),
+    ),
+    "corrected": (Column("curvature_jsd_corrected", "JSD corrected", "10⁻³", 1000.0, optional=True),),
+    "goals": (
+        Column("goals_turn_variation", "turns moved", "TV", optional=True),
+        Column("goals_variation", "goals moved", "TV", optional=True),
+        Column("goals_founders", "first branches", "left", digits=1, optional=True),
+    ),
+}
+"""Columns on request."""
+METHOD_COLUMNS = {column.key: column for column in (*COLUMNS, *(c for each in ASKED.values() for c in each))}
+"""All but those of a user's own, by key."""
 
 
 @dataclass(frozen=True)
@@ -99,18 +140,22 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """A method: its seeds in ascending order, our cells and the paper's by metric."""
+    """A method: its seeds in ascending order, our cells and the paper's by metric.
+
+    ``way`` says how it was simulated, where a method has a row for each.
+    """
 
     method: str
     seeds: tuple[int, ...]
     cells: Mapping[str, Cell]
     paper: Mapping[str, Cell] = field(default_factory=dict)
     evaluations: tuple[str, ...] = ()
+    way: str = ""
 
     @property
     def name(self) -> str:
-        """As in the paper."""
-        return method_name(self.method)
+        """As in the paper, then the way."""
+        return " ".join(filter(None, (method_name(self.method), self.way)))
 
 
 @dataclass(frozen=True)
@@ -140,12 +185,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Entry:
-    """A run and the evaluation that stands for it."""
+    """A run and the evaluation that stands for it, or one of several by the way it was simulated."""
 
     folder: Path
     config: Mapping[str, Any]
     name: str
     record: Mapping[str, Any]
+    way: str = ""
 
     @property
     def method(self) -> str:
@@ -169,7 +215,7 @@ def family(method: str) -> str:
 
 
 def collect(
-    folders: Sequence[Path], setting: Setting, patterns: Sequence[str] = ()
+    folders: Sequence[Path], setting: Setting, patterns: Sequence[str] = (), *, each: bool = False
 ) -> tuple[list[Entry], dict[str, list[Path]]]:
     """The evaluated runs of a setting.
 
@@ -178,9 +224,10 @@ def collect(
         setting: of the runs that are wanted.
         patterns: names of evaluations (``*`` and ``?`` stand for anything); of those of a run, the ones that the
             first fitting pattern fits count. Without patterns all do.
+        each: take every evaluation that any pattern fits, as a row for each way of simulation.
 
     Returns:
-        The runs, each with its one evaluation, and those that are left out by the reason.
+        The runs, each with its one evaluation (or with each), and those that are left out by the reason.
 
     Raises:
         ConfigError: no runs, a run with several evaluations, or two runs of the same method and seed.
@@ -207,7 +254,11 @@ def collect(
             )
             left_out.setdefault(reason, []).append(folder)
             continue
-        entries.append(Entry(folder, config, *choose_evaluation(folder, kept, patterns)))
+        if each:
+            names = [name for name in kept if any(fitting([name], [p]) for p in patterns or "*")]
+            entries += [Entry(folder, config, n, kept[n], simulation_way(kept[n]["config"])) for n in names]
+        else:
+            entries.append(Entry(folder, config, *choose_evaluation(folder, kept, patterns)))
     _check_distinct(entries)
     return entries, left_out
 
@@ -221,7 +272,7 @@ def _unfit(config: Mapping[str, Any], setting: Setting) -> str:
     return ""
 
 
-def fitting(kept: Mapping[str, Any], patterns: Sequence[str]) -> list[str]:
+def fitting(kept: Iterable[str], patterns: Sequence[str]) -> list[str]:
     """Names of the evaluations that the first fitting pattern fits; all without patterns."""
     if not patterns:
         return list(kept)
@@ -247,17 +298,34 @@ def choose_evaluation(
 
 
 def _check_distinct(entries: Sequence[Entry]) -> None:
-    seen: dict[tuple[str, int], Entry] = {}
+    seen: dict[tuple[str, int, str], Entry] = {}
     for entry in entries:
-        other = seen.setdefault((entry.method, entry.seed), entry)
-        if other is not entry:
+        other = seen.setdefault((entry.method, entry.seed, entry.way), entry)
+        if other is entry:
+            continue
+        if other.folder == entry.folder:
+            names = f"{other.name}, {entry.name}"
             raise ConfigError(
-                f"two runs of {method_name(entry.method)} with seed {entry.seed}: {other.folder}, {entry.folder}"
+                f"{entry.folder} was simulated twice as {entry.way}, choose with --evaluation: {names}"
             )
+        raise ConfigError(
+            f"two runs of {method_name(entry.method)} with seed {entry.seed}: {other.folder}, {entry.folder}"
+        )
 
 
-def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | None = None) -> Comparison:
+def compare(
+    entries: Sequence[Entry],
+    setting: Setting,
+    dataset: PaperData | None = None,
+    asked: Sequence[TableColumns] = (),
+) -> Comparison:
     """The table of some evaluated runs; their order does not matter.
+
+    Args:
+        entries: the runs, of one method with one seed one for each way of simulation.
+        setting: theirs.
+        dataset: whose figures from the paper stand beside ours.
+        asked: columns on request.
 
     Raises:
         ConfigError: no runs, runs evaluated on different segments, seeds of a method evaluated in different ways, or
@@ -269,21 +337,24 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
         raise ConfigError(f"the paper has no figures for setting '{setting}' on {dataset}")
     if not entries:
         raise ConfigError(f"no evaluated runs of setting '{setting}'")
-    entries = sorted(entries, key=lambda entry: (ROWS.index(entry.method), entry.seed))
+    entries = sorted(entries, key=lambda entry: (ROWS.index(entry.method), entry.way, entry.seed))
     _check_comparable(entries)
     # Beside the paper's figures stand only what the paper has.
-    columns = COLUMNS if figures else (*COLUMNS, *_own_columns(entries), COST)
+    floor = () if any(FLOOR.key not in entry.record for entry in entries) else (FLOOR,)
+    more = [column for name in dict.fromkeys(asked) for column in ASKED[name]]
+    columns = (*COLUMNS, *more) if figures else (*COLUMNS, *floor, *more, *_own_columns(entries), COST)
     rows = [_baseline_row(entries[0], name, columns) for name in BASELINES]
-    for method in dict.fromkeys(entry.method for entry in entries):
-        mine = [entry for entry in entries if entry.method == method]
-        cells = {column.key: Cell.of([_number(entry, column.key) for entry in mine]) for column in columns}
+    for method, way in dict.fromkeys((entry.method, entry.way) for entry in entries):
+        mine = [entry for entry in entries if (entry.method, entry.way) == (method, way)]
+        cells = {column.key: Cell.of([_number(entry, column) for entry in mine]) for column in columns}
         seeds, names = tuple(entry.seed for entry in mine), tuple(entry.name for entry in mine)
-        rows.append(Row(method, seeds, cells, evaluations=names))
-    ours = _with_best({row.method: row.cells for row in rows}, columns)
-    theirs = _with_best(_paper_cells(figures or {}), COLUMNS)
+        rows.append(Row(method, seeds, cells, evaluations=names, way=way))
+    ours = _with_best({(row.method, row.way): row.cells for row in rows}, columns)
+    theirs = _with_best(
+        {(method, ""): cells for method, cells in _paper_cells(figures or {}).items()}, COLUMNS
+    )
     rows = [
-        Row(row.method, row.seeds, ours[row.method], theirs.get(row.method, {}), row.evaluations)
-        for row in rows
+        replace(row, cells=ours[row.method, row.way], paper=theirs.get((row.method, ""), {})) for row in rows
     ]
     return Comparison(setting, dataset, columns, tuple(rows), tuple(_notes(entries, dataset)))
 
@@ -297,10 +368,11 @@ def _own_columns(entries: Sequence[Entry]) -> list[Column]:
 def _baseline_row(entry: Entry, name: str, columns: Sequence[Column]) -> Row:
     """What the evaluations say of the log or of constant velocity."""
     cells = {column.key: Cell((), math.nan, math.nan) for column in columns}
-    # The log is at no distance from itself, so only its collisions and its time off the road say anything.
-    known = METRICS[:2] if name == "playback" else METRICS
-    for key in known:
-        cells[key] = Cell.of([_number(entry, key, name)])
+    # The log is at no distance from itself.
+    known = [column for column in columns if not (name == "playback" and column.key in AT_A_DISTANCE)]
+    for column in known:
+        if column.key in METRICS or column.optional:
+            cells[column.key] = Cell.of([_number(entry, column, name)])
     return Row(name, (), cells)
 
 
@@ -312,30 +384,42 @@ def _paper_cells(figures: Mapping[str, Mapping[str, tuple[float, float]]]) -> di
 
 
 def _with_best(
-    table: Mapping[str, Mapping[str, Cell]], columns: Sequence[Column]
-) -> dict[str, dict[str, Cell]]:
+    table: Mapping[tuple[str, str], Mapping[str, Cell]], columns: Sequence[Column]
+) -> dict[tuple[str, str], dict[str, Cell]]:
     """Mark the lowest value of every metric in each family of two methods or more.
 
     What looks equal in the table is equally good.
     """
     shown = {column.key: column.shown for column in columns}
     ranked = {column.key for column in COLUMNS}
-    done: dict[str, dict[str, Cell]] = {}
-    for method, cells in table.items():
-        rivals = [other for other in table if family(other) == family(method)]
-        done[method] = {}
+    done: dict[tuple[str, str], dict[str, Cell]] = {}
+    for (method, way), cells in table.items():
+        rivals = [other for other in table if family(other[0]) == family(method)]
+        done[method, way] = {}
         for key, cell in cells.items():
             means = [table[other][key].mean for other in rivals if not math.isnan(table[other][key].mean)]
             rated = key in ranked and method not in BASELINES and len(means) > 1
             best = rated and shown[key](cell.mean) == shown[key](min(means))
-            done[method][key] = Cell(cell.values, cell.mean, cell.error, best)
+            done[method, way][key] = Cell(cell.values, cell.mean, cell.error, best)
     return done
 
 
-def _number(entry: Entry, key: str, part: str = "") -> float:
-    if key == COST.key:
+def _number(entry: Entry, column: Column, part: str = "") -> float:
+    if column.key == COST.key:
         return float(entry.record["cost"]["simulation"]) / max(1, entry.record["segments"])
+    if column.less is not None:
+        begin, taken = (replace(column, key=key, less=None) for key in column.less)
+        return _number(entry, begin, part) - _number(entry, taken, part)
     where = entry.record[part] if part else entry.record
+    return math.nan if column.optional and column.key not in where else number(entry, where, column.key)
+
+
+def number(entry: Entry, where: Mapping[str, Any], key: str) -> float:
+    """A number of an evaluation, from its record or a part of it; NaN for a mean over nothing.
+
+    Raises:
+        DataError: it is none.
+    """
     value = where.get(key, "")
     # JSON has no NaN, which stands for a mean over nothing.
     if value is None:
@@ -347,14 +431,14 @@ def _number(entry: Entry, key: str, part: str = "") -> float:
 
 def _check_comparable(entries: Sequence[Entry]) -> None:
     first = entries[0]
-    known: dict[str, Entry] = {}
+    known: dict[tuple[str, str], Entry] = {}
     for entry in entries:
         if entry.record["data"].get("checksum") != first.record["data"].get("checksum"):
             raise ConfigError(
                 f"evaluated on different run segments, choose with --evaluation: {first.folder} ({first.name}), "
                 f"{entry.folder} ({entry.name})"
             )
-        other = known.setdefault(entry.method, entry)
+        other = known.setdefault((entry.method, entry.way), entry)
         if _way(other) != _way(entry):
             raise ConfigError(
                 f"seeds of {method_name(entry.method)} evaluated in different ways, choose with --evaluation: "
@@ -377,7 +461,7 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     ways: dict[str, list[str]] = {}
     for entry in entries:
         config = entry.record["config"]
-        ways.setdefault(f"{simulation_name(config)}, {config['rollouts']} rollouts", []).append(entry.method)
+        ways.setdefault(f"{simulation_way(config)}, {config['rollouts']} rollouts", []).append(entry.method)
     for way, methods in ways.items():
         notes.append(f"simulated {way}: {', '.join(dict.fromkeys(map(method_name, methods)))}")
     for method in dict.fromkeys(entry.method for entry in entries):

@@ -23,11 +23,21 @@ from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
-from symphony.metrics import AgentSteps, CollisionKinds, RolloutMetrics, collision_kinds
+from symphony.metrics import (
+    AgentSteps,
+    Choice,
+    CollisionKinds,
+    RolloutMetrics,
+    Standing,
+    choices,
+    collision_kinds,
+    route_turns,
+    standing_at_end,
+)
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.demonstrations import SceneDataset, logged
-from symphony.simulation.driving import driven_by, search_kind
+from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.rollouts import Rollouts
 from symphony.simulation.workers import batches, naming, shared
@@ -230,7 +240,7 @@ class _BatchEvaluator:
                 seconds = time.process_time() - began
                 part = dataclasses.replace(blank, metrics=RolloutMetrics(), own={}, seconds=seconds)
                 own = {path: load_object(path) for path in blank.config.metric}
-                _add(part, self.dataset, items, scenes, found.rollouts, own)
+                _add(part, self.dataset, items, scenes, found, own)
                 parts.append(part)
                 if self.seen and seen is None:
                     seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
@@ -242,14 +252,16 @@ def _add(
     dataset: SceneDataset,
     items: list[int],
     scenes: SceneBatch,
-    rollouts: Rollouts,
+    found: Simulation,
     own: dict[str, Metric],
 ) -> None:
     """Add the rollouts of some run segments to what was found."""
-    log, log_valid = logged(scenes)
+    rollouts, (log, log_valid) = found.rollouts, logged(scenes)
     judged = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
     exists = _there(scenes, rollouts, log_valid if evaluation.search == "log" else None)
     both = judged._replace(counted=judged.counted & log_valid[:, None, 1:])
+    judged_log = log_valid & ~scenes.background[:, None]
+    standing = standing_at_end(rollouts.state, log, judged_log, scenes.last_step)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     for path, metric in own.items():
         values = metric(scenes, rollouts)
@@ -286,7 +298,22 @@ def _add(
         # Segments of one recording share its traffic, so errors are over recordings.
         groups=[segment.group or segment.segment_id for segment in segments],
         single=single,
+        standing=Standing(*(part.cpu() for part in standing)),
+        choices=_choices(scenes, found),
     )
+
+
+def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
+    """What a search made of the goals; None without search or without goals."""
+    if found.search is None or found.drawn is None or not scenes.route.shape[2]:
+        return None
+    # The rollouts of a tree are the first of its leaves.
+    each = found.goal.shape[1] // found.drawn.shape[1]
+    first = found.search.slots[..., 0, :each].sort(-1).values
+    founders = 1 + (first.diff(dim=-1) != 0).sum(-1)
+    turn = route_turns(scenes.route, scenes.route_count)
+    drawn = found.drawn.flatten(1, 2)
+    return choices(drawn.cpu(), found.goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
 
 
 def _there(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> Bool[Tensor, "B K N T+1"]:

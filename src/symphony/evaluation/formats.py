@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from symphony.config import TableFormat
-from symphony.evaluation.comparison import SETTINGS, Cell, Column, Comparison, Row, family
+from symphony.evaluation.comparison import SETTINGS, Cell, Column, Comparison, Row, family, method_name
 from symphony.files import json_text
 
 NOTHING = "–"
@@ -25,7 +25,8 @@ WIDE = 200
 def print_text(comparison: Comparison, console: Console) -> None:
     """Print the table; the best values bold on a terminal and with a star elsewhere."""
     table = Table(title=comparison.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("method", max_width=10)  # wide enough for MGAIL+TS+H
+    ways = any(row.way for row in comparison.rows)
+    table.add_column("method", max_width=None if ways else 10)  # wide enough for MGAIL+TS+H
     table.add_column("seeds", justify="right")
     for column in comparison.columns:
         table.add_column(f"{column.title}\n{column.unit}", justify="right", no_wrap=True)
@@ -41,7 +42,9 @@ def print_text(comparison: Comparison, console: Console) -> None:
                 text.append("\n" if number else "")
                 text.append(_number(cell, column, "±") + star, strong if cell.best else weak)
             cells.append(text)
-        label = Text(row.name)
+        label = Text(method_name(row.method))
+        if row.way:
+            label.append(f"\n  {row.way}", "dim")
         if comparison.dataset is not None:
             label.append("\n  paper", "dim")
         # Families stand apart, as in the paper.
@@ -135,6 +138,7 @@ FORMATS: dict[TableFormat, Callable[[Comparison], str]] = {
 def _json_row(row: Row) -> dict[str, Any]:
     found: dict[str, Any] = {"method": row.method, "name": row.name, "seeds": row.seeds}
     found["evaluations"] = row.evaluations
+    found |= {"way": row.way} if row.way else {}
     for key, cell in row.cells.items():
         found[key] = {"mean": cell.mean, "se": cell.error, "best": cell.best, "values": cell.values}
     if row.paper:

@@ -62,7 +62,8 @@ def differences(entries: Sequence[Entry], base: str) -> list[Difference]:
     methods = list(dict.fromkeys(entry.method for entry in entries))
     if base not in methods:
         raise ConfigError(f"'{base}' is not among the methods {', '.join(methods)}")
-    tables = {method: _mean_rows([e for e in entries if e.method == method]) for method in methods}
+    keys = [column.key for column in PAIRED]
+    tables = {method: mean_rows([e for e in entries if e.method == method], keys) for method in methods}
     return [_difference(method, base, tables[method], tables[base]) for method in methods if method != base]
 
 
@@ -70,25 +71,30 @@ Rows = dict[str, tuple[str, dict[str, float]]]
 """By the name of the segment: its group and its numbers."""
 
 
-def _mean_rows(entries: Sequence[Entry]) -> Rows:
-    each = [_rows(entry) for entry in entries]
+def mean_rows(entries: Sequence[Entry], metrics: Sequence[str]) -> Rows:
+    """Numbers of every run segment that all evaluations have, averaged over these (over seeds).
+
+    Raises:
+        DataError: an evaluation without rows of its segments.
+    """
+    each = [_rows(entry, metrics) for entry in entries]
     shared = set.intersection(*(set(rows) for rows in each))
     return {
         name: (
             each[0][name][0],
-            {c.key: float(np.mean([rows[name][1][c.key] for rows in each])) for c in PAIRED},
+            {key: float(np.mean([rows[name][1][key] for rows in each])) for key in metrics},
         )
         for name in sorted(shared)
     }
 
 
-def _rows(entry: Entry) -> Rows:
+def _rows(entry: Entry, metrics: Sequence[str]) -> Rows:
     rows: Any = entry.record.get("per_segment")
     if not isinstance(rows, list):
         raise DataError("is missing", file=f"{entry.folder}: {entry.name}", field="per_segment")
     found: Rows = {}
     for row in rows:
-        numbers = {c.key: math.nan if row.get(c.key) is None else float(row[c.key]) for c in PAIRED}
+        numbers = {key: math.nan if row.get(key) is None else float(row[key]) for key in metrics}
         found[str(row["segment"])] = str(row.get("group") or row["segment"]), numbers
     return found
 

@@ -58,10 +58,13 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was judged and whether
         that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
         store; ``config``: the settings of the evaluation, with what was left to the agent filled
-        in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``;
+        in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and ``parts``,
+        pseudo-values of the divergence by recording (see :func:`symphony.metrics.sampled_divergence`);
         ``per_segment``: a row for each run segment.
     """
     visited, visited_log = result.metrics.curvature_histograms()
+    divergence, names = result.metrics.curvature_divergence()
+    parts = dict(zip(names, divergence.parts.tolist(), strict=True))
     return {
         "format": FORMAT,
         **result.numbers(),
@@ -70,7 +73,7 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         "config": _filled_in(agent, result),
         **{baseline.agent: baseline.numbers() for baseline in result.baselines},
         "cost": {"simulation": result.seconds},
-        "curvature": {"policy": visited.tolist(), "log": visited_log.tolist()},
+        "curvature": {"policy": visited.tolist(), "log": visited_log.tolist(), "parts": parts},
         "per_segment": result.metrics.rows(),
     }
 
@@ -149,6 +152,16 @@ def simulation_name(config: dict[str, Any]) -> str:
         words.append(f"every{config['prune_every']}")
     if config.get("temperature"):
         words.append(f"at{config['temperature']:g}")
+    return "-".join(words)
+
+
+def simulation_way(config: dict[str, Any]) -> str:
+    """How rollouts came about, with all that tells searches apart: ``tree-1x16-replace-every2-goals=branch``."""
+    words = [simulation_name(config)]
+    for name, usual in (("threshold", None), ("goals", "tree"), ("retries", 0), ("logged_goals", False)):
+        value = config.get(name, usual)
+        if value != usual:
+            words.append(name if value is True else f"{name}={value}")
     return "-".join(words)
 
 

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from symphony.metrics.agents import AgentResult, AgentSteps
-from symphony.metrics.curvature import curvature_histogram, jensen_shannon
+from symphony.metrics.choices import Choice, Standing, choices, route_turns, standing_at_end
+from symphony.metrics.curvature import (
+    Divergence,
+    curvature_histogram,
+    jensen_shannon,
+    sampled_divergence,
+    sampling_floor,
+)
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
 from symphony.metrics.realism import collisions, displacement, offroad
@@ -12,11 +19,15 @@ from symphony.metrics.summary import RolloutMetrics, SegmentResult
 __all__ = [
     "AgentResult",
     "AgentSteps",
+    "Choice",
     "CollisionKind",
     "CollisionKinds",
+    "Divergence",
     "OrderStatistics",
     "RolloutMetrics",
     "SegmentResult",
+    "Standing",
+    "choices",
     "collision_kinds",
     "collisions",
     "curvature_histogram",
@@ -25,4 +36,8 @@ __all__ = [
     "offroad",
     "order_statistics",
     "passing_gap",
+    "route_turns",
+    "sampled_divergence",
+    "sampling_floor",
+    "standing_at_end",
 ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,59 @@ def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.floa
     middle = (p + q) / 2
     divergence = (_relative(p, middle) + _relative(q, middle)) / 2
     return np.maximum(divergence, 0.0)
+
+
+class Divergence(NamedTuple):
+    """A divergence between what rollouts and logs chose, and what is left of it without sampling.
+
+    Attributes:
+        value: of the summed histograms, nats.
+        error: standard error (jackknife); NaN for a single sample.
+        corrected: the value less the bias that finite samples give it; NaN for a single sample.
+        parts: [n] pseudo-values of the samples, whose mean is the corrected value.
+    """
+
+    value: float
+    error: float
+    corrected: float
+    parts: NDArray[np.float64]
+
+
+def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Divergence:
+    """Jensen-Shannon divergence of the sums of n independent samples, its error and bias by leaving one out.
+
+    Samples are drawn as pairs: of segments that are alike in rollouts and log less is sampling than of others, and
+    rollouts that are alike count as what they are.
+
+    Args:
+        counts: [n, K] histogram of the rollouts of each sample (a recording, or a segment).
+        counts_log: [n, K] of its logs.
+
+    Source: Quenouille, "Notes on bias in estimation", Biometrika 43 (1956).
+    """
+    total, total_log, number = counts.sum(0), counts_log.sum(0), len(counts)
+    value = float(jensen_shannon(total, total_log))
+    if number < 2:
+        return Divergence(value, math.nan, math.nan, np.full(number, math.nan))
+    without = jensen_shannon(total - counts, total_log - counts_log)
+    parts = number * value - (number - 1) * without
+    error = float(parts.std(ddof=1) / np.sqrt(number))
+    return Divergence(value, error, float(parts.mean()), parts)
+
+
+def sampling_floor(counts_log: NDArray[Any], draws: int = 200) -> float:
+    """What another log of the same size would score against this one, nats: no policy is known to be better.
+
+    Finite samples of one distribution differ. The other log is a bootstrap sample of this one's segments, so it also
+    differs in which segments there are; a perfect policy on the same segments scores somewhat less.
+
+    Args:
+        counts_log: [n, K] histogram of the log of each segment.
+        draws: bootstrap samples to average over, always the same ones.
+    """
+    number = len(counts_log)
+    often = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), size=draws)
+    return float(np.nanmean(jensen_shannon(often @ counts_log, counts_log.sum(0)[None])))
 
 
 def _normalised(counts: NDArray[np.float64]) -> NDArray[np.float64]:

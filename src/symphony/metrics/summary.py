@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.metrics.agents import AgentResult, AgentSteps, agent_rates, agent_results, speed_distance
-from symphony.metrics.curvature import BINS, curvature_histogram, jensen_shannon
+from symphony.metrics.choices import Choice, Standing, choice_numbers
+from symphony.metrics.curvature import (
+    BINS,
+    Divergence,
+    curvature_histogram,
+    sampled_divergence,
+    sampling_floor,
+)
 from symphony.metrics.kinds import CollisionKind, CollisionKinds
 
 
@@ -41,6 +48,9 @@ class SegmentResult:
         simulated: egos, and other interactive agents, in all rollouts.
         group: the recording the segment is part of; None where not given.
         single: what became of single agents while their log exists; None where not asked for.
+        standing: agents that stand at the end, of all rollouts and of the log, and agents whose log lasts that long;
+            None where not given.
+        choice: what the search made of the goals; None without search or goals.
     """
 
     collided: int
@@ -56,6 +66,8 @@ class SegmentResult:
     simulated: tuple[int, int] = (0, 0)
     group: str | None = None
     single: AgentResult | None = None
+    standing: tuple[int, int, int] | None = None
+    choice: Choice | None = None
 
 
 class RolloutMetrics:
@@ -81,6 +93,8 @@ class RolloutMetrics:
         kinds: CollisionKinds | None = None,
         groups: Sequence[str] | None = None,
         single: AgentSteps | None = None,
+        standing: Standing | None = None,
+        choices: Sequence[Choice] | None = None,
     ) -> None:
         """Add the rollouts of some segments.
 
@@ -97,6 +111,8 @@ class RolloutMetrics:
             groups: [B] the recording each segment is part of (see ``RunSegment.group``), for all segments or for
                 none. Segments of one recording are no independent samples: standard errors are then over groups.
             single: what single agents did, for all segments or for none.
+            standing: who stands at the end, for all segments or for none.
+            choices: [B] what the search made of the goals, for all segments or for none.
 
         Raises:
             ValueError: for a segment that was added before, shapes that do not fit together, a displacement or
@@ -119,6 +135,7 @@ class RolloutMetrics:
         if groups is not None and len(groups) != len(segment_ids):
             raise ValueError(f"{len(groups)} groups for {len(segment_ids)} segments")
         singles = None if single is None else agent_results(single)
+        ends = None if standing is None else _count_standing(standing)
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
         # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
@@ -140,6 +157,8 @@ class RolloutMetrics:
                 simulated=(int(there[b, 0]), int(there[b, 1:].sum())),
                 group=None if groups is None else groups[b],
                 single=None if singles is None else singles[b],
+                standing=None if ends is None else ends[b],
+                choice=None if choices is None else choices[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -157,7 +176,8 @@ class RolloutMetrics:
         """One row per segment, ordered by its id, for paired comparisons; ``group`` is the recording it is part of.
 
         ``collision_rate`` and ``offroad_time`` in percent, ``ade`` and ``min_sade`` in metres (NaN where the log is
-        valid at no step).
+        valid at no step); where given ``collision_with_playback``, ``standing`` and ``standing_log`` in percent, and
+        ``goals_variation``.
         """
         return [
             {
@@ -167,6 +187,7 @@ class RolloutMetrics:
                 "offroad_time": 100.0 * s.offroad / s.steps if s.steps else math.nan,
                 "ade": s.error.mean() / s.logged if s.logged else math.nan,
                 "min_sade": s.error.min() / s.logged if s.logged else math.nan,
+                **_more(s),
             }
             for name, s in sorted(self.segments.items())
         ]
@@ -179,6 +200,16 @@ class RolloutMetrics:
             visited_log += segment.histogram_log
         return visited, visited_log
 
+    def curvature_divergence(self) -> tuple[Divergence, list[str]]:
+        """The divergence, and the names of its samples: the groups, or without any the segments."""
+        found = [self.segments[name] for name in sorted(self.segments)]
+        member = _groups(found)
+        names = sorted(self.segments) if member is None else sorted({str(s.group) for s in found})
+        counts = (
+            np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True)
+        )
+        return sampled_divergence(*(_summed(each, member) for each in counts)), names
+
     def compute(self) -> dict[str, Any]:
         """The table row.
 
@@ -187,8 +218,10 @@ class RolloutMetrics:
             ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
             all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
             standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
-            ``segments`` and ``rollouts`` (per segment). Where kinds were given, likewise the percent of rollouts
-            whose first collision is of a kind, ``collision_into_leader`` and so on for every
+            ``segments`` and ``rollouts`` (per segment). ``curvature_jsd_floor`` is what another log of
+            the same size would score, ``curvature_jsd_corrected`` the divergence without its bias by sampling (its
+            error is that of the divergence; NaN for a single segment or group). Where kinds were given, likewise the
+            percent of rollouts whose first collision is of a kind, ``collision_into_leader`` and so on for every
             :class:`CollisionKind` (they sum to ``collision_rate``), that is with a playback agent,
             ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
             themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
@@ -198,6 +231,8 @@ class RolloutMetrics:
             ``agent_offroad_time``; metres driven in percent of the log's, ``agent_progress``; mean speed,
             ``agent_speed``, and the percent of time that agents stand, ``agent_standing``, both also as ``*_log``;
             and how far the speeds are from the log's, ``agent_speed_distance`` (Wasserstein, m/s).
+            Where standing was given, ``standing`` and ``standing_log`` are the percent of agents that stand at the
+            last step, of those whose log lasts that long. Where choices were given, see :func:`choice_numbers`.
             Where groups were given, ``groups`` is how many, and all standard errors are over them (as if each were
             one segment: cluster-robust, and a jackknife that leaves out a group).
 
@@ -226,15 +261,18 @@ class RolloutMetrics:
             **_kind_rates(found),
             **_agent_rates(found),
             **(agent_rates(single) if single else {}),
+            **_standing_rates(found),
         }
         member = _groups(found)
         out: dict[str, Any] = {}
         for name, (total, weight) in parts.items():
             out[name], out[f"{name}_se"] = _ratio(total, weight, member)
-        out["curvature_jsd"], out["curvature_jsd_se"] = _divergence(
-            _summed(np.stack([s.histogram for s in found]), member),
-            _summed(np.stack([s.histogram_log for s in found]), member),
-        )
+        divergence, _ = self.curvature_divergence()
+        out["curvature_jsd"], out["curvature_jsd_se"] = divergence.value, divergence.error
+        out["curvature_jsd_floor"] = sampling_floor(np.stack([s.histogram_log for s in found]))
+        out["curvature_jsd_corrected"] = divergence.corrected
+        chosen = [s.choice for s in found if s.choice is not None]
+        out |= choice_numbers(chosen) if chosen else {}
         if single:
             out["agent_speed_distance"] = speed_distance(single)
         out["segments"] = len(found)
@@ -299,6 +337,41 @@ def _agent_rates(
     return rates
 
 
+def _count_standing(standing: Standing) -> list[tuple[int, int, int]]:
+    """Of every segment: agents that stand, of the rollouts and of the log, and agents that are compared."""
+    counted = standing.counted
+    slow = (standing.rollouts & counted[:, None]).sum((1, 2)).tolist()
+    return list(zip(slow, (standing.log & counted).sum(1).tolist(), counted.sum(1).tolist(), strict=True))
+
+
+def _standing_rates(
+    found: Sequence[SegmentResult],
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Percent times agents, and agents, of every segment: those of the rollouts, and of the log."""
+    given = [s.standing for s in found if s.standing is not None]
+    if not given:
+        return {}
+    if len(given) < len(found):
+        raise ValueError(f"who stands was given for {len(given)} of {len(found)} segments")
+    slow, slow_log, agents = np.array(given, dtype=np.float64).T
+    rollouts = np.array([s.rollouts for s in found], dtype=np.float64)
+    return {"standing": (100 * slow, agents * rollouts), "standing_log": (100 * slow_log, agents)}
+
+
+def _more(s: SegmentResult) -> dict[str, float]:
+    """What a row has where it was asked for."""
+    out: dict[str, float] = {}
+    if s.kinds is not None:
+        out["collision_with_playback"] = 100.0 * float(s.kinds[:, 1].sum()) / s.rollouts
+    if s.standing is not None:
+        slow, slow_log, agents = s.standing
+        out["standing"] = 100.0 * slow / (agents * s.rollouts) if agents else math.nan
+        out["standing_log"] = 100.0 * slow_log / agents if agents else math.nan
+    if s.choice is not None:
+        out["goals_variation"] = s.choice.variation
+    return out
+
+
 def _groups(found: Sequence[SegmentResult]) -> NDArray[np.int64] | None:
     """[segments] number of the group each is in, from 0; None where none were given."""
     given = [s.group for s in found if s.group is not None]
@@ -331,17 +404,6 @@ def _ratio(
         return float(ratio), math.nan
     residual = (total - ratio * weight) / weight.mean()
     return float(ratio), float(np.sqrt((residual**2).sum() / (count - 1) / count))
-
-
-def _divergence(counts: NDArray[np.int64], counts_log: NDArray[np.int64]) -> tuple[float, float]:
-    """Divergence of the summed histograms [segments or groups, 201] and its jackknife standard error over those."""
-    total, total_log = counts.sum(0), counts_log.sum(0)
-    value, number = float(jensen_shannon(total, total_log)), len(counts)
-    if number < 2:
-        return value, math.nan
-    without = jensen_shannon(total - counts, total_log - counts_log)
-    error = np.sqrt((number - 1) / number * ((without - without.mean()) ** 2).sum())
-    return value, float(error)
 
 
 def _check_shapes(

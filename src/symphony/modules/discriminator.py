@@ -11,18 +11,13 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from symphony.keys import GAP, GAP_AHEAD, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
-from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, gap_features, scene_module
 from symphony.modules.pooling import PoolMode
 
 Features = Literal["paper", "clearance", "foresight"]
 FORESIGHT = (0.5, 1.0, 2.0)
 """Seconds ahead at which ``foresight`` looks."""
 _GAP, _ROAD = 3, 2 * 5
-
-
-def gap_features(gap: Tensor) -> Tensor:
-    """Signed gaps in metres `[...]` as numbers of order one `[..., 3]`: fine near contact, coarse farther away."""
-    return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
 def road_features(distance: Tensor) -> Tensor:

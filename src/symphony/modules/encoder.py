@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -23,12 +24,22 @@ class ElementGroup:
     Attributes:
         key: float `[..., N, K, features]`; K may differ from call to call.
         mask_key: bool `[..., N, K]`, True where an element is valid.
-        features: features of one element.
+        features: features of one element, those under further keys included.
+        more_keys: further features `[..., N, K, F]` of the same elements.
+        gap_keys: signed gaps `[..., N, K]` or `[..., N, K, H]` to them in metres, of which :func:`gap_features` makes
+            three features each.
     """
 
     key: NestedKey
     mask_key: NestedKey
     features: int
+    more_keys: tuple[NestedKey, ...] = ()
+    gap_keys: tuple[NestedKey, ...] = ()
+
+
+def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
+    """Signed gaps in metres as numbers of order one: fine near contact, coarse farther away."""
+    return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
 EncoderClass = Callable[..., Any]
@@ -93,15 +104,24 @@ class SceneNetwork(nn.Module):
         return in_blocks(self.head, self.encoder(own, valid, *elements_and_masks))
 
 
-class _JoinOwn(nn.Module):
-    """Concatenates the own features that come under several keys."""
+class _Join(nn.Module):
+    """Concatenates features that come under several keys: the agents' own, and those of each group's elements."""
 
-    def __init__(self, network: nn.Module, owns: int) -> None:
+    def __init__(self, network: nn.Module, owns: int, groups: Sequence[ElementGroup]) -> None:
         super().__init__()
         self.network, self.owns = network, owns
+        self.parts = [(len(group.more_keys), len(group.gap_keys)) for group in groups]
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        return self.network(torch.cat(inputs[: self.owns], -1), *inputs[self.owns :])
+        waiting = iter(inputs)
+        joined = [torch.cat([next(waiting) for _ in range(self.owns)], -1), next(waiting)]
+        for more, gaps in self.parts:
+            elements, mask = next(waiting), next(waiting)
+            parts = [elements, *(next(waiting) for _ in range(more))]
+            # A gap without a dimension of times gives three features, one with H times 3 H.
+            parts += [gap_features(next(waiting)).flatten(elements.ndim - 1) for _ in range(gaps)]
+            joined += [torch.cat(parts, -1), mask]
+        return self.network(*joined, *waiting)
 
 
 def scene_module(
@@ -123,6 +143,7 @@ def scene_module(
         valid_key: mask of the agents.
         more_keys: further inputs.
     """
-    pairs = [key for group in groups for key in (group.key, group.mask_key)]
-    joined = network if len(own_keys) == 1 else _JoinOwn(network, len(own_keys))
-    return TensorDictModule(joined, in_keys=[*own_keys, valid_key, *pairs, *more_keys], out_keys=[out_key])
+    read = [key for group in groups for key in (group.key, group.mask_key, *group.more_keys, *group.gap_keys)]
+    apart = len(own_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
+    joined = _Join(network, len(own_keys), groups) if apart else network
+    return TensorDictModule(joined, in_keys=[*own_keys, valid_key, *read, *more_keys], out_keys=[out_key])

@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch.optim import Adam
 
-from symphony.agents import Agent, observation_of, policy_network
+from symphony.agents import Agent, bicycle, observation_of, policy_network
 from symphony.config import TrainConfig
 from symphony.data.store import SegmentStore
-from symphony.envs import Bicycle
 from symphony.objectives import BCLoss
 from symphony.simulation import SceneDataset
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
@@ -18,7 +17,7 @@ def bc(config: TrainConfig, processes: Processes) -> Trainer:
     """Imitate the logged actions of every vehicle that moves or waits."""
     torch.manual_seed(config.seed)
     rng, device = torch.Generator(), processes.device
-    store, dynamics = SegmentStore(config.data), Bicycle()
+    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
     data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
 
     # Networks.
@@ -34,7 +33,8 @@ def bc(config: TrainConfig, processes: Processes) -> Trainer:
     # The order of updates.
     def update(step: int) -> Updates:
         items, observation = data.draw(config.segments, rng), observation_of(spec)
-        yield "policy", policy_loss(data.sample_states(items, config.states, observation, rng, device))
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        yield "policy", policy_loss(experts)
 
     phases = [Phase(config.steps, update, cosine(rates, config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)

@@ -6,11 +6,18 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
 
-from symphony.agents import Agent, discriminator_network, goal_network, observation_of, policy_network
+from symphony.agents import (
+    Agent,
+    bicycle,
+    discriminator_network,
+    goal_network,
+    observation_of,
+    policy_network,
+)
 from symphony.collectors import BeamSearchCollector, with_rows
 from symphony.config import TrainConfig
 from symphony.data.store import SegmentStore
-from symphony.envs import Bicycle, DrivingEnv
+from symphony.envs import DrivingEnv
 from symphony.modules import SeededNoise
 from symphony.objectives import DiscriminatorLoss, DistillationLoss, GoalLoss
 from symphony.simulation import SceneDataset, SearchReplay, with_survivors
@@ -22,7 +29,7 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     """Learn from the log, and from rollouts of a beam search that the discriminator prunes; both given routes."""
     torch.manual_seed(config.seed)
     seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
-    store, dynamics = SegmentStore(config.data), Bicycle()
+    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
     data = SceneDataset(store, config.agent.interactive, dynamics, routes=True, duration=config.duration)
 
     # Networks.
@@ -43,9 +50,7 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
 
     # Losses and optimizers.
-    policy_loss = processes.share(
-        DistillationLoss(policy, rollout_weight=config.search.weight, survivors=config.search.survivors)
-    )
+    policy_loss = processes.share(DistillationLoss(policy, rollout_weight=config.search.weight))
     goal_loss = processes.share(GoalLoss(goals))
     realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
     optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
@@ -56,8 +61,8 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         items, observation = data.draw(config.segments, rng), observation_of(spec, discriminator=False)
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
-        experts = data.sample_states(items, config.states, observation, rng, device)
-        rollouts = replay.survivors(config.search.states, rng, observation)
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        rollouts = replay.survivors(config.search.states, rng, observation, config.search.survivors)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
         yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
 

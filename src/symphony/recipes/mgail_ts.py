@@ -52,7 +52,8 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
     # The order of updates, in three phases.
     def regression(step: int) -> Updates:
         items = data.draw(config.segments, rng)
-        yield "policy", regression_loss(data.sample_states(items, config.states, observation, rng, device))
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        yield "policy", regression_loss(experts)
 
     def discriminate(step: int) -> Updates:
         yield "search", replay.refresh(step)
@@ -67,7 +68,9 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
         yield from discriminate(step)
         losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
         if config.mgail.expert_weight:
-            experts = data.sample_states(items, config.states, observation, rng, device)
+            experts = data.sample_states(
+                items, config.states, observation, rng, device, config.perturb.at(step)
+            )
             losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
         yield "policy", losses
 

@@ -58,7 +58,8 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
 
     def regression(step: int) -> Updates:
         items = data.draw(config.segments, rng)
-        yield "policy", regression_loss(data.sample_states(items, config.states, observation, rng, device))
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        yield "policy", regression_loss(experts)
         yield from goals_of(items)
 
     def discriminate(step: int) -> Updates:
@@ -76,7 +77,9 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield from discriminate(step)
         losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
         if config.mgail.expert_weight:
-            experts = data.sample_states(items, config.states, observation, rng, device)
+            experts = data.sample_states(
+                items, config.states, observation, rng, device, config.perturb.at(step)
+            )
             losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
         yield "policy", losses
         yield from goals_of(items)

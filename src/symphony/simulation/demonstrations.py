@@ -12,16 +12,19 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from symphony import keys
+from symphony.config import PerturbConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
-from symphony.envs.routes import POINTS, RouteTable, route_ahead, route_choices
+from symphony.envs.routes import POINTS, RouteTable, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.experts import ExpertCache, Experts, fit_experts
+from symphony.simulation.kept import KeptExperts
+from symphony.simulation.perturbation import perturbed
 
 KEEP = 5000
 """Segments held in memory once they are prepared: 90 kB each, 170 with routes, in the built-in data."""
@@ -69,6 +72,7 @@ class SceneDataset:
         self.routes, self.duration, self.keep = routes, duration, keep
         self.scene = lru_cache(keep)(self._scene)
         self.experts = ExpertCache(self._experts, keep)
+        self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -134,9 +138,16 @@ class SceneDataset:
         return collate([self.scene(i) for i in items])
 
     def _experts(self, items: Sequence[int]) -> list[Experts]:
-        """The demonstrations of several items, fitted together."""
-        segments, graphs = [self.segment(i) for i in items], [self.graph(i) for i in items]
-        return fit_experts(segments, self.dynamics, graphs, routes=self.routes)
+        """The demonstrations of several items: those kept with the store, the others fitted together and kept."""
+        contents = [self.store.content(self.indices[i]) for i in items]
+        known = [self.kept.load(content) for content in contents]
+        missing = [k for k, experts in enumerate(known) if experts is None]
+        segments, graphs = [self.segment(items[k]) for k in missing], [self.graph(items[k]) for k in missing]
+        made = fit_experts(segments, self.dynamics, graphs, routes=self.routes) if missing else []
+        for k, experts in zip(missing, made, strict=True):
+            self.kept.save(contents[k], experts)
+            known[k] = experts
+        return [experts for experts in known if experts is not None]
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Different items at random (all, if there are fewer)."""
@@ -149,8 +160,9 @@ class SceneDataset:
         observation: ObservationConfig,
         rng: torch.Generator,
         device: torch.device | str = "cpu",
+        perturb: PerturbConfig | None = None,
     ) -> TensorDict:
-        """A training batch: expert states drawn uniformly from some segments.
+        """A training batch: expert states drawn uniformly from some segments, some of them displaced.
 
         Returns:
             TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
@@ -171,10 +183,15 @@ class SceneDataset:
         action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
+        scenes = self.scenes(items)
+        if perturb is not None:
+            now, later = (_pose(scenes.log_state[item, when + k, agent]) for k in (0, 1))
+            size = scenes.box_size[item, agent]
+            state, action = perturbed(state, action, now, later, size, self.dynamics, self.dt, perturb, rng)
         tables = [table for expert in found for table in expert.routes]
         taken = logged_routes(tables, row) if observation.route else None
         return expert_batch(
-            self.scenes(items).to(device),
+            scenes.to(device),
             item.to(device),
             when.to(device),
             agent.to(device),
@@ -262,6 +279,12 @@ def logged_routes(tables: Sequence[RouteTable], row: Tensor) -> tuple[Tensor, Te
     return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
 
 
+def _pose(log_state: Tensor) -> Tensor:
+    """From x, y, heading and velocity [M, 5] to x, y, heading and speed [M, 4]."""
+    speed = forward_speed(log_state[:, 3:], log_state[:, 2])
+    return torch.cat([log_state[:, :3], speed[:, None]], -1)
+
+
 def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
     """What the interactive agents did in the log: states [B, T, N, 4] and validity [B, T, N]."""
     steps = scenes.log_valid.shape[1]
@@ -290,22 +313,14 @@ def expert_batch(
     index, here = agent[:, None], state[:, None]
     real = torch.ones_like(index, dtype=torch.bool)
     objects = objects_at(scenes, scene_of, step, here, index, real)
-    seen = observe(scenes, scene_of, step, objects, index, observation)
+    known = None if routes is None else (routes[0][:, None], routes[1][:, None])
+    seen = observe(scenes, scene_of, step, objects, index, observation, routes=known)
     batch = TensorDict({}, batch_size=[len(step)], device=state.device)
-    for key, value in (
-        (keys.OWN, seen.own),
-        (keys.OBJECTS, seen.objects),
-        (keys.OBJECTS_MASK, seen.objects_mask),
-        (keys.POINTS, seen.points),
-        (keys.POINTS_MASK, seen.points_mask),
-        (keys.VALID, real),
-        (keys.STATE, here),
-    ):
-        batch.set(key, value)
+    batch.set(keys.VALID, real)
+    batch.set(keys.STATE, here)
+    for name, value in seen._asdict().items():
+        if value is not None:
+            batch.set(("agents", "observation", name), value)
     if action is not None:
         batch.set(keys.ACTION, action[:, None])
-    if routes is not None:
-        points, count = routes
-        ahead = route_ahead(here, points[:, None], count[:, None], observation.distance_scale)
-        batch.set(keys.ROUTE, ahead)
     return batch

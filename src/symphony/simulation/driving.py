@@ -45,12 +45,14 @@ class Simulation(NamedTuple):
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
         search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
+        drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
     """
 
     rollouts: Rollouts
     goal: Int[Tensor, "B K N"]
     search: BeamSearchResult | None
     failed: tuple[dict[int, str], ...] = ()
+    drawn: Int[Tensor, "B trees S N"] | None = None
 
 
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
@@ -115,6 +117,7 @@ def simulation(
         start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
+    drawn = goal
     if search_kind(agent, config) in ("none", "log"):
         found = simulate(
             env, TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor), start
@@ -154,9 +157,10 @@ def simulation(
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
+    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn)
     if planned is None or number is None:
-        return Simulation(rollouts, goal, result)
-    return _without_failed(Simulation(rollouts, goal, result), planned, number[:, :, :taken].flatten(1, 2))
+        return whole
+    return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
 
 
 def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:

@@ -5,8 +5,11 @@ Legend: B scenes, S branches, T steps, N agents, K states drawn.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from symphony import keys
 from symphony.collectors import BeamSearchCollector
@@ -17,14 +20,12 @@ from symphony.simulation.demonstrations import SceneDataset
 
 _RANK = ("collector", "beam_rank")
 _LEARNED = (
-    keys.OWN,
-    keys.OBJECTS,
+    *keys.SEEN,
     keys.OBJECTS_MASK,
-    keys.POINTS,
     keys.POINTS_MASK,
+    keys.LIGHTS_MASK,
     keys.VALID,
     keys.ACTION,
-    keys.ROUTE,
     keys.ROLLOUT,
     keys.RANK,
 )
@@ -63,18 +64,26 @@ class SearchReplay:
             raise RuntimeError("nothing was searched yet")
         return self._leaves
 
-    def survivors(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
+    def survivors(
+        self,
+        count: int,
+        rng: torch.Generator,
+        observation: ObservationConfig,
+        which: Literal["all", "best"] = "all",
+    ) -> TensorDict:
         """States of surviving rollouts and what was done in them, drawn uniformly from all before the scenes' ends.
 
         Args:
             count: K.
             rng: of the draw.
             observation: what the policy sees.
+            which: of every surviving rollout, or only of the best of each tree.
 
         Returns:
             TensorDict [K, N]: observation, ``ACTION``, ``RANK`` of the rollout in its tree, ``ROLLOUT`` (True).
         """
-        chosen = _drawn(self.env, self.leaves, count, rng)
+        wanted = self.leaves.get(_RANK) == 0 if which == "best" else None
+        chosen = _drawn(self.env, self.leaves, count, rng, wanted)
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
         valid = batch.get(keys.VALID)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
@@ -169,9 +178,15 @@ def _after(steps: TensorDictBase) -> TensorDictBase:
     return kept.update(TensorDict(after, batch_size=kept.batch_size))
 
 
-def _drawn(env: DrivingEnv, steps: TensorDictBase, count: int, rng: torch.Generator) -> TensorDictBase:
-    """Some [K] of the steps [*b] before their scenes' last, uniformly with replacement."""
-    counted = steps.get(keys.STEP) < env.scenes.last_step[steps.get(keys.SCENE)]
-    rows = counted.squeeze(-1).nonzero()
+def _drawn(
+    env: DrivingEnv,
+    steps: TensorDictBase,
+    count: int,
+    rng: torch.Generator,
+    wanted: Tensor | None = None,
+) -> TensorDictBase:
+    """Some [K] of the wanted steps [*b] before their scenes' last, uniformly with replacement."""
+    counted = (steps.get(keys.STEP) < env.scenes.last_step[steps.get(keys.SCENE)]).squeeze(-1)
+    rows = (counted if wanted is None else counted & wanted).nonzero()
     pick = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)]
     return steps[tuple(pick.unbind(-1))]

@@ -1,0 +1,131 @@
+"""Demonstrations kept with their store, so that a segment is fitted once and not once a run."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import symphony
+from symphony.envs.routes import POINTS, RouteTable
+from symphony.files import replacing
+from symphony.simulation.experts import Experts
+
+VERSION = 1
+"""Of the fit: raised when it gives something else for the same segment."""
+PACKAGE = Path(symphony.__file__).parent
+FOLDER = "experts"
+"""Of a store's."""
+
+
+class KeptExperts:
+    """Files of demonstrations in a store's folder, one a segment, named after all that they depend on.
+
+    They are a cache: a file that is missing or damaged is made anew, and where the folder can't be written or belongs
+    to the package, nothing is kept. Arrays only, nothing pickled.
+
+    Args:
+        store: the store's folder.
+        settings: what the fit depends on beside the segment's content.
+    """
+
+    def __init__(self, store: Path, settings: str) -> None:
+        self.settings = settings
+        self.folder: Path | None = None if PACKAGE in store.resolve().parents else store / FOLDER
+        try:
+            if self.folder is not None:
+                self.folder.mkdir(exist_ok=True)
+        except OSError:
+            self.folder = None
+
+    def _path(self, content: str) -> Path | None:
+        key = hashlib.sha256(f"{VERSION} {content} {self.settings}".encode()).hexdigest()
+        return None if self.folder is None else self.folder / f"{key[:32]}.npz"
+
+    def load(self, content: str) -> Experts | None:
+        """Those of the segment with this hash; None where there are none that can be read."""
+        path = self._path(content)
+        if path is None or not path.is_file():
+            return None
+        try:
+            # Opened here: NumPy leaves a damaged file open.
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+                return _from_arrays({name: file[name] for name in file.files})
+        except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile):
+            return None
+
+    def save(self, content: str, experts: Experts) -> None:
+        """Keep those of a segment, if the folder can be written and the disk has room."""
+        path = self._path(content)
+        if path is None or not os.access(path.parent, os.W_OK):
+            return
+        try:
+            with replacing(path) as draft, draft.open("wb") as file:
+                np.savez(file, allow_pickle=False, **_to_arrays(experts))
+        except OSError:
+            self.folder = None
+
+
+def _to_arrays(experts: Experts) -> dict[str, NDArray[Any]]:
+    routes = experts.routes
+    arrays = {
+        name: getattr(experts, name).numpy() for name in ("agent", "states", "actions", "valid", "error")
+    }
+    return arrays | {
+        "route_number": np.array([len(table.count) for table in routes], np.int64),
+        "route_points": np.concatenate(
+            [np.zeros((0, POINTS, 2), np.float32), *(table.points for table in routes)]
+        ),
+        "route_count": np.concatenate([np.zeros(0, np.int64), *(table.count for table in routes)]),
+        "route_right": np.concatenate([np.zeros(0, np.bool_), *(table.right for table in routes)]),
+        "route_logged": np.array([table.logged for table in routes], np.int64),
+    }
+
+
+def _from_arrays(arrays: dict[str, NDArray[Any]]) -> Experts:
+    """The inverse; ValueError where the arrays don't fit together."""
+    agents, steps = len(arrays["agent"]), arrays["states"].shape[1]
+    ends = arrays["route_number"].cumsum()
+    total = int(ends[-1]) if len(ends) else 0
+    expected = {
+        "states": (agents, steps, 4),
+        "valid": (agents, steps - 1),
+        "error": (agents,),
+        "route_points": (total, POINTS, 2),
+        "route_count": (total,),
+        "route_right": (total,),
+        "route_logged": (len(ends),),
+    }
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, expected {shape}")
+    if arrays["actions"].shape[:2] != (agents, steps - 1) or len(ends) not in (0, agents):
+        raise ValueError("actions or routes of another number of agents")
+    tables = tuple(
+        RouteTable(
+            arrays["route_points"][end - count : end],
+            arrays["route_count"][end - count : end],
+            arrays["route_right"][end - count : end],
+            int(logged),
+        )
+        for end, count, logged in zip(ends, arrays["route_number"], arrays["route_logged"], strict=True)
+    )
+
+    def tensor(name: str) -> Tensor:
+        return torch.from_numpy(arrays[name])
+
+    return Experts(
+        agent=tensor("agent"),
+        states=tensor("states"),
+        actions=tensor("actions"),
+        valid=tensor("valid"),
+        error=tensor("error"),
+        routes=tables,
+    )

@@ -1,0 +1,114 @@
+"""Logged states displaced, with the action that leads smoothly back: what a log alone never shows.
+
+A policy that has only seen the log does not know what to do beside it (the cause of behavioural cloning's drift). The
+labels are those of a critically damped return to the logged motion, along and across it.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from symphony.config import PerturbConfig
+from symphony.envs.dynamics import Bicycle, Displacement, bicycle_inverse, bicycle_step
+from symphony.geometry.frames import rotate, wrap
+
+ALONG, ACROSS = 1.5, 1.0
+"""Seconds in which an error along and across the road dies out to a third or so."""
+SLOWEST = 2.0
+"""m/s below which steering is not made harder, however slow the vehicle."""
+STEERING, BRAKING = 0.5, 4.0
+"""Largest steering angle in radians and acceleration in m/s^2 of the way back."""
+
+
+def displaced(
+    logged: Float[Tensor, "M 4"], config: PerturbConfig, rng: torch.Generator
+) -> Float[Tensor, "M 4"]:
+    """States x, y, heading, speed near logged ones.
+
+    Errors are normal, times a number drawn uniformly from 0 to 1 for each state. Slow vehicles are moved less across
+    and turned less, fast ones are turned less, so that no vehicle starts off sideways.
+    """
+    normal = torch.randn(len(logged), 4, generator=rng)
+    share = torch.rand(len(logged), generator=rng)
+    speed = logged[:, 3].abs()
+    slow = (speed / 4.0).clamp_max(1.0)
+    shift = torch.stack([normal[:, 0] * config.along, normal[:, 1] * config.across * slow], -1)
+    turn = normal[:, 2] * config.heading * slow * (8.0 / speed.clamp_min(8.0))
+    faster = normal[:, 3] * config.speed
+    return torch.cat(
+        [
+            logged[:, :2] + rotate(share[:, None] * shift, logged[:, 2]),
+            (logged[:, 2] + share * turn)[:, None],
+            (logged[:, 3] + share * faster).clamp_min(0.0)[:, None],
+        ],
+        -1,
+    )
+
+
+def way_back(
+    state: Float[Tensor, "M 4"],
+    logged: Float[Tensor, "M 4"],
+    following: Float[Tensor, "M 4"],
+    length: Float[Tensor, " M"],
+    dt: float,
+) -> Float[Tensor, "M 4"]:
+    """The state a step later on a smooth return to the log.
+
+    Where ``state`` is the logged one, it keeps the log's acceleration and curvature.
+
+    Args:
+        state: x, y, heading, speed of the vehicle.
+        logged: of the log at that time.
+        following: of the log a step later.
+        length: of the boxes, metres.
+        dt: seconds per step.
+    """
+    error = rotate(state[:, :2] - logged[:, :2], -logged[:, 2])
+    turned, faster = wrap(state[:, 2] - logged[:, 2]), state[:, 3] - logged[:, 3]
+    acceleration = (following[:, 3] - logged[:, 3]) / dt - 2.0 / ALONG * faster - error[:, 0] / ALONG**2
+    acceleration = acceleration.clamp(-BRAKING, BRAKING)
+    travelled = (0.5 * (logged[:, 3] + following[:, 3]) * dt).clamp_min(0.5 * dt)
+    curvature = wrap(following[:, 2] - logged[:, 2]) / travelled
+    after = (state[:, 3] + acceleration * dt).clamp_min(0.0)
+    pace = 0.5 * (state[:, 3] + after)
+    turn = curvature * pace - 2.0 / ACROSS * turned - error[:, 1] / (ACROSS**2 * pace.clamp_min(SLOWEST))
+    target = torch.stack([state[:, 0], state[:, 1], state[:, 2] + turn * dt, after], -1)
+    acceleration, steering = bicycle_inverse(state, target, length, dt)
+    return bicycle_step(state, acceleration, steering.clamp(-STEERING, STEERING), length, dt)
+
+
+def perturbed(
+    state: Float[Tensor, "M 4"],
+    action: Tensor,
+    logged: Float[Tensor, "M 4"],
+    following: Float[Tensor, "M 4"],
+    size: Float[Tensor, "M 2"],
+    dynamics: Bicycle | Displacement,
+    dt: float,
+    config: PerturbConfig,
+    rng: torch.Generator,
+) -> tuple[Float[Tensor, "M 4"], Tensor]:
+    """Expert states and actions, a share of them displaced and labelled with the action that comes nearest to the way
+    back.
+
+    Args:
+        state: x, y, heading, speed of the fitted experts.
+        action: their actions [M] or [M, 2].
+        logged: of the log at that time.
+        following: of the log a step later.
+        size: of the boxes, metres.
+        dynamics: the action space.
+        dt: seconds per step.
+        config: how many and how far.
+        rng: for all draws.
+    """
+    chosen = torch.rand(len(state), generator=rng) < config.share
+    start = displaced(logged, config, rng)
+    target = way_back(start, logged, following, size[:, 0], dt)
+    pair = torch.stack([start, target], 1)
+    known = torch.ones(pair.shape[:2], dtype=torch.bool)
+    label, _ = dynamics.fit(pair[..., :2], pair[..., 2], pair[..., 3], known, size, dt)
+    wide = chosen if action.ndim == 1 else chosen[:, None]
+    return torch.where(chosen[:, None], start, state), torch.where(wide, label[:, 0].to(action.dtype), action)

@@ -1,0 +1,186 @@
+"""What sampling alone adds to a divergence, who stands at the end, and what a search makes of goals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symphony.geometry import rotate
+from symphony.metrics import (
+    Choice,
+    RolloutMetrics,
+    choices,
+    jensen_shannon,
+    route_turns,
+    sampled_divergence,
+    sampling_floor,
+    standing_at_end,
+)
+from symphony.metrics.choices import choice_numbers
+
+BINS = 15
+
+
+def perfect(
+    segments: int, rollouts: int, rng: np.random.Generator, copies: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Visits of a policy that does what the log does: both drawn from what is usual in each segment."""
+    usual = rng.dirichlet(np.full(BINS, 0.3), segments)
+    policy = np.stack([rng.multinomial(rollouts // copies, p) for p in usual]) * copies
+    return policy, np.stack([rng.multinomial(1, p) for p in usual])
+
+
+def means(segments: int, rollouts: int, copies: int = 1, trials: int = 60) -> np.ndarray:
+    """Value, bias, corrected value and its error of every trial [trials, 4]."""
+    rng = np.random.default_rng(segments + rollouts + copies)
+    found = [sampled_divergence(*perfect(segments, rollouts, rng, copies)) for _ in range(trials)]
+    return np.array([[one.value, one.value - one.corrected, one.corrected, one.error] for one in found])
+
+
+@pytest.mark.parametrize(("segments", "rollouts"), [(100, 4), (100, 16), (400, 4)])
+def test_a_perfect_policy_is_corrected_to_zero(segments: int, rollouts: int) -> None:
+    found = means(segments, rollouts)
+    value, bias, corrected, error = found.mean(0)
+    assert bias == pytest.approx(value, rel=0.25)
+    assert abs(corrected) < error, "zero within its error"
+    assert abs(corrected) < value / 4
+    assert found[:, 2].std() < 2 * error
+
+
+def test_more_data_lower_the_bias_and_alike_rollouts_do_not() -> None:
+    few, many = means(100, 16)[:, 1].mean(), means(400, 16)[:, 1].mean()
+    assert many == pytest.approx(few / 4, rel=0.3)
+    assert means(100, 4)[:, 1].mean() > few
+    # Sixteen rollouts that are copies of four are four.
+    assert means(100, 16, copies=4)[:, 1].mean() == pytest.approx(means(100, 4)[:, 1].mean(), rel=0.15)
+
+
+def test_what_differs_is_left_when_the_bias_is_taken_away() -> None:
+    rng = np.random.default_rng(0)
+    p, q = rng.dirichlet(np.ones(BINS), 2)
+    middle = (p + q) / 2
+    true = 0.5 * (p * np.log(p / middle) + q * np.log(q / middle)).sum()
+    found = [sampled_divergence(rng.multinomial(4, p, 200), rng.multinomial(1, q, 200)) for _ in range(60)]
+    corrected, value = (np.array(x) for x in ([d.corrected for d in found], [d.value for d in found]))
+    assert abs(corrected.mean() - true) < 3 * corrected.std() / math.sqrt(60) + 0.02 * true
+    assert abs(value.mean() - true) > abs(corrected.mean() - true)
+    assert np.mean([d.error for d in found]) == pytest.approx(corrected.std(), rel=0.3)
+
+
+def test_a_single_sample_has_no_error() -> None:
+    found = sampled_divergence(np.array([[1, 2]]), np.array([[0, 1]]))
+    assert found.value > 0
+    assert math.isnan(found.corrected)
+    assert math.isnan(found.error)
+
+
+@pytest.mark.parametrize("segments", [50, 200])
+def test_the_floor_is_what_another_log_scores(segments: int) -> None:
+    rng = np.random.default_rng(segments)
+    p = rng.dirichlet(np.full(BINS, 0.5))
+    logs = [np.eye(BINS, dtype=int)[rng.choice(BINS, segments, p=p)] for _ in range(60)]
+    floors = [sampling_floor(log) for log in logs]
+    # One of the two samples is as large as life, as many rollouts would be.
+    other = [float(jensen_shannon(log.sum(0), p)) for log in logs]
+    assert np.mean(floors) == pytest.approx(np.mean(other), rel=0.25)
+    assert sampling_floor(np.concatenate([logs[0]] * 4)) == pytest.approx(floors[0] / 4, rel=0.25)
+    # A perfect policy on the very segments scores less, if segments differ in what is usual.
+    trials = [perfect(segments, 1600, rng) for _ in range(20)]
+    scored = np.mean([sampled_divergence(policy, log).value for policy, log in trials])
+    assert scored < np.mean([sampling_floor(log) for _, log in trials])
+
+
+# --- standing ---
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=20)
+def test_who_stands_is_said_of_agents_whose_log_lasts(seed: int) -> None:
+    torch.manual_seed(seed)
+    state, log = torch.rand(3, 2, 5, 2, 4), torch.rand(3, 5, 2, 4)
+    logged, last = torch.rand(3, 5, 2) < 0.6, torch.tensor([4, 2, 0])
+    found = standing_at_end(state, log, logged, last)
+    for b, step in enumerate(last.tolist()):
+        assert torch.equal(found.rollouts[b], state[b, :, step, :, 3] < 0.5)
+        assert torch.equal(found.log[b], log[b, step, :, 3] < 0.5)
+        assert torch.equal(found.counted[b], logged[b, step])
+    metrics, shape = RolloutMetrics(), (3, 2, 2, 4)
+    nothing = torch.zeros(shape, dtype=torch.bool)
+    metrics.update(
+        ["a", "b", "c"],
+        collided=nothing,
+        offroad=nothing,
+        displacement=torch.zeros(shape),
+        simulated=~nothing,
+        logged=torch.ones(3, 2, 4, dtype=torch.bool),
+        curvature=[np.zeros(1)] * 3,
+        curvature_log=[np.zeros(1)] * 3,
+        standing=found,
+    )
+    numbers, there = metrics.compute(), found.counted
+    if there.any():
+        both = found.rollouts.transpose(0, 1)[:, there]
+        assert numbers["standing"] == pytest.approx(100 * both.float().mean().item())
+        assert numbers["standing_log"] == pytest.approx(100 * found.log[there].float().mean().item())
+    else:
+        assert math.isnan(numbers["standing"])
+
+
+# --- goals ---
+
+
+def arc(angle: float, points: int = 30) -> torch.Tensor:
+    """A route that is straight, then turns by an angle to the left, then goes on."""
+    heading = torch.zeros(points, dtype=torch.float64)
+    heading[10:15] = torch.linspace(0, angle, 5, dtype=torch.float64)
+    heading[15:] = angle
+    return torch.stack([heading.cos(), heading.sin()], -1).cumsum(0) * 3.0
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-2.6, 2.6), st.floats(-500, 500))
+def test_turns_do_not_depend_on_where_a_route_lies(turn: float, angle: float, shift: float) -> None:
+    if abs(abs(angle) - math.radians(45)) < 1e-3:
+        return
+    routes = torch.stack([arc(angle), arc(-angle)])
+    moved = rotate(routes, torch.tensor(turn, dtype=torch.float64)) + shift
+    count = torch.tensor([30, 30])
+    wanted = 0 if abs(angle) < math.radians(45) else int(np.sign(angle))
+    assert (route_turns(routes, count) - 1).tolist() == [wanted, -wanted]
+    assert (route_turns(moved, count) - 1).tolist() == [wanted, -wanted]
+    # What lies past the end of a route is no part of it.
+    assert route_turns(routes, torch.tensor([9, 9])).tolist() == [1, 1]
+
+
+def test_by_hand() -> None:
+    drawn = torch.tensor([[[0, -1], [0, -1], [1, -1], [2, -1]]])
+    kept = torch.tensor([[[0, -1], [0, -1]]])
+    turn = torch.tensor([[[2, 1, 0], [1, 1, 1]]])
+    (one,) = choices(drawn, kept, turn, torch.tensor([2.0]))
+    assert one.drawn.tolist() == [1, 1, 2]
+    assert one.kept.tolist() == [0, 0, 2]
+    assert one.variation == 0.5
+    numbers = choice_numbers([one])
+    assert (numbers["goals_drawn_left"], numbers["goals_kept_left"]) == (50, 100)
+    assert numbers["goals_turn_variation"] == pytest.approx(0.5)
+    assert numbers["goals_founders"] == 2
+    nothing = choice_numbers([Choice(np.zeros(3, int), np.zeros(3, int), math.nan, 1.0)])
+    assert math.isnan(nothing["goals_variation"])
+
+
+@given(st.permutations(range(6)), st.integers(0, 2**31))
+@settings(max_examples=20)
+def test_a_search_that_keeps_all_moves_no_goal(order: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drawn = torch.tensor(rng.integers(0, 4, (1, 6, 2)))
+    turn = torch.tensor(rng.integers(0, 3, (1, 2, 4)))
+    (one,) = choices(drawn, drawn[:, list(order)], turn, torch.tensor([6.0]))
+    assert one.variation == 0
+    assert one.drawn.tolist() == one.kept.tolist()
+    # One route for all moves the most, and by no more than 1.
+    (moved,) = choices(drawn, drawn[:, :1].expand(-1, 6, -1), turn, torch.tensor([1.0]))
+    assert 0 <= moved.variation < 1

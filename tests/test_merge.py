@@ -1,0 +1,56 @@
+"""Several stores as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from symphony.cli import main
+from symphony.data.builtin import builtin_store
+from symphony.data.merge import merge
+from symphony.data.segment import content_hash
+from symphony.data.store import SegmentStore, StoreWriter
+from symphony.errors import DataError
+
+PARTS = [builtin_store("train"), builtin_store("test")]
+
+
+def test_the_merged_store_holds_every_segment_as_it_was(tmp_path: Path) -> None:
+    stores = [SegmentStore(path) for path in PARTS]
+    told: list[tuple[int, int]] = []
+    merged = merge(PARTS, tmp_path / "all", lambda done, total: told.append((done, total)))
+    merged.verify()
+    assert len(merged) == sum(map(len, stores)) == told[-1][0] == told[-1][1]
+    offset = 0
+    for store in stores:
+        for k in (0, len(store) - 1):
+            assert content_hash(merged[offset + k]) == content_hash(store[k])
+            assert merged.tags(offset + k) == store.tags(k)
+        offset += len(store)
+    assert merged.groups.tolist() == [name for store in stores for name in store.groups.tolist()]
+
+
+def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
+    with StoreWriter(tmp_path / "all.partial") as writer:
+        writer.copy(SegmentStore(PARTS[0]), 3)
+    assert merge(PARTS[1:], tmp_path / "all").checksum() == SegmentStore(PARTS[1]).checksum()
+    assert not (tmp_path / "all.partial").exists()
+
+
+def test_the_same_segment_twice_another_time_step_and_what_is_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="in the store already"):
+        merge([PARTS[0], PARTS[0]], tmp_path / "twice")
+    assert not (tmp_path / "twice").exists()
+    store = SegmentStore(PARTS[0])
+    with StoreWriter(tmp_path / "slow") as writer:
+        writer.append(store[0].replace(dt=0.1, segment_id="slow"))
+    with pytest.raises(DataError, match=r"0\.1 s, 0\.2 s"):
+        merge([PARTS[1], tmp_path / "slow"], tmp_path / "mixed")
+    with pytest.raises(DataError, match="exists already"):
+        merge(PARTS, tmp_path / "slow")
+
+
+def test_the_command_says_what_there_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "merge", *map(str, PARTS), "--out", str(tmp_path / "all")]) == 0
+    assert str(sum(len(SegmentStore(path)) for path in PARTS)) in capsys.readouterr().out
