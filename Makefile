@@ -24,7 +24,7 @@ setup: $(DEV)  ## create .venv with everything for development
 demo: $(CORE)  ## learn from the built-in data and write pictures and numbers to out/demo
 	$(BIN)/symphony demo --out out/demo
 
-table: $(CORE)  ## train, judge and compare all eight methods, tiny, in out/table
+table: $(CORE)  ## train, evaluate and compare all eight methods, tiny, in out/table
 	$(BIN)/python scripts/make_table.py --out out/table
 
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile

@@ -60,10 +60,10 @@ def main() -> None:
 
         return call
 
-    step, policy, judge = env._step, networks.policy.forward, networks.discriminator.forward
+    step, policy, discriminator = env._step, networks.policy.forward, networks.discriminator.forward
     env._step = timed("environment", step)
     networks.policy.forward = timed("policy", policy)
-    networks.discriminator.forward = timed("discriminator", judge)
+    networks.discriminator.forward = timed("discriminator", discriminator)
 
     def once() -> TensorDictBase:
         with torch.no_grad():

@@ -133,11 +133,11 @@ def search(
     )
     torch.manual_seed(0)
     policy = discrete_policy(SELF_FEATURES, groups)
-    judge = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features=features)
+    realism = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features=features)
     env = DrivingEnv(builtin(16), Bicycle(), config)
     rows = torch.arange(16)[:, None].expand(-1, branches)
     start = env.start(rows, torch.arange(branches).expand(rows.shape))
-    score = KeyScore(keys.SCORE, judge, valid_key=keys.VALID)
+    score = KeyScore(keys.SCORE, realism, valid_key=keys.VALID)
 
     def act(state: Any) -> Any:
         if noise:

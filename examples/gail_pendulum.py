@@ -56,11 +56,11 @@ def main(iterations: int = 60, rows: int = 16, branches: int = 16, updates: int 
         Net(MLP(3, 2, num_cells=[64, 64]), NormalParamExtractor()), STATE, ["loc", "scale"]
     )
     actor = ProbabilisticActor(heads, ["loc", "scale"], distribution_class=torques)
-    judge = TensorDictModule(Net(MLP(3, 1, num_cells=[64, 64]), nn.Flatten(-2)), STATE, ["score"])
+    discriminator = TensorDictModule(Net(MLP(3, 1, num_cells=[64, 64]), nn.Flatten(-2)), STATE, ["score"])
     collector = BeamSearchCollector(
         with_rows(PendulumEnv(), [rows]),
         actor,
-        score=KeyScore("score", judge),
+        score=KeyScore("score", discriminator),
         branches=branches,
         leaves=branches,
         keep_tree=True,  # the discriminator also learns from what was dropped
@@ -70,10 +70,10 @@ def main(iterations: int = 60, rows: int = 16, branches: int = 16, updates: int 
         frames_per_batch=rows * branches * STEPS,
         total_frames=iterations * rows * branches * STEPS,
     )
-    policy_loss, judge_loss = BCLoss(actor), DiscriminatorLoss(judge, gradient_penalty=0.1)
+    policy_loss, discriminator_loss = BCLoss(actor), DiscriminatorLoss(discriminator, gradient_penalty=0.1)
     policy_loss.set_keys(action="action")
-    judge_loss.set_keys(score="score", simulated="simulated")
-    optimizer = torch.optim.Adam([*actor.parameters(), *judge.parameters()], lr=5e-3)
+    discriminator_loss.set_keys(score="score", simulated="simulated")
+    optimizer = torch.optim.Adam([*actor.parameters(), *discriminator.parameters()], lr=5e-3)
     logged, simulated, survivors = (
         TensorDictReplayBuffer(storage=LazyTensorStorage(256_000), batch_size=512) for _ in range(3)
     )
@@ -86,7 +86,7 @@ def main(iterations: int = 60, rows: int = 16, branches: int = 16, updates: int 
         for _ in range(updates):
             both = torch.cat([simulated.sample(), logged.sample()])
             both["simulated"] = torch.arange(len(both)) < len(both) // 2
-            losses = judge_loss(both).update(policy_loss(survivors.sample()))
+            losses = discriminator_loss(both).update(policy_loss(survivors.sample()))
             optimizer.zero_grad()
             (losses["loss_discriminator"] + losses["loss_bc"]).backward()
             optimizer.step()

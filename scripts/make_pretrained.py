@@ -121,9 +121,9 @@ def read_run(folder: Path) -> TrainConfig:
 
 def without_paths(config: TrainConfig) -> TrainConfig:
     """The configuration with names in place of paths of the machine it was used on."""
-    judged = config.validation
-    if judged.data is not None:
-        judged = replace(judged, data=Path(data_name(judged.data)))
+    evaluated = config.validation
+    if evaluated.data is not None:
+        evaluated = replace(evaluated, data=Path(data_name(evaluated.data)))
     before = config.warm_start
     return replace(
         config,
@@ -131,7 +131,7 @@ def without_paths(config: TrainConfig) -> TrainConfig:
         out=Path(config.out.name),
         # The last part also where a checkpoint is named.
         warm_start=None if before is None else Path(before.name),
-        validation=judged,
+        validation=evaluated,
         resume=False,
         wandb="disabled",
         device="cpu",
@@ -188,9 +188,9 @@ def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> Non
         pairs += [(name, how[name], getattr(search, name)) for name in ("rule", "prune_every")]
         if search.rule == "systematic":
             pairs.append(("temperature", how["temperature"], search.temperature))
-    for what, judged, own in pairs:
-        if judged != own:
-            raise ConfigError(f"the evaluation is of another agent: {what} {judged}, not {own}")
+    for what, evaluated, own in pairs:
+        if evaluated != own:
+            raise ConfigError(f"the evaluation is of another agent: {what} {evaluated}, not {own}")
 
 
 def card(name: str, source: Source, config: TrainConfig, parameters: dict[str, int]) -> str:

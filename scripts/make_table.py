@@ -18,26 +18,6 @@ from symphony.config import METHODS
 from symphony.data.builtin import builtin_store
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
-SIZES = {
-    "--steps": "120",
-    "--segments": "8",
-    "--states": "256",
-    "--agent.num-points": "64",
-    "--agent.hidden": "32",
-    "--agent.head": "32",
-    "--checkpoint-every": "60",
-    "--search.segments": "4",
-    "--search.branches": "4",
-    "--search.test-branches": "4",
-    "--search.updates": "10",
-    "--search.states": "64",
-    "--discriminator.states": "64",
-    "--mgail.regression": "80",
-    "--mgail.head-start": "10",
-    "--mgail.rollouts": "4",
-    "--rollouts": "4",
-}
-"""In place of those of the profile ``smoke``."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -56,7 +36,7 @@ def main(args: Sequence[str] | None = None) -> int:
             shutil.rmtree(run)
         given = {word.partition("=")[0] for word in further}
         places = {"--data": builtin_store("train"), "--test": builtin_store("test"), "--out": run}
-        flags = {**places, "--profile": "smoke", **SIZES}
+        flags = {**places, "--profile": "tiny", "--rollouts": "4"}
         recipe = runpy.run_path(str(RECIPES / f"{method}.py"))
         kept = [str(word) for flag, value in flags.items() if flag not in given for word in (flag, value)]
         recipe["main"]([*kept, *further])

@@ -26,7 +26,7 @@ from symphony.simulation import SceneDataset
 from symphony.training import Processes, Trainer, processes
 
 WORLD = 2
-LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "judge": "realism_loss"}
+LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "realism": "realism_loss"}
 TRAINED = ("bc", "bc_ts_h", "mgail_ts")
 CPU = torch.device("cpu")
 
@@ -54,7 +54,7 @@ def batch_for(kind: str, trainer: Trainer) -> TensorDictBase:
     rng, data, sees = torch.Generator().manual_seed(1), trainer.data, trainer.agent.observation
     if kind == "goals":
         batch = data.sample_goals([0, 1], 32, sees, rng)
-    elif kind == "judge":
+    elif kind == "realism":
         replay = pieces(trainer)["replay"]
         trainer.rng.manual_seed(1)
         replay.refresh(0)
@@ -82,7 +82,7 @@ def descended(trainer: Trainer, kind: str, batch: TensorDictBase) -> tuple[dict[
 
 def compare(kind: str, store: Path, world: Processes) -> dict[str, Any]:
     """The loss of one half of a batch in each process beside that of all of it in one."""
-    method = {"bc": "bc", "distillation": "bc_ts", "goals": "bc_h", "judge": "bc_ts"}[kind]
+    method = {"bc": "bc", "distillation": "bc_ts", "goals": "bc_h", "realism": "bc_ts"}[kind]
     alone, together = fresh(method, store, Processes(CPU)), fresh(method, store, world)
     batch = batch_for(kind, alone)
     half = len(batch) // WORLD

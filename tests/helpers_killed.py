@@ -48,8 +48,8 @@ DEATHS = (
 
 def config(method: Any, store: Path, out: Path) -> TrainConfig:
     """Of a run with more checkpoints than are kept."""
-    judged = ValidationConfig(data=store, segments=1, rollouts=1)
-    return helpers_runs.tiny(method, store, out, steps=STEPS, validation=judged, resume=True)
+    evaluated = ValidationConfig(data=store, segments=1, rollouts=1)
+    return helpers_runs.tiny(method, store, out, steps=STEPS, validation=evaluated, resume=True)
 
 
 def die_at(name: str, count: int, file: str, report: int) -> None:

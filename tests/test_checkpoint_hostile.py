@@ -207,15 +207,15 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 
 @pytest.mark.parametrize("at", ["best", "skips", "processes"])
 def test_what_a_run_keeps_is_looked_at_when_it_goes_on(at: str, store: Path, tmp_path: Path) -> None:
-    judged = ValidationConfig(data=store, segments=1, rollouts=1)
-    train(tiny("bc", store, tmp_path / "run", validation=judged))
+    evaluated = ValidationConfig(data=store, segments=1, rollouts=1)
+    train(tiny("bc", store, tmp_path / "run", validation=evaluated))
     file = checkpoints(tmp_path / "run" / "checkpoints")[-1] / MANIFEST
     good = json.loads(file.read_text())
     assert good["parts"]["extra"]["state"]["best"] is not None
     for new in ("x", -1, {"step": "one", "infractions": 2}):
         file.write_text(json.dumps(put(good, ("parts", "extra", "state", at), new)))
         with pytest.raises(CheckpointError) as caught:
-            train(tiny("bc", store, tmp_path / "run", steps=6, validation=judged, resume=True))
+            train(tiny("bc", store, tmp_path / "run", steps=6, validation=evaluated, resume=True))
         assert (caught.value.file, caught.value.field) == (file, f"extra.{at}")
         if at == "best":
             with pytest.raises(CheckpointError, match=MANIFEST):

@@ -340,7 +340,7 @@ class LinesReader(Reader):
         made = straight_road(3, num_lanes=lanes, steps=21)
         x, lane, speed = (np.clip(column, -1e6, 1e6).astype(np.float32) for column in table.T)
         time = np.arange(21, dtype=np.float32) * np.float32(0.2)
-        # One successor, so that the lane graph can be judged.
+        # One successor, so that the lane graph can be checked.
         ahead = [made.road.lanes[k] + np.float32([400, 0, 0]) for k in range(lanes)]
         graph = dataclasses.replace(
             made.road,

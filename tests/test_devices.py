@@ -36,7 +36,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 @pytest.mark.parametrize("method", get_args(Method))
-def test_a_method_trains_and_is_judged_on_the_device_it_is_given(
+def test_a_method_trains_and_is_evaluated_on_the_device_it_is_given(
     method: Any, device: str, store: Path, tmp_path: Path
 ) -> None:
     short = MGAILConfig(regression=0, head_start=0, rollouts=4)

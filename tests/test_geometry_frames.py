@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from symphony.geometry import from_frame, rotate, to_frame, wrap
+from symphony.geometry import rotate, wrap
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -49,23 +49,11 @@ def test_rotate_by_a_quarter_turn_is_counter_clockwise():
     torch.testing.assert_close(turned, torch.tensor([-1.0, 2.0]))
 
 
-def test_frame_puts_forward_on_x_and_left_on_y():
-    origin, heading = torch.tensor([10.0, 5.0]), torch.tensor(math.pi / 2)
-    ahead, left = torch.tensor([10.0, 8.0]), torch.tensor([7.0, 5.0])
-    torch.testing.assert_close(to_frame(ahead, origin, heading), torch.tensor([3.0, 0.0]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(to_frame(left, origin, heading), torch.tensor([0.0, 3.0]), atol=1e-6, rtol=0)
-
-
-def test_frames_are_inverse_and_keep_distances():
+def test_rotation_keeps_distances_and_its_inverse_turns_back():
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(3, 5, 7, 2, generator=generator, dtype=torch.float64) * 100
-    origin = torch.randn(3, 5, 1, 2, generator=generator, dtype=torch.float64) * 100
-    heading = torch.randn(3, 5, 1, generator=generator, dtype=torch.float64) * 9
-    local = to_frame(points, origin, heading)
-    torch.testing.assert_close(from_frame(local, origin, heading), points)
-    torch.testing.assert_close(to_frame(from_frame(points, origin, heading), origin, heading), points)
-    torch.testing.assert_close(local.norm(dim=-1), (points - origin).norm(dim=-1))
-    assert torch.autograd.gradcheck(
-        to_frame,
-        (points[0, 0].requires_grad_(), origin[0, 0].requires_grad_(), heading[0, 0].requires_grad_()),
-    )
+    angle = torch.randn(3, 5, 1, generator=generator, dtype=torch.float64) * 9
+    turned = rotate(points, angle)
+    torch.testing.assert_close(rotate(turned, -angle), points)
+    torch.testing.assert_close(turned.norm(dim=-1), points.norm(dim=-1))
+    assert torch.autograd.gradcheck(rotate, (points[0, 0].requires_grad_(), angle[0, 0].requires_grad_()))

@@ -153,12 +153,12 @@ def test_a_resumed_run_ends_like_an_uninterrupted_one(
 
 
 def test_so_does_one_whose_discriminator_sees_noise_and_a_penalty(store: Path, tmp_path: Path) -> None:
-    judge = DiscriminatorConfig(
+    discriminator = DiscriminatorConfig(
         hidden=8, head=8, states=8, instance_noise=0.1, gradient_penalty=0.1, features="foresight"
     )
-    whole = train(tiny("bc_ts", store, tmp_path / "whole", discriminator=judge))
+    whole = train(tiny("bc_ts", store, tmp_path / "whole", discriminator=discriminator))
     stopped(whole, tmp_path / "part", 2)
-    train(tiny("bc_ts", store, tmp_path / "part", discriminator=judge, resume=True))
+    train(tiny("bc_ts", store, tmp_path / "part", discriminator=discriminator, resume=True))
     assert same_weights(weights(tmp_path / "part"), weights(whole))
 
 
@@ -249,7 +249,7 @@ def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:
             SearchConfig(**bad)
 
 
-def test_the_command_line_trains_and_judges_a_method_with_search(store: Path, tmp_path: Path) -> None:
+def test_the_command_line_trains_and_evaluates_a_method_with_search(store: Path, tmp_path: Path) -> None:
     out, file = tmp_path / "run", tmp_path / "numbers.json"
     command = f"""train bc_ts --data {store} --out {out} --steps 2 --states 16 --wandb disabled
         --agent.hidden 8 --agent.head 8 --agent.num-points 12 --search.branches 2 --search.segments 2
@@ -275,7 +275,7 @@ def led_to(steps: TensorDictBase) -> TensorDictBase:
     return after.set(keys.STEP, steps[keys.STEP] + 1).set(keys.STATE, steps[("next", *keys.STATE)])
 
 
-def test_searches_are_judged_up_to_the_end_of_each_scene(store: Path, tmp_path: Path) -> None:
+def test_searches_are_scored_up_to_the_end_of_each_scene(store: Path, tmp_path: Path) -> None:
     wide = SearchConfig(branches=4, segments=3, prune_every=4, updates=2, states=8)
     record, replay = searched(store, tmp_path, search=wide)
     env, found = replay.env, replay.leaves

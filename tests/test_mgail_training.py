@@ -32,7 +32,7 @@ METHODS = ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h")
 SHORT = MGAILConfig(regression=2, head_start=2, rollouts=3)
 STILL = MGAILConfig(regression=0, head_start=9, rollouts=3)
 """Keeps a policy as it is."""
-JUDGED = EvaluateConfig(rollouts=2)
+SETTINGS = EvaluateConfig(rollouts=2)
 Trained = Callable[..., Path]
 
 
@@ -213,17 +213,17 @@ def test_a_killed_run_ends_like_an_unbroken_one(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_agent_is_judged_as_it_was_trained(trained: Trained, store: Path, method: str) -> None:
+def test_an_agent_is_evaluated_as_it_was_trained(trained: Trained, store: Path, method: str) -> None:
     agent = load_agent(str(trained(method)))
     assert agent.dynamics == Displacement()
     assert (agent.goals is None) == (not method.endswith("_h"))
     assert agent.discriminator is not None
-    usual = evaluate(agent, store, JUDGED).numbers()
+    usual = evaluate(agent, store, SETTINGS).numbers()
     assert usual["search"] == ("tree" if "_ts" in method else "none")
     assert all(math.isfinite(float(usual[name])) for name in ("ade", "collision_rate", "offroad_time"))
     # The other way works too.
     kind: Any = {"tree": "none", "none": "tree"}[str(usual["search"])]
-    other = evaluate(agent, store, replace(JUDGED, search=kind)).numbers()
+    other = evaluate(agent, store, replace(SETTINGS, search=kind)).numbers()
     assert other["search"] == kind
     assert other["ade"] != usual["ade"]
 
@@ -273,7 +273,7 @@ def test_a_segment_too_short_for_the_duration_is_named(store: Path, tmp_path: Pa
         config("mgail", store, tmp_path, duration=-1)
 
 
-def test_an_agent_is_judged_for_the_duration_it_was_trained_with(
+def test_an_agent_is_evaluated_for_the_duration_it_was_trained_with(
     trained: Trained, store: Path, tmp_path: Path
 ) -> None:
     run = train(config("mgail", store, tmp_path / "run", duration=1, steps=1))
@@ -282,9 +282,9 @@ def test_an_agent_is_judged_for_the_duration_it_was_trained_with(
     assert agent.spec is not None
 
     def numbers(of: int, asked: int, where: Path = store) -> Any:
-        judged = replace(JUDGED, duration=asked)
+        evaluated = replace(SETTINGS, duration=asked)
         other = replace(agent, spec=replace(agent.spec, duration=of))
-        return pytest.approx(evaluate(other, where, judged).numbers(), nan_ok=True)
+        return pytest.approx(evaluate(other, where, evaluated).numbers(), nan_ok=True)
 
     assert numbers(1, 0) == numbers(0, 1).expected
     assert numbers(2, 1) == numbers(1, 0).expected
@@ -307,6 +307,6 @@ def test_eight_agents_train(tmp_path: Path) -> None:
     assert all(0 < r["gradient_norm_policy"] < math.inf for r in records)
     assert records[-1]["skipped_updates"] == 0
     assert "policy_mgail_score" in records[-1]
-    found = evaluate(str(run), tmp_path / "store", JUDGED)
+    found = evaluate(str(run), tmp_path / "store", SETTINGS)
     assert found.interactive == 8
     assert math.isfinite(float(found.numbers()["ade"]))

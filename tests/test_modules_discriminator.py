@@ -1,4 +1,4 @@
-"""The discriminator: what it sees, what it does not, and which way its score points."""
+"""The discriminator: what it observes, what it does not, and which way its score points."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def observation(*batch, agents=3, objects=5, points=12, seed=0):
     return td
 
 
-def judge(features="clearance", seed=0, **changes):
+def realism(features="clearance", seed=0, **changes):
     torch.manual_seed(seed)
     return discriminator(4, 5, 4, hidden=16, head=(16,), features=features, **changes)
 
@@ -59,7 +59,7 @@ def judge(features="clearance", seed=0, **changes):
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
 def test_one_score_per_agent_and_none_for_padding(batch, features):
     td = observation(*batch)
-    score = judge(features)(td)[SCORE]
+    score = realism(features)(td)[SCORE]
     assert score.shape == (*batch, 3)
     assert (score[~td[VALID]] == 0).all()
     assert (score[td[VALID]] != 0).all()
@@ -68,7 +68,7 @@ def test_one_score_per_agent_and_none_for_padding(batch, features):
 @pytest.mark.parametrize("features", KINDS)
 @torch.no_grad()
 def test_a_padded_agent_may_hold_anything(features):
-    td, network = observation(20), judge(features)
+    td, network = observation(20), realism(features)
     plain = network(td.clone())[SCORE]
     empty = ~td[VALID]
     for key in network.in_keys:
@@ -81,7 +81,7 @@ def test_a_padded_agent_may_hold_anything(features):
 @settings(max_examples=10)
 @given(st.floats(0, 6.28), st.floats(1.001, 50), st.floats(0, 0.999))
 def test_nothing_beyond_the_radius_matters(angle, far, near):
-    network, td = judge(radius=0.8), observation()
+    network, td = realism(radius=0.8), observation()
     td[OBJECTS_MASK][0, 1] = td[POINTS_MASK][0, 4] = True
     turn = torch.tensor([angle]).cos(), torch.tensor([angle]).sin()
 
@@ -102,7 +102,7 @@ def test_nothing_beyond_the_radius_matters(angle, far, near):
 
 @torch.no_grad()
 def test_the_order_of_elements_and_their_padding_change_nothing():
-    td, network = observation(6), judge("foresight")
+    td, network = observation(6), realism("foresight")
     plain = network(td.clone())[SCORE]
     mixed = td.clone()
     order = torch.tensor([3, 0, 4, 1, 2])
@@ -121,7 +121,7 @@ def test_the_order_of_elements_and_their_padding_change_nothing():
 
 @torch.no_grad()
 def test_a_score_does_not_depend_on_the_batch():
-    td, network = observation(70), judge("foresight")
+    td, network = observation(70), realism("foresight")
     whole = network(td.clone())[SCORE]
     for rows in (slice(0, 1), slice(5, 38), slice(66, 70)):
         assert torch.equal(network(td[rows].clone())[SCORE], whole[rows])
@@ -135,7 +135,7 @@ def test_each_kind_reads_what_it_needs_and_no_more():
         "foresight": {ROAD, GAP, GAP_AHEAD},
     }
     for features, more in reads.items():
-        network = judge(features)
+        network = realism(features)
         assert set(network.in_keys) == {OWN, VALID, OBJECTS, OBJECTS_MASK, POINTS, POINTS_MASK} | more
         small = td.select(*network.in_keys)
         plain = network(small.clone())[SCORE]
@@ -167,7 +167,7 @@ def test_clearances_are_squashed_in_order(distance, more):
 
 @pytest.mark.parametrize("features", KINDS)
 def test_simulated_states_come_to_score_higher(features):
-    network, td = judge(features), observation(200, seed=1)
+    network, td = realism(features), observation(200, seed=1)
     td[VALID][:] = True
     td[SIMULATED] = torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) < 0.5
     # Separable by the agent's own first feature.
@@ -195,7 +195,7 @@ def test_overlap_alone_can_be_learned_from_gaps_but_not_without():
     td[GAP][..., 0] = torch.where(td[SIMULATED], -0.3, td[GAP][..., 0])
     found = {}
     for features in ("paper", "clearance"):
-        loss = DiscriminatorLoss(judge(features))
+        loss = DiscriminatorLoss(realism(features))
         optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
         for _ in range(25):
             optimizer.zero_grad()
@@ -208,7 +208,7 @@ def test_overlap_alone_can_be_learned_from_gaps_but_not_without():
 
 @pytest.mark.parametrize("features", ["clearance", "foresight"])
 def test_gradient_flows_through_every_floating_input(features):
-    td, network = observation(30), judge(features)
+    td, network = observation(30), realism(features)
     leaves = {k: td[k].requires_grad_() for k in network.in_keys if td[k].is_floating_point()}
     network(td)[SCORE].sum().backward()
     for key, leaf in leaves.items():

@@ -22,7 +22,7 @@ SIMULATED, VALID = ("agents", "simulated"), ("agents", "valid")
 PENALTY = {"gradient_penalty": 0.3}
 
 
-class Judge(nn.Module):
+class Discriminator(nn.Module):
     def __init__(self, dtype=torch.float32):
         super().__init__()
         self.net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1)).to(dtype)
@@ -33,7 +33,7 @@ class Judge(nn.Module):
 
 def discriminator(dtype=torch.float32):
     torch.manual_seed(0)
-    return TensorDictModule(Judge(dtype), in_keys=[OBSERVATION], out_keys=[SCORE])
+    return TensorDictModule(Discriminator(dtype), in_keys=[OBSERVATION], out_keys=[SCORE])
 
 
 def batch(*shape, agents=3):
@@ -174,7 +174,7 @@ def test_it_keeps_the_contract_of_torchrl(arguments):
 
 
 def test_the_key_of_the_score_can_be_set():
-    network = TensorDictModule(Judge(), in_keys=[OBSERVATION], out_keys=["score"])
+    network = TensorDictModule(Discriminator(), in_keys=[OBSERVATION], out_keys=["score"])
     loss = DiscriminatorLoss(network)
     with pytest.raises(KeyError, match="writes no score"):
         loss(batch(3))
@@ -184,7 +184,7 @@ def test_the_key_of_the_score_can_be_set():
 
 @pytest.mark.parametrize("penalty_on", ["data", "simulated", "both"])
 @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
-def test_the_penalty_of_a_linear_judge_is_its_weight(penalty_on, reduction):
+def test_the_penalty_of_a_linear_discriminator_is_its_weight(penalty_on, reduction):
     """The gradient of w . x is w wherever x is."""
     td = batch(20)
     net = nn.Linear(4, 1)
@@ -237,7 +237,7 @@ def scenes(count, elements):
     return td
 
 
-def scene_judge(pool):
+def scene_discriminator(pool):
     torch.manual_seed(3)
     network = SceneNetwork(SceneEncoder(5, [6], hidden=8, pool=pool), 1, head=(8,))
     keys = [("agents", "own"), VALID, ("agents", "objects"), ("agents", "objects_mask")]
@@ -248,7 +248,7 @@ def scene_judge(pool):
 def test_the_penalty_reaches_the_encoders_through_every_pool(pool):
     td = scenes(12, 50)
     assert (td[VALID] & ~td[SIMULATED]).any()
-    reference, network = scene_judge("dense"), scene_judge(pool)
+    reference, network = scene_discriminator("dense"), scene_discriminator(pool)
     for one in (reference, network):
         out = DiscriminatorLoss(one, gradient_penalty=5.0, penalty_on="both")(td)
         out["loss_discriminator"].backward()
@@ -266,14 +266,14 @@ def test_the_penalty_reaches_the_encoders_through_every_pool(pool):
 def test_the_penalty_is_that_of_each_agent_by_itself():
     td = scenes(12, 7)
     loss = DiscriminatorLoss(
-        scene_judge("winner"), gradient_penalty=1.0, penalty_keys=[("agents", "objects")]
+        scene_discriminator("winner"), gradient_penalty=1.0, penalty_keys=[("agents", "objects")]
     )
     rows = []
     for i, j in (td[VALID] & ~td[SIMULATED]).nonzero().tolist():
         one = td[i : i + 1].clone()
         leaf = one["agents", "objects"].requires_grad_()
         one["agents", "objects"] = leaf
-        (gradient,) = torch.autograd.grad(scene_judge("dense")(one)[SCORE][0, j], leaf)
+        (gradient,) = torch.autograd.grad(scene_discriminator("dense")(one)[SCORE][0, j], leaf)
         rows.append(gradient.square().sum())
     assert len(rows) > 1
     torch.testing.assert_close(loss(td)["gradient_penalty"], torch.stack(rows).mean())
@@ -282,9 +282,9 @@ def test_the_penalty_is_that_of_each_agent_by_itself():
 def test_an_input_without_influence_has_no_gradient():
     td = batch(5)
     td["agents", "more"] = torch.randn(5, 3, 2)
-    judge = Judge()
+    discriminator = Discriminator()
     network = TensorDictModule(
-        lambda x, more: judge(x), in_keys=[OBSERVATION, ("agents", "more")], out_keys=[SCORE]
+        lambda x, more: discriminator(x), in_keys=[OBSERVATION, ("agents", "more")], out_keys=[SCORE]
     )
     arguments = {"penalty_on": "both", **PENALTY}
     all_inputs = DiscriminatorLoss(network, **arguments)(td)
@@ -317,7 +317,7 @@ def test_noise_is_for_training_and_follows_its_generator():
     assert make(0)(td)["loss_discriminator"] == first == clone(td)["loss_discriminator"]
     loss.eval()
     assert loss(td)["loss_discriminator"] == plain
-    # A linear judge sees noise of the stated spread.
+    # A linear discriminator sees noise of the stated spread.
     wide = TensorDict(x=torch.zeros(20000), simulated=torch.ones(20000, dtype=torch.bool), batch_size=[])
     network = TensorDictModule(lambda x: x.square(), in_keys=["x"], out_keys=["score"])
     loss = DiscriminatorLoss(network, instance_noise=0.5, noise_keys=["x"])

@@ -57,7 +57,7 @@ def losses(method: str, dataset: SceneDataset) -> tuple[dict[str, Any], DrivingE
     """The losses of a method on its own networks, as a recipe makes them, and the environment they learn in."""
     spec = spec_of(method, dataset)
     torch.manual_seed(0)
-    policy, goals, judge = networks(method, dataset)
+    policy, goals, discriminator = networks(method, dataset)
     # One scene with three interactive agents and one with two, hence with one that is padding.
     scenes = collate([scene(dataset.segment(i), [0, 1, 2][: 3 - i], dataset.graph(i)) for i in (0, 1)])
     env = DrivingEnv(scenes, dynamics_of(spec), observation_of(spec))
@@ -65,10 +65,10 @@ def losses(method: str, dataset: SceneDataset) -> tuple[dict[str, Any], DrivingE
         "bc": BCLoss(policy),
         "distillation": DistillationLoss(policy),
         "goal": GoalLoss(goals),
-        "discriminator": DiscriminatorLoss(judge),
+        "discriminator": DiscriminatorLoss(discriminator),
     }
     if method == "mgail_ts_h":
-        found["mgail"] = MGAILLoss(policy, judge, env, horizon=2)
+        found["mgail"] = MGAILLoss(policy, discriminator, env, horizon=2)
     return found, env
 
 

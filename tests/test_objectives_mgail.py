@@ -49,7 +49,7 @@ def actor():
     return displacement_policy(SELF_FEATURES, GROUPS, dt=0.2, hidden=8, head=(8,)).double()
 
 
-def judge():
+def realism():
     torch.manual_seed(1)
     return discriminator(*SIZES, hidden=8, head=(8,)).double()
 
@@ -62,7 +62,7 @@ def planned(env, *scenes, steps=STEPS, seed=0):
 
 
 def make(env=None, **arguments):
-    return MGAILLoss(actor(), judge(), world() if env is None else env, **arguments)
+    return MGAILLoss(actor(), realism(), world() if env is None else env, **arguments)
 
 
 def value_and_gradient(loss, td):
@@ -94,7 +94,7 @@ def by_hand(env, policy, network, td):
 @pytest.mark.parametrize("cost", ["log_d", "non_saturating", "logit"])
 def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
     td = planned(env)
-    score = by_hand(env, actor(), judge(), td)[1]
+    score = by_hand(env, actor(), realism(), td)[1]
     d = score.sigmoid()
     costs = {"log_d": d.log(), "non_saturating": -(1 - d).log(), "logit": score}[cost]
     # The road ends after four steps.
@@ -140,7 +140,7 @@ def test_gradients_of_final_states_by_differences():
 
 @pytest.mark.parametrize("checkpoint", [0, 2])
 def test_only_the_actor_receives_a_gradient(env, checkpoint):
-    policy, network = actor(), judge()
+    policy, network = actor(), realism()
     before = list(network.parameters())
     td = planned(env)
     kept = td.clone()
@@ -186,7 +186,7 @@ def test_checkpoints_keep_less_for_the_backward_pass(env):
 def test_cut_at_every_step_it_is_the_sum_of_single_steps(env, checkpoint):
     td = planned(env)
     with torch.no_grad():
-        states, _ = by_hand(env, actor(), judge(), td)
+        states, _ = by_hand(env, actor(), realism(), td)
     single = make(env, reduction="sum")
     ones = (states[t].copy().set(PLAN, td[PLAN][:, t : t + 1]) for t in range(STEPS))
     parts = [value_and_gradient(single, one) for one in ones]
@@ -214,7 +214,7 @@ def test_reactions_can_be_left_out_of_the_gradient(env):
 @pytest.mark.parametrize("rule", [KeepAll(), KeepBest(0.5)])
 def test_the_gradient_is_that_through_the_surviving_branches(env, rule):
     """Of a search that is run with gradients, its choices held fixed."""
-    policy, network = actor(), judge()
+    policy, network = actor(), realism()
     branch = torch.arange(4).expand(2, 4)
     start = env.start(torch.tensor([[0], [1]]).expand(2, 4), branch)
     result = search(env, policy, network, start.copy(), seed=5, rule=rule, prune_every=2)
@@ -313,7 +313,8 @@ def test_copies_have_a_discriminator_of_their_own(env):
     # Nor is it reset with the actor.
     loss.reset_parameters_recursive()
     assert all(
-        torch.equal(*pair) for pair in zip(loss.discriminator.parameters(), judge().parameters(), strict=True)
+        torch.equal(*pair)
+        for pair in zip(loss.discriminator.parameters(), realism().parameters(), strict=True)
     )
     assert set(loss.state_dict()) == set(make(env, checkpoint=3).state_dict())
     assert len(list(loss.parameters())) == len(list(actor().parameters()))
@@ -323,7 +324,7 @@ def test_keys_of_numbers_and_scores_can_be_set(env):
     td = planned(env)
     reference = make(env)(td)["loss_mgail"]
     network = discriminator(*SIZES, hidden=8, head=(8,), out_key="s").double()
-    network.load_state_dict(judge().state_dict())
+    network.load_state_dict(realism().state_dict())
     policy = displacement_policy(SELF_FEATURES, GROUPS, dt=0.2, hidden=8, head=(8,), noise_key="u").double()
     policy.load_state_dict(actor().state_dict())
     loss = MGAILLoss(policy, network, env)
@@ -342,7 +343,7 @@ def test_bad_calls_are_refused(env):
     with pytest.raises(ValueError, match="nothing to simulate"):
         make(env)(td.exclude(PLAN))
     with pytest.raises(ValueError, match="no environment"):
-        MGAILLoss(actor(), judge())(td)
+        MGAILLoss(actor(), realism())(td)
     for bad in ({"cost": "d"}, {"horizon": -1}, {"truncate": -1}, {"checkpoint": -1}, {"reduction": "max"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             make(env, **bad)

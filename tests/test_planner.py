@@ -149,7 +149,7 @@ def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
 
 
 @pytest.mark.parametrize("search", ["tree", "oracle"])
-def test_the_search_judges_learned_agents_only(search: str) -> None:
+def test_the_search_scores_learned_agents_only(search: str) -> None:
     result = simulated(Wanderer, search=search, branches=6).search
     assert (result.simulated_scores[..., 0] == 0).all()
     if search == "tree":
@@ -350,7 +350,7 @@ def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
 
 
 def test_without_a_planner_nothing_changes() -> None:
-    """A search judges the first agent, too."""
+    """A search scores the first agent, too."""
     agent = load_agent(AGENT)
     data = dataset(agent, 1)
     config = EvaluateConfig(rollouts=2, branches=4)

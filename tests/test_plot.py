@@ -239,7 +239,7 @@ def test_steps_and_scores_that_are_not_finite_do_no_harm() -> None:
     axes = plot_tree(SEGMENT, make_tree(position=position, score=score), blank())
     # Both steps that touch the missing place are left out; slot 1 goes on with its own period.
     assert sum(map(len, steps_drawn(axes, "0").values())) == BRANCHES * STEPS - 2
-    plot_genealogy(make_tree(score=np.full_like(score, np.nan)), blank())
+    plot_genealogy(make_tree(score=np.full_like(score, np.nan)), blank(), dt=0.2)
 
 
 @pytest.mark.parametrize(
@@ -412,11 +412,11 @@ def test_command_line_shows_the_tree_that_an_evaluation_searches(
     agent = load_agent(str(run))
     scenes = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True).scenes([0, 1])
     config = EvaluateConfig(rollouts=4, search="tree", branches=4, seed=3)
-    judged = simulated(agent, scenes, config).state[1, :, 1:, :, :2].numpy()
+    evaluated = simulated(agent, scenes, config).state[1, :, 1:, :, :2].numpy()
     slots = lineage(torch.from_numpy(tree.parents)).numpy()
     paths = [np.stack([tree.position[slots[t // 4, leaf], t] for t in range(10)]) for leaf in range(4)]
     # The evaluation takes the best leaf first.
-    assert sorted(path.tobytes() for path in paths) == sorted(path.tobytes() for path in judged)
+    assert sorted(path.tobytes() for path in paths) == sorted(path.tobytes() for path in evaluated)
 
 
 def test_command_line_draws_curves(run: Path, run_without_search: Path, tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", params=METHODS)
 def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two networks' making, judged once."""
+    """A run of two networks' making, evaluated once."""
     folder = tmp_path_factory.mktemp("runs")
     before = request.param.replace("_ts", "")
     adversarial = {"mgail": MGAILConfig(regression=1, head_start=0, rollouts=2)}
@@ -73,7 +73,7 @@ def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.Te
         **adversarial,
     )
     out = train(second)
-    judge = [
+    command = [
         "evaluate",
         str(out),
         "--data",
@@ -85,7 +85,7 @@ def run(request: pytest.FixtureRequest, store: Path, tmp_path_factory: pytest.Te
         "--prune-every",
         "3",
     ]
-    assert main(judge) == 0
+    assert main(command) == 0
     return out
 
 
@@ -163,10 +163,10 @@ def test_its_name_works_wherever_an_agent_is_named(made: Path, store: Path, tmp_
     before, picture = contents(made), tmp_path / "picture.png"
     data = ["--data", str(store)]
     file = tmp_path / "numbers.json"
-    judge = ["evaluate", "pretrained:tiny", *data, "--rollouts", "2", "--json", str(file)]
-    assert main(judge) == 0
+    command = ["evaluate", "pretrained:tiny", *data, "--rollouts", "2", "--json", str(file)]
+    assert main(command) == 0
     found, (kept,) = json.loads(file.read_text()), (made / "evaluations").iterdir()
-    # It does what its run did when that was judged.
+    # It does what its run did when that was evaluated.
     assert {key: found[key] for key in ("ade", "collision_rate", "config")} == {
         key: json.loads(kept.read_text())[key] for key in ("ade", "collision_rate", "config")
     }

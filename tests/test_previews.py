@@ -224,7 +224,7 @@ def test_statistics_of_nothing_are_no_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_judge_that_has_not_judged_yet_has_no_scores(store: Path, tmp_path: Path) -> None:
+def test_a_discriminator_that_has_not_scored_yet_has_no_scores(store: Path, tmp_path: Path) -> None:
     early = replace(tiny("mgail", store, tmp_path).mgail, regression=4)
     out = train(config(store, tmp_path / "run", 2, "mgail", steps=6, mgail=early))
     assert [previewed(out)[step]["preview_score_data_p50"] is None for step in (2, 4, 6)] == [

@@ -70,7 +70,7 @@ def test_unknown_profiles_are_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     with pytest.raises(ConfigError, match="did you mean 'laptop'"):
         expanded(["bc", "--profile", "labtop"])
     assert main(["train", "bc", "--data", str(tmp_path), "--out", str(tmp_path), "--profile=fast"]) == 2
-    assert "profile is one of default, paper, laptop, smoke" in capsys.readouterr().err
+    assert "profile is one of default, paper, laptop, tiny, smoke" in capsys.readouterr().err
 
 
 def test_without_a_profile_nothing_changes() -> None:

@@ -38,8 +38,8 @@ SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=3)
 KINDS = ("none", "tree", "oracle", "best")
 
 
-def make_agent(seed: int = 0, judge: int = 0, **changes: Any) -> Agent:
-    """A tiny untrained agent that follows routes; ``judge`` is the seed of the discriminator alone."""
+def make_agent(seed: int = 0, discriminator: int = 0, **changes: Any) -> Agent:
+    """A tiny untrained agent that follows routes; ``discriminator`` is the seed of that alone."""
     spec = AgentSpec(
         action_space="bicycle",
         dt=0.2,
@@ -52,7 +52,7 @@ def make_agent(seed: int = 0, judge: int = 0, **changes: Any) -> Agent:
     spec = replace(spec, **changes)
     torch.manual_seed(seed)
     agent = build_agent("tiny", spec)
-    torch.manual_seed(judge)
+    torch.manual_seed(discriminator)
     return replace(agent, discriminator=build_agent("tiny", spec).discriminator)
 
 
@@ -117,7 +117,7 @@ def part(rollouts: Rollouts, *index: Any) -> Rollouts:
     return Rollouts(*(value[index] for value in rollouts))
 
 
-def judged(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> Tensor:
+def scored(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> Tensor:
     """Scores [B, S, T, N] of states [B, S, T + 1, N, 4], the first left out."""
     steps = states.shape[2] - 1
     whole = [*start.shape, steps]
@@ -178,7 +178,7 @@ def test_what_the_search_scored_is_what_the_discriminator_says_of_the_leaves(
     tree = torch.cat([start[keys.STATE][:, :, None], result.tree[("next", *keys.STATE)]], 2)
     counted = found.counted.any(-1)
     for states, scores in ((found.state, result.scores), (tree, result.simulated_scores)):
-        expected = judged(env, agent, start, states)
+        expected = scored(env, agent, start, states)
         torch.testing.assert_close(scores[counted], expected[counted], atol=1e-6, rtol=1e-5)
         assert (scores[~counted] == ENDED).all()
         assert scores[counted].min() > ENDED / 2
@@ -322,7 +322,7 @@ def test_repeated_periods_lower_the_score(env: DrivingEnv, agent: Agent) -> None
     # Whatever was taken is a history of its own: the scores are those of the states.
     found = rollouts_of(env, start, twice.trajectories)
     counted = found.counted.any(-1)
-    expected = judged(env, agent, start, found.state)
+    expected = scored(env, agent, start, found.state)
     torch.testing.assert_close(twice.scores[counted], expected[counted], atol=1e-6, rtol=1e-5)
 
 
@@ -354,12 +354,12 @@ def test_neither_discriminator_nor_search_touches_the_goals(
     scenes = dataset.scenes(range(4))
     reference, none = goals_of(monkeypatch, agent, scenes, EvaluateConfig(search="none", rollouts=5))
     assert len(reference[1, :, 0].unique()) > 1  # else there is nothing to bias
-    strict = replace(agent, discriminator=make_agent(judge=1).discriminator)
+    strict = replace(agent, discriminator=make_agent(discriminator=1).discriminator)
     driven = []
-    for kind, judge in (("tree", agent), ("tree", strict), ("oracle", agent), ("best", strict)):
+    for kind, scorer in (("tree", agent), ("tree", strict), ("oracle", agent), ("best", strict)):
         trees = 1 if kind == "best" else 5
         config = EvaluateConfig(search=kind, rollouts=5, trees=trees, branches=3, rule="best")
-        goals, state = goals_of(monkeypatch, judge, scenes, config)
+        goals, state = goals_of(monkeypatch, scorer, scenes, config)
         assert torch.equal(goals, reference)
         driven.append(state)
     # Each of them does change what survives.
@@ -419,7 +419,7 @@ def test_best_is_the_best_of_independent_rollouts(dataset: SceneDataset, agent: 
     env = DrivingEnv(scenes, agent.dynamics, agent.observation)
     start = start_of(env, 2 * branches)
     every = plain(env, agent, start)
-    scores = judged(env, agent, start, every.state).masked_fill(~every.counted, -torch.inf)
+    scores = scored(env, agent, start, every.state).masked_fill(~every.counted, -torch.inf)
     total = scores.amax(2).sum(-1).unflatten(1, (2, branches))
     best = total.argmin(-1) + branches * torch.arange(2)
     for b in range(4):
@@ -442,7 +442,7 @@ def blocked() -> RunSegment:
     return make_segment(road, np.stack([place, flat], -1), flat, velocity, dt, "blocked")
 
 
-def test_the_oracle_lowers_what_it_judges() -> None:
+def test_the_oracle_lowers_what_it_measures() -> None:
     agent, scenes = make_agent(goals=False), scene(blocked(), [0, 1])
 
     def bad(kind: Any) -> tuple[float, float]:

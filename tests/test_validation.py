@@ -59,11 +59,11 @@ def steps(run: Path) -> list[int]:
     return [int(path.name[-12:]) for path in checkpoints(run / "checkpoints")]
 
 
-def test_every_checkpoint_and_the_last_weights_are_judged(run: Path) -> None:
-    judged = [r["step"] for r in read_metrics(run) if "validation_infractions" in r]
-    assert judged == [2, 4, 5]
+def test_every_checkpoint_and_the_last_weights_are_evaluated(run: Path) -> None:
+    evaluated = [r["step"] for r in read_metrics(run) if "validation_infractions" in r]
+    assert evaluated == [2, 4, 5]
     for record in read_metrics(run):
-        if record["step"] in judged:
+        if record["step"] in evaluated:
             assert {f"validation_{name}" for name in METRICS} <= record.keys()
             total = record["validation_collision_rate"] + record["validation_offroad_time"]
             assert record["validation_infractions"] == total
@@ -94,7 +94,7 @@ Scripted = Callable[..., None]
 
 @pytest.fixture
 def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
-    """Let the evaluator find given infractions at the judgements to come."""
+    """Let the evaluator find given infractions at the evaluations to come."""
 
     class Found:
         def __init__(self, value: float) -> None:
@@ -150,13 +150,13 @@ def test_a_resumed_run_remembers_the_best(
     train(replace(whole, resume=True, steps=14))
     assert steps(whole.out) == [10, 12, 14]
     assert choose(whole.out).name.endswith("14")
-    # And without judgements from here on.
+    # And without evaluations from here on.
     train(replace(whole, resume=True, steps=24, validation=ValidationConfig(rollouts=2)))
     assert steps(whole.out) == [14, 20, 22, 24]
     assert choose(whole.out).name.endswith("14")
 
 
-def test_what_is_judged_stays_the_same_when_a_run_goes_on(
+def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(
     store: Path, held_out: Path, tmp_path: Path
 ) -> None:
     short = config(store, tmp_path / "run", held_out, steps=2)
@@ -166,7 +166,7 @@ def test_what_is_judged_stays_the_same_when_a_run_goes_on(
             train(replace(short, resume=True, steps=4, validation=replace(short.validation, **other)))
     moved = shutil.copytree(held_out, tmp_path / "moved")
     train(replace(short, resume=True, steps=4, validation=replace(short.validation, data=moved, every=4)))
-    # A run that was not judged so far may be from now on.
+    # A run that was not evaluated so far may be from now on.
     plain = config(store, tmp_path / "plain", None, steps=2)
     train(plain)
     train(replace(plain, resume=True, steps=4, validation=ValidationConfig(data=held_out, rollouts=1)))
@@ -204,7 +204,7 @@ def test_networks_and_random_numbers_are_left_as_they_were(
     assert torch.equal(state, torch.get_rng_state())
     for name, module in modules.items():
         assert all(torch.equal(a, b) for a, b in zip(before[name], module.state_dict().values(), strict=True))
-    # As good is no better; and it is the weights of the moment that are judged.
+    # As good is no better; and it is the weights of the moment that are evaluated.
     assert validator(4) == first
     assert validator.best.step == 3
     with torch.no_grad():
@@ -213,7 +213,7 @@ def test_networks_and_random_numbers_are_left_as_they_were(
     assert validator(5) != first
 
 
-def test_an_agent_is_judged_without_its_folder(store: Path, held_out: Path, run: Path) -> None:
+def test_an_agent_is_evaluated_without_its_folder(store: Path, held_out: Path, run: Path) -> None:
     agent = load_agent(str(run))
     dataset = SceneDataset(SegmentStore(held_out), 2, Bicycle(), [1])
     done: list[tuple[int, int]] = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 # SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.
@@ -23,19 +24,19 @@ def _signed(value: int) -> int:
     return value - (1 << 64) if value >> 63 else value
 
 
-def _shift_xor(x: Tensor, bits: int) -> Tensor:
+def _shift_xor(x: Int[Tensor, "*b"], bits: int) -> Int[Tensor, "*b"]:
     # int64 shifts copy the sign; the mask makes the shift logical.
     return x ^ ((x >> bits) & ((1 << (64 - bits)) - 1))
 
 
-def _mix(x: Tensor) -> Tensor:
+def _mix(x: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
     """SplitMix64's finaliser, a bijection of int64 in which each input bit sways each output bit."""
     x = _shift_xor(x, 30) * _signed(_MULTIPLIERS[0])
     x = _shift_xor(x, 27) * _signed(_MULTIPLIERS[1])
     return _shift_xor(x, 31)
 
 
-def fold_in(stream: Tensor, index: Tensor | int) -> Tensor:
+def fold_in(stream: Int[Tensor, "*#b"], index: Int[Tensor, "*#b"] | int) -> Int[Tensor, "*b"]:
     """Derive int64 streams from streams: `stream` and `index` broadcast; distinct pairs give unrelated streams."""
     if isinstance(index, int):
         return _mix(stream + _signed((index + 1) * _GAMMA))
@@ -47,7 +48,13 @@ def stream_of(text: str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-def uniform(seed: int, stream: Tensor, step: Tensor | int, *, dtype: torch.dtype = torch.float32) -> Tensor:
+def uniform(
+    seed: int,
+    stream: Int[Tensor, "*#b"],
+    step: Int[Tensor, "*#b"] | int,
+    *,
+    dtype: torch.dtype = torch.float32,
+) -> Float[Tensor, "*b"]:
     """Uniform numbers in the open interval (0, 1), a pure function of the three arguments.
 
     Args:

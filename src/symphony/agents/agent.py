@@ -56,7 +56,7 @@ class Agent:
 
     @property
     def observation(self) -> ObservationConfig:
-        """What it sees, what its discriminator sees included."""
+        """What it observes, the input of its discriminator included."""
         return ObservationConfig.nothing() if self.spec is None else observation_of(self.spec)
 
     @property

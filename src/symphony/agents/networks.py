@@ -34,7 +34,7 @@ def bicycle(config: AgentConfig) -> Bicycle:
 
 
 def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> ObservationConfig:
-    """What the networks see.
+    """What the networks observe.
 
     Args:
         spec: of the agent.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from symphony.cli.evaluate import evaluate_with_bar
 from symphony.cli.tables import print_metrics
-from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
+from symphony.config import EvaluateConfig, TrainConfig
+from symphony.config.profiles import demo
 from symphony.files import write_json
 
 
@@ -47,28 +48,16 @@ class Demo:
             shutil.rmtree(run)
         learn, test = builtin_store("train"), builtin_store("test")
         console.print(f"Learning to drive from {learn} (behavioural cloning, {self.steps} updates)")
-        # Half the states and fewer points than by default: more, cheaper updates suit so few segments.
-        small = AgentConfig(num_points=128)
-        train(
-            TrainConfig(
-                method="bc",
-                data=learn,
-                out=run,
-                steps=self.steps,
-                seed=self.seed,
-                agent=small,
-                states=512,
-                wandb="disabled",
-            )
-        )
+        config = TrainConfig(method="bc", data=learn, out=run, steps=self.steps, seed=self.seed)
+        train(demo(config))
         console.print(f"Simulating {test}, which it has not seen")
-        config = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
+        settings = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
         agents = ["playback", "constant_velocity", str(run), PRETRAINED]
         items = evenly_spaced(len(SegmentStore(test)), PANELS)
         drawn = {
             name: ClipKeeper(items, title=f"{title}: ") for name, title in zip(agents, NAMES, strict=True)
         }
-        results = [evaluate_with_bar(name, test, config, observe=drawn[name]) for name in agents]
+        results = [evaluate_with_bar(name, test, settings, observe=drawn[name]) for name in agents]
         rows = [{**result.numbers(), "agent": name} for result, name in zip(results, NAMES, strict=True)]
         print_metrics(rows, title="Built-in test segments")
         console.print(

@@ -16,7 +16,7 @@ class Export:
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SIM")]
     """Folder of saved rollouts."""
     format: Literal["commonroad", "json"] = "commonroad"
-    """CommonRoad scenarios (XML 2020a, .xml), or plain JSON."""
+    """CommonRoad scenarios (XML 2020a, .xml), or JSON."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Where the files go; by default the folder `export` within SIM."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
@@ -32,7 +32,7 @@ class Export:
 
         from symphony.errors import ConfigError
         from symphony.files import naming, write_file
-        from symphony.simulation.export import commonroad, plain
+        from symphony.simulation.export import commonroad, to_dict
         from symphony.simulation.saved_files import file_stem, load_rollouts
 
         folder = load_rollouts(self.folder)
@@ -47,7 +47,7 @@ class Export:
                     raise ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
                 stem = out / f"{file_stem(name)}-{k}"
                 if self.format == "json":
-                    text = json.dumps(plain(saved, k), ensure_ascii=False, allow_nan=False)
+                    text = json.dumps(to_dict(saved, k), ensure_ascii=False, allow_nan=False)
                     write_file(stem.with_name(f"{stem.name}.json"), text + "\n")
                 else:
                     write_file(stem.with_name(f"{stem.name}.xml"), commonroad(saved, k))

@@ -40,12 +40,14 @@ class Curvature:
         if not self.runs:
             raise ConfigError("no runs given")
         if self.data is not None and self.evaluation:
-            raise ConfigError("--evaluation chooses among what runs keep, --data judges them anew: give one")
+            raise ConfigError(
+                "--evaluation chooses among what runs keep, --data evaluates them anew: give one"
+            )
         if self.data is None and self.config != EvaluateConfig():
             raise ConfigError("settings of the simulation need --data, the run segments to simulate")
 
     def run(self) -> None:
-        """Judge where it is asked for, and draw."""
+        """Evaluate where it is asked for, and draw."""
         import numpy as np
 
         from symphony.agents.included import run_folder

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from symphony.config import PROFILES, TrainConfig
-from symphony.config.checks import shown
+from symphony.config.checks import option
 from symphony.errors import ConfigError
 
 WORDS = (
     "default: the values shown; paper: the protocol of the paper (70 000 updates, 1 000 points, its discriminator, "
     "batch 16, S 4 and 16, 200 validation segments); laptop: meant for two cores and about an hour (3 000 updates, "
-    "128 points, 48 validation segments of 4 rollouts); smoke: seconds, to see that all runs. What is given beside "
-    "it has precedence; the best checkpoint is chosen where --validation.data is given."
+    "128 points, 48 validation segments of 4 rollouts); tiny: half a minute, what `make table` runs; smoke: seconds, "
+    "to see that all runs. What is given beside it has precedence; the best checkpoint is chosen where "
+    "--validation.data is given."
 )
 
 
@@ -49,7 +50,7 @@ def _changes(before: Any, after: Any, prefix: str = "--") -> Iterator[tuple[str,
     """Flags and the words that set them, for what differs between two configurations."""
     for field in dataclasses.fields(before):
         old, new = getattr(before, field.name), getattr(after, field.name)
-        flag = prefix + shown(field.name)
+        flag = prefix + option(field.name)
         if dataclasses.is_dataclass(old):
             yield from _changes(old, new, f"{flag}.")
         elif new is True and old is False:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Simulate:
     """Simulate the interactive agents of every run segment and keep the rollouts.
 
-    An interrupted simulation is continued by the same command. See them with `symphony view`, judge them with
+    An interrupted simulation is continued by the same command. See them with `symphony view`, evaluate them with
     `symphony report`, hand them on with `symphony export`.
     """
 

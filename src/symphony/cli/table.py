@@ -19,7 +19,7 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class Table:
-    """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has judged.
+    """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has evaluated.
 
     A row for each method there is, mean and standard error over its seeds, the best of the BC methods and of the
     MGAIL methods in bold. Runs of other settings are left out.

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 import torchrl
+from jaxtyping import Int
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -24,7 +25,7 @@ def policy_of(collector: Collector) -> Callable[[TensorDictBase], TensorDictBase
     return _member(collector, "_wrapped_policy")
 
 
-def new_trajectories(collector: Collector, number: int, device: torch.device) -> Tensor:
+def new_trajectories(collector: Collector, number: int, device: torch.device) -> Int[Tensor, " K"]:
     """Numbers [K] of K trajectories, never given before."""
     return _member(collector, "_traj_pool").get_traj_and_increment(number, device=device)
 

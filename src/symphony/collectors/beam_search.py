@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -57,7 +57,7 @@ def beam_search(
 
     Gradients flow through environment, policy and scores unless the caller turns them off, along the history of
     each leaf; no tensor is changed in place. The end of an episode changes nothing: every branch runs for
-    `steps` steps, and a score that should not judge what follows the end must be 0 there.
+    `steps` steps, and a score that should not count what follows the end must be 0 there.
 
     Args:
         env: accepts any batch shape (``batch_size=[]``, ``batch_locked=False``); random numbers of its own are
@@ -156,7 +156,9 @@ def beam_search(
     )
 
 
-def score_state(env: EnvBase, score: Score, stepped: TensorDictBase, now: TensorDictBase) -> Tensor:
+def score_state(
+    env: EnvBase, score: Score, stepped: TensorDictBase, now: TensorDictBase
+) -> Float[Tensor, "*b S N"]:
     """Scores [*b, S, N] of the state `now` that the step `stepped` led to.
 
     The reward is shown to the score, but is no part of the next step's input.
@@ -205,11 +207,11 @@ def _simulate(
     return _Run(records, joined, totals, now)
 
 
-def _better(first: _Run, second: _Run, redo: Tensor, slot_keys: Sequence[NestedKey]) -> _Run:
+def _better(first: _Run, second: _Run, redo: Bool[Tensor, "*b S"], slot_keys: Sequence[NestedKey]) -> _Run:
     """Branch by branch the run with the lower total, among those to be redone."""
     take = redo & ~(first.totals <= second.totals)
 
-    def choose(new: Tensor, old: Tensor) -> Tensor:
+    def choose(new: Shaped[Tensor, "*e"], old: Shaped[Tensor, "*e"]) -> Shaped[Tensor, "*e"]:
         return torch.where(take.reshape(take.shape + (1,) * (new.ndim - take.ndim)), new, old)
 
     after = second.after.apply(choose, first.after)
@@ -221,8 +223,11 @@ def _better(first: _Run, second: _Run, redo: Tensor, slot_keys: Sequence[NestedK
     )
 
 
-def _fork(state: TensorDictBase, parents: Tensor, slot_keys: Sequence[NestedKey]) -> TensorDictBase:
+def _fork(
+    state: TensorDictBase, parents: Int[Tensor, "*b S"], slot_keys: Sequence[NestedKey]
+) -> TensorDictBase:
     branches = parents.shape[-1]
+    # Places in the flattened [*b, S]: of the first branch of each row, and of the parents beside it.
     first = torch.arange(0, parents.numel(), branches, device=parents.device)
     rows = first.reshape(*parents.shape[:-1], 1) + parents
     return _set_slots(_take(state, rows), state, slot_keys)
@@ -244,7 +249,7 @@ def _take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None 
     return TensorDict(taken, [*rows.shape, *tensordict.batch_size[dims:]], device=tensordict.device)
 
 
-def _take_rows(values: Tensor, rows: Int[Tensor, "*c"], dims: int) -> Tensor:
+def _take_rows(values: Shaped[Tensor, ...], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*c ..."]:
     # index_select on whole rows is many times faster than gather or advanced indexing on wide entries.
     taken = values.flatten(0, dims - 1).index_select(0, rows.flatten())
     return taken.reshape(*rows.shape, *values.shape[dims:])
@@ -272,7 +277,9 @@ def _groups(start: TensorDictBase, key: NestedKey) -> Int[Tensor, "*b S"]:
     return (value[..., :, None, :] == value[..., None, :, :]).all(-1).int().argmax(-1)
 
 
-def _noises(noise: Tensor | None, start: TensorDictBase, periods: int) -> Sequence[Tensor | None]:
+def _noises(
+    noise: Float[Tensor, "*b P"] | None, start: TensorDictBase, periods: int
+) -> Sequence[Float[Tensor, "*b"] | None]:
     if noise is None:
         return [None] * periods
     if noise.shape != (*start.shape[:-1], periods):

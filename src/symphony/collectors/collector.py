@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -243,7 +244,7 @@ class BeamSearchCollector(Collector):
 
         return elsewhere
 
-    def rule_noise(self, start: TensorDictBase) -> Tensor:
+    def rule_noise(self, start: TensorDictBase) -> Float[Tensor, "*b P"]:
         """Numbers [*env.batch_size, P] in [0, 1) for the pruning rule, from a branched start state."""
         periods = -(-self.frames_per_batch // self.prune_every)
         if self._rule_noise is not None:
@@ -320,6 +321,6 @@ def _last(key: NestedKey) -> str:
     return key if isinstance(key, str) else key[-1]
 
 
-def _per_entry(flag: Tensor, batch_dims: int) -> Tensor:
+def _per_entry(flag: Bool[Tensor, "*e"], batch_dims: int) -> Bool[Tensor, ...]:
     """Whether any of the flags [*b, ...] of an entry [*b] is set."""
     return flag.reshape(*flag.shape[:batch_dims], -1).any(-1)

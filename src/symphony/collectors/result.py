@@ -19,7 +19,7 @@ class BeamSearchResult:
 
     Attributes:
         trajectories: [*b, L, T] of the leaves, laid out and named as by ``env.rollout``, kept entries only.
-        scores: [*b, L, T, N] of the leaves' histories; `scores[..., t, :]` judges ``("next", ...)`` of step t.
+        scores: [*b, L, T, N] of the leaves' histories; `scores[..., t, :]` is of ``("next", ...)`` of step t.
         slots: [*b, P, L] int64, the slot in which each period of each leaf's history was simulated.
         totals: [*b, P, S] aggregate of each period, by the slot that simulated it.
         parents: [*b, P, S] int64; after period p slot s was continued from slot `parents[..., p, s]`. The last
@@ -69,7 +69,7 @@ def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
     return torch.stack(slots[::-1], -2)
 
 
-def _named(slots: Tensor, branches: int) -> Tensor:
+def _named(slots: Int[Tensor, "*b L"], branches: int) -> Bool[Tensor, "*b S"]:
     """Which of the slots occur among `slots` [..., L]."""
     found = torch.zeros(*slots.shape[:-1], branches, dtype=torch.bool, device=slots.device)
     return found.scatter(-1, slots, True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeGuard
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from symphony.errors import ConfigError
@@ -186,6 +186,7 @@ class ReplaceBad:
         own = (good[..., None, :] & same).any(-1)
         candidates = good[..., None, :] & (same | ~own[..., :, None])
         waiting = ~good[..., None, :] & torch.where(own[..., :, None], same, ~own[..., None, :])
+        # Those that wait for the same branches take them by turns, from one on that the noise picks.
         turn = (waiting & (slots < slots[:, None])).sum(-1)
         number = candidates.sum(-1)
         first = (noise.double()[..., None] * number).long()
@@ -249,7 +250,9 @@ def prune(
     return torch.empty_like(members.flatten(-2)).scatter(-1, members.flatten(-2), parents.flatten(-2))
 
 
-def _checked(rule: object, parents: Tensor, totals: Tensor) -> Tensor:
+def _checked(
+    rule: object, parents: Shaped[Tensor, ...], totals: Float[Tensor, "*b S"]
+) -> Int[Tensor, "*b S"]:
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
         raise ConfigError(
             f"a pruning rule must return int64 {tuple(totals.shape)}, "

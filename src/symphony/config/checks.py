@@ -14,7 +14,7 @@ def positive(config: Any, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
         if not (value > 0 and math.isfinite(value)):
-            raise ConfigError(f"{shown(name)} must be positive, is {value}")
+            raise ConfigError(f"{option(name)} must be positive, is {value}")
 
 
 def not_negative(config: Any, *names: str) -> None:
@@ -22,7 +22,7 @@ def not_negative(config: Any, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
         if not (value >= 0 and math.isfinite(value)):
-            raise ConfigError(f"{shown(name)} must not be negative, is {value}")
+            raise ConfigError(f"{option(name)} must not be negative, is {value}")
 
 
 def one_of(config: Any, name: str, known: Iterable[str], *, path: bool = False) -> None:
@@ -30,9 +30,9 @@ def one_of(config: Any, name: str, known: Iterable[str], *, path: bool = False) 
     value, known = getattr(config, name), list(known)
     if value not in known and not (path and ":" in value):
         more = " or an import path such as my.module:Name" if path else ""
-        raise ConfigError(f"{shown(name)} is one of {', '.join(known)}{more}, not '{value}'")
+        raise ConfigError(f"{option(name)} is one of {', '.join(known)}{more}, not '{value}'")
 
 
-def shown(name: str) -> str:
+def option(name: str) -> str:
     """A setting as the command line spells it."""
     return name.replace("_", "-")

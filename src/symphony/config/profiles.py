@@ -8,7 +8,7 @@ from typing import Literal
 
 from symphony.config.training import TrainConfig
 
-Profile = Literal["default", "paper", "laptop", "smoke"]
+Profile = Literal["default", "paper", "laptop", "tiny", "smoke"]
 
 
 def paper(config: TrainConfig) -> TrainConfig:
@@ -48,6 +48,21 @@ def laptop(config: TrainConfig) -> TrainConfig:
     )
 
 
+def tiny(config: TrainConfig) -> TrainConfig:
+    """About half a minute for a method: what `make table` runs."""
+    return replace(
+        smoke(config),
+        steps=120,
+        segments=8,
+        states=256,
+        checkpoint_every=60,
+        agent=replace(config.agent, num_points=64, hidden=32, head=32),
+        search=replace(config.search, segments=4, branches=4, test_branches=4, updates=10, states=64),
+        discriminator=replace(config.discriminator, hidden=8, head=8, states=64),
+        mgail=replace(config.mgail, regression=80, head_start=10, rollouts=4),
+    )
+
+
 def smoke(config: TrainConfig) -> TrainConfig:
     """Seconds, to see that all runs."""
     return replace(
@@ -66,9 +81,18 @@ def smoke(config: TrainConfig) -> TrainConfig:
     )
 
 
+def demo(config: TrainConfig) -> TrainConfig:
+    """What `symphony demo` runs, minutes on a laptop.
+
+    Half the states and fewer points than by default: more, cheaper updates suit the few segments of the package.
+    """
+    return replace(config, agent=replace(config.agent, num_points=128), states=512, wandb="disabled")
+
+
 PROFILES: dict[Profile, Callable[[TrainConfig], TrainConfig]] = {
     "default": lambda config: config,
     "paper": paper,
     "laptop": laptop,
+    "tiny": tiny,
     "smoke": smoke,
 }

@@ -31,7 +31,7 @@ class Conformance:
     """What was found.
 
     Attributes:
-        segments: how many were judged.
+        segments: how many were checked.
         skipped: records the reader gave an error for instead.
         damaged: damaged copies that were read.
         numbers: see :data:`symphony.data.plausibility.RANGES`.
@@ -66,7 +66,7 @@ class ConformanceError(AssertionError):
 
 
 def check_segments(segments: Sequence[RunSegment]) -> Conformance:
-    """Judge run segments of one source, however they came about.
+    """Check run segments of one source, however they came about.
 
     Checks: ``schema`` (validation), ``ids`` (unique), ``store`` (survives the store unchanged), and those of
     :data:`symphony.data.plausibility.RANGES`: ``time step``, ``re-centred``, ``masked`` (zeros where not valid),
@@ -86,7 +86,7 @@ def check_segments(segments: Sequence[RunSegment]) -> Conformance:
 def check_reader(
     reader: Reader, files: Iterable[str | Path], *, damage: int = 1, flips: int = 20, seed: int = 0
 ) -> Conformance:
-    """Judge a reader by a few good files of its format.
+    """Check a reader with a few good files of its format.
 
     Besides the checks of :func:`check_segments`: ``errors`` (nothing but :class:`DataError` comes of reading, and
     it names the file), ``source`` (segments name format and file), ``determinism`` (reading again, in another
@@ -133,7 +133,7 @@ def check_reader(
 def _inspect(segments: Sequence[RunSegment]) -> Conformance:
     report = Conformance(segments=len(segments))
     if not segments:
-        report.fail("segments", "there are none to judge")
+        report.fail("segments", "there are none to check")
         return report
     for segment in segments:
         try:
@@ -230,10 +230,10 @@ def _mistreat(
     for part, data in copies.files.items():
         for size in dict.fromkeys(min(int(share * len(data)), len(data) - 1) for share in CUTS):
             what = f"{part.name} cut to {size} of {len(data)} bytes"
-            _judge_cut(copies, part, size, whole, what, report)
+            _check_cut(copies, part, size, whole, what, report)
         for changed in _changed(data, flips, rng):
             for item in copies.read(part, changed, report, "damaged"):
-                _judge_valid(item, f"{part.name} with bytes changed", report)
+                _check_valid(item, f"{part.name} with bytes changed", report)
         foreign: dict[str, bytes | None] = {"emptied": b"", "made noise": rng.bytes(max(len(data), 64))}
         foreign["made text"] = b"Not what you are looking for.\n" * 50
         if part not in copies.optional:
@@ -244,7 +244,7 @@ def _mistreat(
                 report.fail("foreign", f"{part.name} {what}: gives a segment all the same")
 
 
-def _judge_cut(
+def _check_cut(
     copies: _Copies, part: Path, size: int, whole: list[str], what: str, report: Conformance
 ) -> None:
     data = copies.files[part]
@@ -261,7 +261,7 @@ def _judge_cut(
         report.fail("truncated", f"{what}: no error, though {len(lost)} records are gone")
 
 
-def _judge_valid(item: Item, what: str, report: Conformance) -> None:
+def _check_valid(item: Item, what: str, report: Conformance) -> None:
     if isinstance(item, RunSegment):
         try:
             validate(item)

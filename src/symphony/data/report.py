@@ -85,7 +85,7 @@ class Report:
         share = 100 * self.overlaps / self.converted
         return (
             f"in the logs of {self.overlaps} of {self.converted} segments ({share:.1f} %) a moving vehicle's box "
-            "overlaps another: what is judged by collisions there is judged by the tracking's errors, too; "
+            "overlaps another: collisions there count errors of the tracking, too; "
             "--exclude-overlaps leaves them out"
         )
 

@@ -62,7 +62,7 @@ def interactive_choice(
     else of those it marks for prediction that move, else the one the ego merges with, crosses, follows or leads
     (:mod:`symphony.data.context`; the one with the smallest time gap, then the nearest), else the nearest that
     moves. Then the nearest that move. All are vehicles seen at the first step; "nearest" is to the ego at that
-    step, and agents seen at every step (which the log can judge throughout) go before the others, whatever
+    step, and agents seen at every step (which can be compared with the log throughout) go before the others, whatever
     their context.
 
     Args:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
@@ -59,7 +59,7 @@ class DrivingEnv(EnvBase):
         scenes: static data of B segments, all with the same number of interactive agents; or a source, from which
             every reset of a whole batch draws as many as the batch has rows.
         dynamics: :class:`Bicycle` (joint discrete actions) or :class:`Displacement` (metres).
-        observation: what the agents see.
+        observation: what the agents observe.
         reward: of a step, from the state before it (with its action) and the state after it, ``[*b, N]``; by default
             -1 for an agent that collides or is off the road.
         ends_on: what ends the episode of a scene, for any of its interactive agents.
@@ -240,7 +240,7 @@ class DrivingEnv(EnvBase):
         return self._from_state(*self._read(state))
 
     def choices(self, state: TensorDictBase) -> TensorDictBase:
-        """Add the feasible routes of a start state, as the goal policy sees them.
+        """Add the feasible routes of a start state, as the goal policy observes them.
 
         Writes ``ROUTES`` [..., N, G, F] and ``ROUTES_MASK`` [..., N, G] into a copy.
         """
@@ -285,7 +285,7 @@ class DrivingEnv(EnvBase):
             default=None,
         )
 
-    def _draw(self, shape: torch.Size, *, renew: bool) -> Tensor:
+    def _draw(self, shape: torch.Size, *, renew: bool) -> Int[Tensor, "*b"]:
         """Rows of the scenes that a batch starts, those at hand or new ones of a source."""
         if self.source is None or (not renew and self._scenes is not None):
             return torch.randint(len(self.scenes), tuple(shape), generator=self._rng)
@@ -306,7 +306,9 @@ class DrivingEnv(EnvBase):
         earned = self.reward(tensordict, out)
         return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
 
-    def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
+    def _moved(
+        self, tensordict: TensorDictBase, state: Float[Tensor, "*b N 4"], size: Float[Tensor, "*b N 2"]
+    ) -> Float[Tensor, "*b N 4"]:
         """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
         return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
@@ -400,7 +402,7 @@ class DrivingEnv(EnvBase):
             terminated = terminated | flags[key].any(-1)
         observation = {name: value for name, value in seen._asdict().items() if value is not None}
 
-        def back(value: Tensor) -> Tensor:
+        def back(value: Shaped[Tensor, M * e]) -> Shaped[Tensor, ... * e]:
             return value.reshape((*shape, *value.shape[1:]))
 
         each = [*shape, self.num_agents]
@@ -437,7 +439,12 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()
     def _flags(
-        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor, seen: Observation
+        self,
+        scene: Int[Tensor, " M"],
+        objects: Objects,
+        index: Int[Tensor, "M N"],
+        valid: Bool[Tensor, "M N"],
+        seen: Observation,
     ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
         collision = collision_flags(objects, index) & valid
         if seen.road is not None:
@@ -452,16 +459,18 @@ class DrivingEnv(EnvBase):
         return self._tables
 
 
-def _rows_of(values: Tensor, index: Tensor) -> Tensor:
+def _rows_of(values: Float[Tensor, "*b A F"], index: Int[Tensor, "*b N"]) -> Float[Tensor, "*b N F"]:
     return values.gather(-2, index[..., None].expand(*index.shape, values.shape[-1]))
 
 
-def _rows(table: Float[Tensor, "B A F"], scene: Int[Tensor, "*b"], index: Int[Tensor, "*b N"]) -> Tensor:
+def _rows(
+    table: Float[Tensor, "B A F"], scene: Int[Tensor, "*b"], index: Int[Tensor, "*b N"]
+) -> Float[Tensor, "*b N F"]:
     """table[scene, index] for scene [...] and index [..., N]."""
     return table[scene[..., None], index]
 
 
-def _like(mask: Tensor, value: Tensor) -> Tensor:
+def _like(mask: Bool[Tensor, "*b 1"], value: Shaped[Tensor, ...]) -> Bool[Tensor, "*b ..."]:
     """mask [..., 1] with trailing dimensions of one, to broadcast against value."""
     flat = mask.squeeze(-1)
     return flat.reshape(flat.shape + (1,) * (value.ndim - flat.ndim))

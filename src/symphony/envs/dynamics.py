@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -24,10 +24,10 @@ WHEELBASE = 0.6
 
 
 def bicycle_step(
-    state: Float[Tensor, "*b 4"],
-    acceleration: Float[Tensor, "*b"],
-    steering: Float[Tensor, "*b"],
-    length: Float[Tensor, "*b"],
+    state: Float[Tensor, "*#b 4"],
+    acceleration: Float[Tensor, "*#b"],
+    steering: Float[Tensor, "*#b"],
+    length: Float[Tensor, "*#b"],
     dt: float,
 ) -> Float[Tensor, "*b 4"]:
     """One step of the kinematic bicycle about the box centre.
@@ -61,7 +61,7 @@ def bicycle_step(
 
 
 def bicycle_inverse(
-    state: Float[Tensor, "*b 4"], after: Float[Tensor, "*b 4"], length: Float[Tensor, "*b"], dt: float
+    state: Float[Tensor, "*#b 4"], after: Float[Tensor, "*#b 4"], length: Float[Tensor, "*#b"], dt: float
 ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     """Acceleration and steering that take the speed and heading of ``state`` to those of ``after``.
 
@@ -78,9 +78,9 @@ def bicycle_inverse(
 
 
 def displacement_step(
-    state: Float[Tensor, "*b 4"],
-    displacement: Float[Tensor, "*b 2"],
-    length: Float[Tensor, "*b"],
+    state: Float[Tensor, "*#b 4"],
+    displacement: Float[Tensor, "*#b 2"],
+    length: Float[Tensor, "*#b"],
     dt: float,
 ) -> Float[Tensor, "*b 4"]:
     """Move the box centre by ``displacement`` (x forward, y left, metres, in the agent's own frame).
@@ -99,35 +99,11 @@ def displacement_step(
     return torch.cat([moved, (state[..., 2] + turn)[..., None], (distance / dt)[..., None]], dim=-1)
 
 
-def displacement_inverse(state: Float[Tensor, "*b 4"], after: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 2"]:
+def displacement_inverse(
+    state: Float[Tensor, "*#b 4"], after: Float[Tensor, "*#b 4"]
+) -> Float[Tensor, "*b 2"]:
     """The displacement in the frame of ``state`` that leads to the position of ``after`` (exact)."""
     return rotate(after[..., :2] - state[..., :2], -state[..., 2])
-
-
-class Dynamics(Protocol):
-    """What the environment needs of a motion model."""
-
-    discrete: bool
-    numbers: int
-    """Uniform numbers that decide an action; 0 for a single one without a dimension of its own."""
-
-    def step(
-        self, state: Float[Tensor, "*b 4"], action: Tensor, size: Float[Tensor, "*b 2"], dt: float
-    ) -> Float[Tensor, "*b 4"]:
-        """The state after one action."""
-        ...
-
-    def fit(
-        self,
-        position: Float[Tensor, "*b T 2"],
-        heading: Float[Tensor, "*b T"],
-        speed: Float[Tensor, "*b T"],
-        valid: Bool[Tensor, "*b T"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
-    ) -> tuple[Tensor, Float[Tensor, "*b T 4"]]:
-        """Actions [*b, T - 1(, 2)] that follow a log, and the states they lead through."""
-        ...
 
 
 def _quadratic(largest: float, count: int) -> NDArray[np.float32]:
@@ -178,7 +154,7 @@ class Bicycle:
         """Number of joint actions."""
         return self.num_acceleration * self.num_steering
 
-    def grid(self, like: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+    def grid(self, like: Float[Tensor, ...]) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
         acceleration, steering = self._joint
         return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
@@ -215,7 +191,9 @@ class Bicycle:
         acceleration, steering = self.grid(position)
         effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())
 
-        def nearest(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        def nearest(
+            state: Float[Tensor, "*b 4"], target: Float[Tensor, "*b 4"], known: Bool[Tensor, "*b"]
+        ) -> tuple[Int[Tensor, "*b"], Float[Tensor, "*b 4"]]:
             after = bicycle_step(
                 state[..., None, :].expand(*state.shape[:-1], self.num_actions, 4),
                 acceleration,
@@ -265,7 +243,9 @@ class Displacement:
     ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
         """Displacements that reach every valid logged position exactly; headings follow from the motion."""
 
-        def exact(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        def exact(
+            state: Float[Tensor, "*b 4"], target: Float[Tensor, "*b 4"], known: Bool[Tensor, "*b"]
+        ) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b 4"]]:
             coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)
             action = torch.where(known[..., None], displacement_inverse(state, target), coast)
             return action, displacement_step(state, action, size[..., 0], dt)
@@ -279,7 +259,7 @@ def _follow(
     speed: Float[Tensor, "*b T"],
     valid: Bool[Tensor, "*b T"],
     advance: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
-) -> tuple[Tensor, Float[Tensor, "*b T 4"]]:
+) -> tuple[Shaped[Tensor, "*b Tm1 ..."], Float[Tensor, "*b T 4"]]:
     """Step through a log: ``advance(state, target, known)`` gives an action and the state it leads to.
 
     ``known`` says where the target and the logged state before it are valid. Where a log begins again after a

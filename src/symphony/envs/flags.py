@@ -37,7 +37,12 @@ def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor,
     return (hit & other).any(-1)
 
 
-def _where_circles_meet(objects: Objects, state: Tensor, size: Tensor, other: Tensor) -> Tensor:
+def _where_circles_meet(
+    objects: Objects,
+    state: Float[Tensor, "M N 5"],
+    size: Float[Tensor, "M N 2"],
+    other: Bool[Tensor, "M N A"],
+) -> Bool[Tensor, "M N"]:
     """Boxes can only overlap where the circles around them do: of all pairs few are left to look at closely."""
     reach = 0.5 * size.norm(dim=-1)[..., None] + (0.5 * objects.size.norm(dim=-1) + _SLACK)[:, None]
     x, y = (state[..., k, None] - objects.state[:, None, :, k] for k in (0, 1))
@@ -45,6 +50,7 @@ def _where_circles_meet(objects: Objects, state: Tensor, size: Tensor, other: Te
     # One flat index, because finding all coordinates of each pair would cost more than the test.
     pair = (near & other).view(-1).nonzero().squeeze(-1)
     subjects, agents = state.shape[1], objects.state.shape[1]
+    # Of a place in [M, N, A] the one in [M, N], and that of the agent in [M, A] of the same row.
     who = torch.div(pair, agents, rounding_mode="floor")
     whom = torch.div(who, subjects, rounding_mode="floor") * agents + pair % agents
     one, two = state.view(-1, 5)[who], objects.state.reshape(-1, 5)[whom]

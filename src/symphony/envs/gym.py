@@ -45,7 +45,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         data: a store of run segments, or its folder.
         action: ``discrete``: the kinematic bicycle's joint actions; ``continuous``: the displacement over a step,
             forward and to the left, where 1 stands for :data:`TOP_SPEED`.
-        observation: what the ego sees.
+        observation: what the ego observes.
         reward: of a step, from the state before and the state after it, as of ``DrivingEnv``; by default -1 where
             the ego collides or is off the road.
         ends_on: what ends an episode early.
@@ -152,7 +152,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         return self.env.with_goals(start) if self.observation.route else start
 
     def _observed(self, state: TensorDictBase) -> Observed:
-        """What the ego sees, as NumPy arrays."""
+        """The ego's observation, as NumPy arrays."""
         seen: Observed = {}
         for name, value in state.get(("agents", "observation")).items():
             array = value[0].numpy()

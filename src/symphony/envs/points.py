@@ -1,6 +1,6 @@
-"""The nearest map and light points as an agent sees them.
+"""The nearest map and light points as an agent observes them.
 
-Shapes: M rows (any flattened batch), N observing agents, K points each sees, P points of a scene.
+Shapes: M rows (any flattened batch), N observing agents, K points each observes, P points of a scene.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def nearest_points(
         flat[torch.from_numpy(known)] = torch.from_numpy(found)
     _among_all(flat.numpy(), rest, row, here_x, here_y, x.numpy(), y.numpy())
     flat = flat.view(*origin.shape[:2], count)
-    return flat, _exist(tables, scene, flat)
+    return flat, _exist(tables, flat)
 
 
 def _among_all(
@@ -116,7 +116,7 @@ def _among_all(
         flat[rows] = chosen + (scene[rows] * total)[:, None]
 
 
-def _exist(tables: Tables, scene: Tensor, flat: Tensor) -> Tensor:
+def _exist(tables: Tables, flat: Int[Tensor, "M N K"]) -> Bool[Tensor, "M N K"]:
     if tables.enough_points:
         return torch.ones(flat.shape, dtype=torch.bool)
     return tables.scenes.point_valid.flatten()[flat]
@@ -124,14 +124,14 @@ def _exist(tables: Tables, scene: Tensor, flat: Tensor) -> Tensor:
 
 def _features(
     tables: Tables,
-    scene: Tensor,
-    step: Tensor,
-    flat: Tensor,
-    mask: Tensor,
-    origin: Tensor,
-    heading: Tensor,
-    speed: Tensor,
-) -> Tensor:
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    flat: Int[Tensor, "M N K"],
+    mask: Bool[Tensor, "M N K"],
+    origin: Float[Tensor, "M N 2"],
+    heading: Float[Tensor, "M N"],
+    speed: Float[Tensor, "M N"],
+) -> Float[Tensor, "M N K F"]:
     config, angle = tables.config, -heading[..., None]
     static = tables.points.index_select(0, flat.flatten()).unflatten(0, flat.shape)
     lights = static[..., LIGHT_COLUMN:]
@@ -160,14 +160,14 @@ def _features(
 
 def _features_in_place(
     tables: Tables,
-    scene: Tensor,
-    step: Tensor,
-    flat: Tensor,
-    mask: Tensor,
-    origin: Tensor,
-    heading: Tensor,
-    speed: Tensor,
-) -> Tensor:
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    flat: Int[Tensor, "M N K"],
+    mask: Bool[Tensor, "M N K"],
+    origin: Float[Tensor, "M N 2"],
+    heading: Float[Tensor, "M N"],
+    speed: Float[Tensor, "M N"],
+) -> Float[Tensor, "M N K F"]:
     """The same numbers, written over copied rows block by block; a third of the time, without a gradient."""
     config, count = tables.config, flat.shape[-1]
     agents, index = flat.numel() // count, flat.flatten()
@@ -188,6 +188,7 @@ def _features_in_place(
     if tables.light is not None:
         light = tables.light.index_select(0, index)
         place = (light >= 0).nonzero().squeeze(-1)
+        # Of a place in [M, N, K] the row.
         row = place // (count * origin.shape[1])
         state = _light_now(tables, scene, step)[row, light[place].long()]
         out.view(-1, POINT_FEATURES)[place, LIGHT_COLUMN + state] = 1.0
@@ -217,9 +218,10 @@ def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: n
     part[..., 5] = own
 
 
-def _light_now(tables: Tables, scene: Tensor, step: Tensor) -> Tensor:
+def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:
     """State [M, Q] int64 of the lights of each row."""
     scenes = tables.scenes
     steps = scenes.light.shape[1]
+    # Places in the flattened [B, steps]; after the log its last state stays.
     row = scene * steps + step.clamp(max=steps - 1)
     return scenes.light.flatten(0, 1).index_select(0, row).long()

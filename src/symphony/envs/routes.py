@@ -30,13 +30,13 @@ SPACING = 3.0
 POINTS = 64
 """Points of a route: 189 m, past what a fast vehicle drives in 10 s."""
 AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
-"""Points of its route that a vehicle sees, counted from the one nearest to it."""
+"""Points of its route that a vehicle observes, counted from the one nearest to it."""
 ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
 ALONG_FEATURES = 11
 BESIDE = 20.0
 """Metres beside its route within which an agent sees where along it something is."""
 STRIDE = 4
-"""Of the points of a route, the share (one in so many) by which the goal policy judges it."""
+"""Of the points of a route, the share (one in so many) by which the goal policy observes it."""
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 
 
@@ -95,7 +95,7 @@ def route_ahead(
     count: Int[Tensor, "M N"],
     distance_scale: float,
 ) -> Float[Tensor, "M N F"]:
-    """What each agent sees of its route, in its own frame.
+    """What each agent observes of its route, in its own frame.
 
     Whether it has one, how far to the left the route lies (metres / 5), its direction, then position and existence of
     points ahead. All zero without a route.
@@ -236,6 +236,7 @@ def pick_routes(
     if routes == 0:
         return route.new_zeros(*goal.shape, POINTS, 2), torch.zeros_like(goal)
     place = torch.arange(agents, device=goal.device)
+    # Places in the flattened [B, A, G].
     row = ((scene[:, None] * agents + place) * routes + goal.clamp_min(0)).flatten()
     points = route.flatten(0, 2).index_select(0, row).unflatten(0, goal.shape)
     exists = count.flatten().index_select(0, row).unflatten(0, goal.shape)

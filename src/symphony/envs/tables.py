@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from symphony.data.segment import AgentType, SignalState
@@ -43,8 +44,8 @@ class Tables:
         return Tables, (self.scenes, self.config)
 
     @cached_property
-    def points(self) -> Tensor:
-        """[B * P, 23] a point's features, with its position and direction in the frame of the world, in metres, in
+    def points(self) -> Float[Tensor, "BP 23"]:
+        """[B P, 23] a point's features, with its position and direction in the frame of the world, in metres, in
         the first four columns and zeros where they depend on the agent or the time.
         """
         scenes = self.scenes
@@ -57,7 +58,7 @@ class Tables:
         return rows
 
     @cached_property
-    def light(self) -> Tensor | None:
+    def light(self) -> Int[Tensor, " BP"] | None:
         """[B * P] int16 row of the lights, -1 for other points; None if there are no lights."""
         return self.scenes.point_light.flatten() if self.scenes.light.shape[2] else None
 
@@ -89,7 +90,7 @@ class Tables:
         return bool((self.scenes.point_valid.sum(1) >= self.config.num_points).all())
 
     @cached_property
-    def agents(self) -> Tensor:
+    def agents(self) -> Float[Tensor, "BA 7"]:
         """[B * A, 7] size and kind of agents as they are seen."""
         scenes = self.scenes
         size = scenes.box_size.flatten(0, 1) / self.config.size_scale
@@ -98,13 +99,13 @@ class Tables:
         return rows.scatter_(1, 2 + scenes.agent_type.flatten().long()[:, None], 1.0)
 
     @cached_property
-    def edges(self) -> dict[str, Tensor]:
+    def edges(self) -> dict[str, Shaped[Tensor, "1 BE ..."]]:
         """The boundary as one scene of B * E segments: start, end, valid, previous, following."""
         scenes = self.scenes
         scene_count, per_scene = scenes.edge_valid.shape
         base = torch.arange(scene_count, device=scenes.edge_valid.device)[:, None] * per_scene
 
-        def flat(index: Tensor) -> Tensor:
+        def flat(index: Int[Tensor, "B E"]) -> Int[Tensor, "1 BE"]:
             return torch.where(index >= 0, index + base, -1).flatten()[None]
 
         start, end = scenes.edge_start, scenes.edge_end
@@ -117,7 +118,7 @@ class Tables:
         }
 
     @cached_property
-    def bounded(self) -> Tensor:
+    def bounded(self) -> Bool[Tensor, " B"]:
         """[B] whether a scene has a boundary at all."""
         return self.edges["valid"].view(self.scenes.edge_valid.shape).any(1)
 

@@ -341,7 +341,9 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T
     )
 
 
-def _curvatures(graph: LaneGraph, state: Tensor, counted: Tensor) -> NDArray[np.float64]:
+def _curvatures(
+    graph: LaneGraph, state: Float[Tensor, "*b U N 4"], counted: Bool[Tensor, "*b T N"]
+) -> NDArray[np.float64]:
     """Average curvature of every branching region that each trajectory visits.
 
     Args:

@@ -118,7 +118,7 @@ def _add(sums: _Sums, segment: RunSegment, rows: NDArray[np.int64], graph: LaneG
     valid = segment.valid[rows]
     position = segment.position[rows, :, :2].astype(np.float64)
     heading, velocity = segment.heading[rows].astype(np.float64), segment.velocity[rows].astype(np.float64)
-    # As the evaluator judges them, so that no figure here can differ from the playback row of a table.
+    # As the evaluator does, so that no figure here can differ from the playback row of a table.
     log = playback(scene(segment, rows.tolist()))
     sums.collided.append(bool(log.collision.any()))
     sums.off.append(log.offroad[log.counted].numpy())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from symphony.geometry.boxes import box_corners, box_gap, boxes_overlap
-from symphony.geometry.frames import forward_speed, from_frame, rotate, to_frame, wrap
+from symphony.geometry.frames import forward_speed, rotate, wrap
 from symphony.geometry.polylines import NO_BOUNDARY, segments_of, signed_distance
 
 __all__ = [
@@ -12,10 +12,8 @@ __all__ = [
     "box_gap",
     "boxes_overlap",
     "forward_speed",
-    "from_frame",
     "rotate",
     "segments_of",
     "signed_distance",
-    "to_frame",
     "wrap",
 ]

@@ -64,14 +64,19 @@ def box_gap(
     return torch.where(separation <= 0, separation, apart)
 
 
-def _local_corners(size: Tensor) -> Tensor:
+def _local_corners(size: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 4 2"]:
     signs = constant(_CORNER_SIGNS, size.dtype, size.device)
     return 0.5 * size[..., None, :] * signs
 
 
 def _separations(
-    center_a: Tensor, heading_a: Tensor, size_a: Tensor, center_b: Tensor, heading_b: Tensor, size_b: Tensor
-) -> Tensor:
+    center_a: Float[Tensor, "*#b 2"],
+    heading_a: Float[Tensor, "*#b"],
+    size_a: Float[Tensor, "*#b 2"],
+    center_b: Float[Tensor, "*#b 2"],
+    heading_b: Float[Tensor, "*#b"],
+    size_b: Float[Tensor, "*#b 2"],
+) -> Float[Tensor, "*b"]:
     """Largest separation along the four face normals: negative where the boxes overlap."""
     # Everything is relative (centre difference, heading difference), so large coordinates cost no precision,
     # and each box's axes are treated alike, so that swapping the boxes gives the same bits.
@@ -93,15 +98,22 @@ def _separations(
     return torch.maximum(front, side)
 
 
-def _projections(delta: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
+def _projections(
+    delta: Float[Tensor, "*#b 2"], heading: Float[Tensor, "*#b"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     cos, sin = torch.cos(heading), torch.sin(heading)
     x, y = delta[..., 0], delta[..., 1]
     return (cos * x + sin * y).abs(), (cos * y - sin * x).abs()
 
 
 def _corner_distance(
-    center: Tensor, heading: Tensor, size: Tensor, other: Tensor, other_heading: Tensor, other_size: Tensor
-) -> Tensor:
+    center: Float[Tensor, "*#b 2"],
+    heading: Float[Tensor, "*#b"],
+    size: Float[Tensor, "*#b 2"],
+    other: Float[Tensor, "*#b 2"],
+    other_heading: Float[Tensor, "*#b"],
+    other_size: Float[Tensor, "*#b 2"],
+) -> Float[Tensor, "*b"]:
     """Smallest distance of the other box's corners from this box (0 inside)."""
     delta, turn = other - center, other_heading - heading
     cos, sin = torch.cos(heading), torch.sin(heading)

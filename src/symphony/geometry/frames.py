@@ -25,20 +25,6 @@ def rotate(vectors: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) 
     return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
 
 
-def to_frame(
-    points: Float[Tensor, "*batch 2"], origin: Float[Tensor, "*#batch 2"], heading: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*batch 2"]:
-    """World points in the frame at ``origin`` whose x axis points along ``heading`` (y to the left)."""
-    return rotate(points - origin, -heading)
-
-
-def from_frame(
-    points: Float[Tensor, "*batch 2"], origin: Float[Tensor, "*#batch 2"], heading: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*batch 2"]:
-    """Inverse of :func:`to_frame`."""
-    return rotate(points, heading) + origin
-
-
 def forward_speed(
     velocity: Float[Tensor, "*batch 2"], heading: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*batch"]:

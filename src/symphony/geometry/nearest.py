@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
@@ -46,7 +46,7 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     return np.flatnonzero(chosen)
 
 
-def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Tensor, Tensor]:
+def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Int[Tensor, "*b n"], Bool[Tensor, "*b n"]]:
     """Index [..., count] of the smallest elements and which of them are finite; the rest is padded with index 0.
 
     On the CPU in ascending order of the index, ties going to the elements that come first.

@@ -92,7 +92,9 @@ def distance_to(
 class _Side:
     """Where points [B, M, 2] lie relative to one segment each."""
 
-    def __init__(self, points: Tensor, start: Tensor, end: Tensor) -> None:
+    def __init__(
+        self, points: Float[Tensor, "B M 2"], start: Float[Tensor, "B M 2"], end: Float[Tensor, "B M 2"]
+    ) -> None:
         self.direction = end - start
         # Component by component: sums over a last dimension of 2 are slow.
         (along_x, along_y), (x, y) = self.direction.unbind(-1), (points - start).unbind(-1)
@@ -104,7 +106,7 @@ class _Side:
         self._away = x, y, along_x, along_y
 
     @property
-    def to_end(self) -> Tensor:
+    def to_end(self) -> Float[Tensor, "B M"]:
         """Distance to the nearer end."""
         x, y, along_x, along_y = self._away
         beyond = self.fraction > 0.5
@@ -113,22 +115,22 @@ class _Side:
         return torch.where(apart, torch.where(apart, gap, 1.0).sqrt(), 0.0)
 
     @property
-    def sign(self) -> Tensor:
+    def sign(self) -> Float[Tensor, "B M"]:
         """+1 on the right, -1 on the left and on the line itself."""
         return 2.0 * (self.offset.detach() > 0).to(self.offset.dtype) - 1.0
 
 
 @torch.no_grad()
 def _corner_sign(
-    points: Tensor,
-    start: Tensor,
-    end: Tensor,
-    valid: Tensor,
-    neighbor: Tensor,
-    nearest: Tensor,
+    points: Float[Tensor, "B M 2"],
+    start: Float[Tensor, "B E 2"],
+    end: Float[Tensor, "B E 2"],
+    valid: Bool[Tensor, "B E"],
+    neighbor: Int[Tensor, "B E"],
+    nearest: Int[Tensor, "B M"],
     here: _Side,
     ahead: bool,
-) -> Tensor:
+) -> Float[Tensor, "B M"]:
     """Sign at a corner: right of either segment where the line turns left, of both where it turns right."""
     index = neighbor.gather(1, nearest).long()
     exists = (index >= 0) & valid.gather(1, index.clamp(min=0))
@@ -141,15 +143,20 @@ def _corner_sign(
     return torch.where(exists, both, one)
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
+def _cross(a: Float[Tensor, "*b 2"], b: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _take(values: Tensor, index: Tensor) -> Tensor:
+def _take(values: Float[Tensor, "B E 2"], index: Int[Tensor, "B M"]) -> Float[Tensor, "B M 2"]:
     return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
 
 
-def _nearest_segment(points: Tensor, start: Tensor, end: Tensor, valid: Tensor) -> Tensor:
+def _nearest_segment(
+    points: Float[Tensor, "B M 2"],
+    start: Float[Tensor, "B E 2"],
+    end: Float[Tensor, "B E 2"],
+    valid: Bool[Tensor, "B E"],
+) -> Int[Tensor, "B M"]:
     """Index [B, M] of the nearest valid segment."""
     batch, count, _ = points.shape
     edges = start.shape[1]
@@ -183,7 +190,7 @@ def _nearest_segment(points: Tensor, start: Tensor, end: Tensor, valid: Tensor) 
     return result
 
 
-def _argmin(values: Tensor) -> tuple[Tensor, Tensor]:
+def _argmin(values: Float[Tensor, "*b E"]) -> tuple[Float[Tensor, "*b"], Int[Tensor, "*b"]]:
     """Minimum over the last dimension and where it is.
 
     In two levels, because on the CPU the index costs ten times as much as the minimum itself.
@@ -195,6 +202,7 @@ def _argmin(values: Tensor) -> tuple[Tensor, Tensor]:
     body = values[..., : fold * _FOLD].unflatten(-1, (_FOLD, fold))
     smallest, column = body.amin(-2).min(-1)
     lane = body.gather(-1, column[..., None, None].expand(*column.shape, _FOLD, 1))[..., 0].min(-1).indices
+    # Its place before the fold, [_FOLD, fold].
     index = lane * fold + column
     if fold * _FOLD == size:
         return smallest, index
@@ -202,7 +210,12 @@ def _argmin(values: Tensor) -> tuple[Tensor, Tensor]:
     return torch.minimum(rest, smallest), torch.where(rest < smallest, tail + fold * _FOLD, index)
 
 
-def _segment_axes(start: Tensor, end: Tensor, valid: Tensor, center: Tensor) -> Tensor:
+def _segment_axes(
+    start: Float[Tensor, "B E 2"],
+    end: Float[Tensor, "B E 2"],
+    valid: Bool[Tensor, "B E"],
+    center: Float[Tensor, "B 1 2"],
+) -> Float[Tensor, "5 B E"]:
     """Each segment's unit vector, offsets along (from its middle) and across, and half length: [5, B, E].
 
     Component by component: operations on a last dimension of 2 are ten times slower.

@@ -82,7 +82,9 @@ def sampling_floor(counts_log: NDArray[Any], draws: int = 200) -> float:
     """
     number = len(counts_log)
     often = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), size=draws)
-    return float(np.nanmean(jensen_shannon(often @ counts_log, counts_log.sum(0)[None])))
+    values = jensen_shannon(often @ counts_log, counts_log.sum(0)[None])
+    known = values[np.isfinite(values)]  # a draw without any curvature has no distribution
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _normalised(counts: NDArray[np.float64]) -> NDArray[np.float64]:

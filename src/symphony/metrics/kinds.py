@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from symphony.geometry import box_gap, rotate, wrap
@@ -70,10 +70,10 @@ class CollisionKinds(NamedTuple):
         playback: bool, whether that one is no interactive agent.
     """
 
-    kind: Tensor
-    step: Tensor
-    other: Tensor
-    playback: Tensor
+    kind: Int[Tensor, "*lead N"]
+    step: Int[Tensor, "*lead N"]
+    other: Int[Tensor, "*lead N"]
+    playback: Bool[Tensor, "*lead N"]
 
     def first(self) -> tuple[Int[Tensor, "*lead"], Bool[Tensor, "*lead"]]:
         """Kind (-1 for none) and `playback` of the first collision of each rollout.
@@ -84,6 +84,7 @@ class CollisionKinds(NamedTuple):
         number = len(CollisionKind)
         none = torch.iinfo(torch.int64).max
         rank = torch.tensor(_RANK, device=self.kind.device)
+        # One number to take the least of, and to take apart again: step, then rank, then whether it is no playback.
         key = 2 * (number * self.step + rank[self.kind.clamp(min=0)]) + (~self.playback).long()
         key = torch.where(self.kind < 0, none, key)
         key = torch.cat([key, key.new_full((*key.shape[:-1], 1), none)], -1).amin(-1)
@@ -95,12 +96,12 @@ class CollisionKinds(NamedTuple):
 class _Poses(NamedTuple):
     """Position [M, A, 2], heading [M, A], velocity [M, A, 2] and validity [M, A]."""
 
-    position: Tensor
-    heading: Tensor
-    velocity: Tensor
-    valid: Tensor
+    position: Float[Tensor, "M *A 2"]
+    heading: Float[Tensor, M * A]
+    velocity: Float[Tensor, "M *A 2"]
+    valid: Bool[Tensor, M * A]
 
-    def of(self, row: Tensor) -> _Poses:
+    def of(self, row: Int[Tensor, " M"]) -> _Poses:
         """Of one agent [M] each."""
         return _Poses(*(value[torch.arange(len(row), device=row.device), row] for value in self))
 
@@ -148,7 +149,7 @@ def collision_kinds(
     if bool((agent < 0).any()):
         raise ValueError("collided is True for a subject that stands for no agent")
 
-    def poses(index: Tensor) -> _Poses:
+    def poses(index: Int[Tensor, " M"]) -> _Poses:
         at = (*where, index)
         logged = log_state.expand(*lead, *log_state.shape[-3:]).transpose(-3, -2)[at]
         valid = log_valid.expand(*lead, *log_valid.shape[-2:]).transpose(-2, -1)[at]
@@ -175,13 +176,15 @@ def collision_kinds(
             kind = torch.where(hit_type == number, int(named), kind)
     playback = ~(other[:, None] == rows).any(-1)
 
-    def filled(values: Tensor) -> Tensor:
+    def filled(values: Int[Tensor, " M"]) -> Int[Tensor, ...]:
         return torch.full(hit.shape, -1, device=hit.device).masked_scatter(hit, values)[0]
 
     return CollisionKinds(filled(kind), filled(step), filled(other), filled(playback.long()) == 1)
 
 
-def _placed(values: Tensor, driven: Tensor, rows: Tensor) -> Tensor:
+def _placed(
+    values: Shaped[Tensor, "M A *e"], driven: Shaped[Tensor, "M N *e"], rows: Int[Tensor, "M N"]
+) -> Shaped[Tensor, "M A *e"]:
     """Values [M, A, ...] with those of the interactive agents [M, N, ...] in their rows."""
     count = values.shape[1]
     # Padding goes to a row more, which is dropped.
@@ -191,7 +194,7 @@ def _placed(values: Tensor, driven: Tensor, rows: Tensor) -> Tensor:
     return values.scatter(1, index, driven)[:, :count]
 
 
-def _deepest(contact: _Poses, boxes: Tensor, agent: Tensor) -> Tensor:
+def _deepest(contact: _Poses, boxes: Float[Tensor, "M A 2"], agent: Int[Tensor, " M"]) -> Int[Tensor, " M"]:
     me = torch.arange(len(agent), device=agent.device), agent
     gap = box_gap(
         contact.position[me][:, None],
@@ -211,7 +214,7 @@ def _deepest(contact: _Poses, boxes: Tensor, agent: Tensor) -> Tensor:
     return other
 
 
-def _chosen(condition: Tensor, yes: _Poses, no: _Poses) -> _Poses:
+def _chosen(condition: Bool[Tensor, " M"], yes: _Poses, no: _Poses) -> _Poses:
     return _Poses(
         *(
             torch.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
@@ -221,8 +224,13 @@ def _chosen(condition: Tensor, yes: _Poses, no: _Poses) -> _Poses:
 
 
 def _classify(
-    one: _Poses, two: _Poses, one_hit: _Poses, two_hit: _Poses, size_one: Tensor, size_two: Tensor
-) -> Tensor:
+    one: _Poses,
+    two: _Poses,
+    one_hit: _Poses,
+    two_hit: _Poses,
+    size_one: Float[Tensor, "M 2"],
+    size_two: Float[Tensor, "M 2"],
+) -> Int[Tensor, " M"]:
     """Kind [M] for poses before and at contact."""
     turn = wrap(two.heading - one.heading)
     away, along, across = _separations(one, two, size_one, size_two)
@@ -240,7 +248,9 @@ def _classify(
     return torch.where(turn.abs() >= OPPOSITE_WAY, int(CollisionKind.ONCOMING), kind)
 
 
-def _separations(one: _Poses, two: _Poses, size_one: Tensor, size_two: Tensor) -> tuple[Tensor, ...]:
+def _separations(
+    one: _Poses, two: _Poses, size_one: Float[Tensor, "M 2"], size_two: Float[Tensor, "M 2"]
+) -> tuple[Float[Tensor, " M"], ...]:
     """How far two is ahead of one, and the gaps between their boxes along and across their mean heading."""
     half = 0.5 * wrap(two.heading - one.heading)
     # The mean heading, not that of either: so the two agents always agree on what they did.
@@ -252,7 +262,7 @@ def _separations(one: _Poses, two: _Poses, size_one: Tensor, size_two: Tensor) -
     return delta[..., 0], along, across
 
 
-def _closing(gap: Tensor, gap_hit: Tensor) -> Tensor:
+def _closing(gap: Float[Tensor, " M"], gap_hit: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
     """Share of the step after which a gap is closed; where it was closed before, minus its depth."""
     return torch.where(gap > 0, gap / (gap - gap_hit).clamp(min=1e-6), gap)
 

@@ -47,7 +47,9 @@ def passing_gap(
     return torch.where(least < never, gap.to(first.dtype), torch.nan)
 
 
-def _finer(path: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def _finer(
+    path: Float[Tensor, "*b T F"], valid: Bool[Tensor, "*b T"]
+) -> tuple[Float[Tensor, "*b fine F"], Bool[Tensor, "*b fine"]]:
     """The path at parts of a step, straight in between, and where both neighbours are valid."""
     steps = path.shape[-2]
     where = torch.arange((steps - 1) * _FINER + 1, device=path.device)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -34,7 +35,7 @@ class Discriminator(nn.Module):
         own_features: of the agent itself, its route included where it is given one.
         object_features: of one object; the first two are its position in the agent's frame.
         point_features: of one map or light point; likewise.
-        radius: how far it sees, in the units of those positions.
+        radius: how far it observes, in the units of those positions.
         hidden: width of the encoders.
         head: widths of the head's hidden layers.
         features: ``paper``; ``clearance``, which adds the signed gap to the box of each object and the signed
@@ -65,15 +66,15 @@ class Discriminator(nn.Module):
 
     def forward(
         self,
-        own: Tensor,
-        valid: Tensor,
-        objects: Tensor,
-        objects_mask: Tensor,
-        points: Tensor,
-        points_mask: Tensor,
-        road: Tensor | None = None,
-        *gaps: Tensor,
-    ) -> Tensor:
+        own: Float[Tensor, "*b N F"],
+        valid: Bool[Tensor, "*b N"],
+        objects: Float[Tensor, "*b N O Fo"],
+        objects_mask: Bool[Tensor, "*b N O"],
+        points: Float[Tensor, "*b N P Fp"],
+        points_mask: Bool[Tensor, "*b N P"],
+        road: Float[Tensor, "*b N 5"] | None = None,
+        *gaps: Float[Tensor, "*b N O"] | Float[Tensor, "*b N O H"],
+    ) -> Float[Tensor, "*b N"]:
         """Logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, road `[..., N, 5]`, gaps
         `[..., N, O]` and with foresight `[..., N, O, H]`.
         """
@@ -86,7 +87,7 @@ class Discriminator(nn.Module):
         logits = self.network(own, valid, objects, objects_mask, points, points_mask).squeeze(-1)
         return torch.where(valid, logits, 0.0)
 
-    def _near(self, elements: Tensor) -> Tensor:
+    def _near(self, elements: Float[Tensor, "*e F"]) -> Bool[Tensor, "*e"]:
         return elements[..., :2].detach().square().sum(-1) <= self.radius**2
 
 

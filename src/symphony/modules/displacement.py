@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
@@ -21,24 +22,24 @@ INSIDE = 0.95
 """Share of the bounds beyond which an action counts as lying there, so that its likelihood stays finite."""
 
 
-def squash(x: Tensor) -> Tensor:
+def squash(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """`x / sqrt(1 + x^2)`, in (-1, 1). Made of exactly rounded operations, unlike tanh, whose last bit on the CPU
     depends on an element's place in the batch.
     """
     return x * (1.0 + x.square()).rsqrt() if x.device.type != "cpu" else x / (1.0 + x.square()).sqrt()
 
 
-def unsquash(y: Tensor) -> Tensor:
+def unsquash(y: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """Inverse of :func:`squash`."""
     return y / (1.0 - y.square()).sqrt()
 
 
-def positive(x: Tensor, smooth: float = SMOOTH) -> Tensor:
+def positive(x: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
     """A smooth `max(x, 0)`: `(x + sqrt(x^2 + smooth^2)) / 2`, above it by at most `smooth / 2`."""
     return 0.5 * (x + (x.square() + smooth**2).sqrt())
 
 
-def positive_inverse(y: Tensor, smooth: float = SMOOTH) -> Tensor:
+def positive_inverse(y: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
     """Inverse of :func:`positive`, for `y > 0`."""
     return y - smooth**2 / (4.0 * y)
 
@@ -64,10 +65,10 @@ class BoundedDisplacement(Distribution):
 
     def __init__(
         self,
-        loc: Tensor,
-        scale: Tensor,
-        pace: Tensor,
-        slope: Tensor,
+        loc: Float[Tensor, "*b 2"],
+        scale: Float[Tensor, "*b 2"],
+        pace: Float[Tensor, "*b"],
+        slope: Float[Tensor, "*b"],
         reach: float,
         validate_args: bool | None = None,
     ) -> None:
@@ -88,39 +89,42 @@ class BoundedDisplacement(Distribution):
             validate_args=False,
         )
 
-    def displacement(self, u: Tensor) -> Tensor:
+    def displacement(self, u: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """The displacement that Gaussian numbers [..., 2] stand for."""
         forward = positive(self.pace + self.reach * squash(u[..., 0]))
         return torch.stack([forward, forward * self.slope * squash(u[..., 1])], -1)
 
-    def latent(self, displacement: Tensor) -> Tensor:
+    def latent(self, displacement: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """Inverse of :meth:`displacement`; what lies outside the bounds or next to them is moved to INSIDE them."""
         forward = displacement[..., 0].clamp_min(1e-4)
         first = (positive_inverse(forward) - self.pace) / self.reach
         second = displacement[..., 1] / (forward * self.slope)
         return unsquash(torch.stack([first, second], -1).clamp(-INSIDE, INSIDE))
 
-    def rsample(self, sample_shape: torch.Size | Sequence[int] = torch.Size()) -> Tensor:  # noqa: B008
+    def rsample(
+        self,
+        sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
+    ) -> Float[Tensor, "*b 2"]:
         """Draw, with gradient to the parameters."""
         shape = self._extended_shape(torch.Size(sample_shape))
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
         return self.displacement(self.loc + self.scale * noise)
 
-    def icdf(self, value: Tensor) -> Tensor:
+    def icdf(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """The draw that independent uniform numbers [..., 2] in (0, 1) stand for, with gradient to the parameters."""
         return self.displacement(self.loc + self.scale * torch.special.ndtri(value))
 
     @property
-    def mode(self) -> Tensor:
+    def mode(self) -> Float[Tensor, "*b 2"]:
         """The displacement of the mean of u (the median of either component)."""
         return self.displacement(self.loc)
 
     @property
-    def deterministic_sample(self) -> Tensor:
+    def deterministic_sample(self) -> Float[Tensor, "*b 2"]:
         """What TorchRL takes when it does not explore."""
         return self.mode
 
-    def log_prob(self, value: Tensor) -> Tensor:
+    def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
         """Log-density [...]; that of the nearest displacement INSIDE the bounds where `value` is not."""
         u = self.latent(value)
         x = self.pace + self.reach * squash(u[..., 0])
@@ -145,8 +149,14 @@ class _Parameters(nn.Module):
         self.slope, self.lateral, self.axle = slope, lateral, axle
 
     def forward(
-        self, head: Tensor, state: Tensor, own: Tensor, valid: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        self,
+        head: Float[Tensor, "*b N 4"],
+        state: Float[Tensor, "*b N 4"],
+        own: Float[Tensor, "*b N F"],
+        valid: Bool[Tensor, "*b N"],
+    ) -> tuple[
+        Float[Tensor, "*b N 2"], Float[Tensor, "*b N 2"], Float[Tensor, "*b N"], Float[Tensor, "*b N"]
+    ]:
         scale = self.min_scale + positive(head[..., 2:], 1.0)
         speed = torch.where(valid, state[..., 3], 0.0).clamp_min(0.0)
         # On a curve of curvature k the centre moves at an angle whose sine is k times its distance to the rear

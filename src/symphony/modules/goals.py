@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
@@ -37,7 +38,9 @@ class RouteScores(nn.Module):
         self.scene = nn.Linear(encoder.width, hidden)
         self.head = mlp((hidden, hidden, 1))
 
-    def forward(self, own: Tensor, valid: Tensor, *inputs: Tensor) -> Tensor:
+    def forward(
+        self, own: Float[Tensor, "*b N F"], valid: Bool[Tensor, "*b N"], *inputs: Shaped[Tensor, "*b N ..."]
+    ) -> Float[Tensor, "*b N G"]:
         """Inputs as for :class:`SceneEncoder`, then routes `[..., N, G, F]` and their mask `[..., N, G]`."""
         *elements, routes, mask = inputs
         around = in_blocks(self.scene, self.encoder(own, valid, *elements))
@@ -80,6 +83,6 @@ def goal_policy(
     )
 
 
-def drawn_goals(goal: Tensor, mask: Tensor) -> Tensor:
+def drawn_goals(goal: Int[Tensor, "*b N"], mask: Bool[Tensor, "*b N G"]) -> Int[Tensor, "*b N"]:
     """Goals `[..., N]` with -1 for agents that have no route in `mask` `[..., N, G]`."""
     return torch.where(mask.any(-1), goal, -1)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 PoolMode = Literal["auto", "dense", "winner"]
@@ -19,12 +20,12 @@ CPU core at width 64: the two meet between 48 and 64 elements)."""
 
 def pool_elements(
     function: Callable[[Tensor], Tensor],
-    elements: Tensor,
-    mask: Tensor,
+    elements: Float[Tensor, "*b K F"],
+    mask: Bool[Tensor, "*b K"],
     *,
     rows: int = ROWS,
     mode: PoolMode = "auto",
-) -> Tensor:
+) -> Float[Tensor, "*b H"]:
     """Maximum over the valid elements of a row-wise network's outputs (paper, III-C).
 
     Masked elements have no influence whatever they hold. A set without a valid element gives zeros and no
@@ -71,7 +72,7 @@ def pool_elements(
     return pooled.reshape(*batch, pooled.shape[-1])
 
 
-def _wants_gradient(function: Callable[[Tensor], Tensor], elements: Tensor) -> bool:
+def _wants_gradient(function: Callable[[Tensor], Tensor], elements: Float[Tensor, "*b K F"]) -> bool:
     if not torch.is_grad_enabled():
         return False
     if elements.requires_grad or not isinstance(function, nn.Module):
@@ -79,7 +80,9 @@ def _wants_gradient(function: Callable[[Tensor], Tensor], elements: Tensor) -> b
     return any(p.requires_grad for p in function.parameters())
 
 
-def _dense(function: Callable[[Tensor], Tensor], sets: Tensor, valid: Tensor) -> Tensor:
+def _dense(
+    function: Callable[[Tensor], Tensor], sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"]
+) -> Float[Tensor, "n H"]:
     n, count, features = sets.shape
     encoded = function(torch.where(valid[..., None], sets, 0.0).reshape(-1, features)).reshape(n, count, -1)
     # Not amax, which would share the gradient between equal elements.
@@ -87,13 +90,18 @@ def _dense(function: Callable[[Tensor], Tensor], sets: Tensor, valid: Tensor) ->
     return torch.where(valid.any(1, keepdim=True), pooled, 0.0)
 
 
-def _first_valid(valid: Tensor) -> Tensor:
+def _first_valid(valid: Bool[Tensor, "n K"]) -> Int[Tensor, " n"]:
     return valid.to(torch.uint8).argmax(1)
 
 
 def _in_chunks(
-    function: Callable[[Tensor], Tensor], sets: Tensor, valid: Tensor, rows: int, *, index: bool
-) -> tuple[Tensor, Tensor | None]:
+    function: Callable[[Tensor], Tensor],
+    sets: Float[Tensor, "n K F"],
+    valid: Bool[Tensor, "n K"],
+    rows: int,
+    *,
+    index: bool,
+) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"] | None]:
     """Maxima `[n, H]`, and on request the element `[n, H]` of each; arbitrary for sets without elements."""
     n, count, features = sets.shape
     size = max(1, rows // count)
@@ -118,7 +126,9 @@ def _in_chunks(
     return torch.cat(maxima), torch.cat(winners) if index else None
 
 
-def _through_winners(function: Callable[[Tensor], Tensor], sets: Tensor, valid: Tensor, rows: int) -> Tensor:
+def _through_winners(
+    function: Callable[[Tensor], Tensor], sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], rows: int
+) -> Float[Tensor, "n H"]:
     with torch.no_grad():
         _, winners = _in_chunks(function, sets, valid, rows, index=True)
         if winners is None:  # pragma: no cover - asked for just above
@@ -131,7 +141,9 @@ def _through_winners(function: Callable[[Tensor], Tensor], sets: Tensor, valid: 
     return torch.where(occupied, _own_channel(function, chosen), 0.0)
 
 
-def _own_channel(function: Callable[[Tensor], Tensor], chosen: Tensor) -> Tensor:
+def _own_channel(
+    function: Callable[[Tensor], Tensor], chosen: Float[Tensor, "n H F"]
+) -> Float[Tensor, "n H"]:
     """Output channel c of element c: `[n, H, F] -> [n, H]`."""
     last = function[-1] if isinstance(function, nn.Sequential) and len(function) else None
     if not isinstance(function, nn.Sequential) or not isinstance(last, nn.Linear):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 BLOCK = 64
@@ -22,7 +23,9 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def in_blocks(function: Callable[[Tensor], Tensor], x: Tensor, rows: int = BLOCK) -> Tensor:
+def in_blocks(
+    function: Callable[[Tensor], Tensor], x: Float[Tensor, "*b F"], rows: int = BLOCK
+) -> Float[Tensor, "*b H"]:
     """Apply a row-wise function `[n, F] -> [n, H]` to `x` `[..., F]` in blocks of exactly `rows` rows.
 
     Matrix products pick their kernel, and with it their rounding, by the number of rows, so that a row computed

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def inverse_cdf(logits: Tensor, noise: Tensor) -> Tensor:
+def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
     """Draw categories `[...]` int64 from logits `[..., C]` by uniform numbers `[...]` in [0, 1].
 
     The category is the one whose interval of the cumulative distribution holds the number; a category of

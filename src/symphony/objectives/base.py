@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int, Num, Shaped
 from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -31,7 +32,7 @@ class MaskedLoss(LossModule):
             the mean of their losses is the loss of the joint batch, however uneven its shards are.
     """
 
-    share_count: Callable[[Tensor], Tensor] | None = None
+    share_count: Callable[[Int[Tensor, ""]], Num[Tensor, ""]] | None = None
 
     def __init__(self, reduction: Reduction | None, use_mask: bool | None) -> None:
         super().__init__()
@@ -67,7 +68,7 @@ class MaskedLoss(LossModule):
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
 
-    def _mask(self, tensordict: TensorDictBase) -> Tensor | None:
+    def _mask(self, tensordict: TensorDictBase) -> Shaped[Tensor, "*b"] | None:
         """What the TensorDict holds under the `valid` key, by the rule of `use_mask`."""
         if self.use_mask is False:
             return None
@@ -77,7 +78,9 @@ class MaskedLoss(LossModule):
             raise KeyError(f"no mask under {key!r}; pass use_mask=False to train without one")
         return mask
 
-    def _entries(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Tensor:
+    def _entries(
+        self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size
+    ) -> Shaped[Tensor, "*b"]:
         """A tensor with one number per entry. Raises KeyError if it is absent, ValueError for another shape."""
         value = tensordict.get(key, default=None)
         if value is None:
@@ -88,14 +91,18 @@ class MaskedLoss(LossModule):
             )
         return value
 
-    def _flags(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Tensor:
+    def _flags(
+        self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size
+    ) -> Bool[Tensor, "*b"]:
         """Likewise for bools: `~` of an integer would be another integer, silently."""
         value = self._entries(tensordict, key, what, shape)
         if value.dtype != torch.bool:
             raise ValueError(f"{what} {key!r} is {value.dtype}, expected torch.bool")
         return value
 
-    def _counted(self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device) -> Tensor:
+    def _counted(
+        self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device
+    ) -> Bool[Tensor, "*b"]:
         """Bool mask of the entries that are valid and that no mask written by TorchRL itself leaves out."""
         counted = torch.ones(shape, dtype=torch.bool, device=device)
         if self._mask(tensordict) is not None:
@@ -106,7 +113,9 @@ class MaskedLoss(LossModule):
                 counted = counted & self._expand_loss_mask(mask, counted)
         return counted
 
-    def _reduced(self, values: Tensor, counted: Tensor, reduction: Reduction | None = None) -> Tensor:
+    def _reduced(
+        self, values: Float[Tensor, "*b"], counted: Bool[Tensor, "*b"], reduction: Reduction | None = None
+    ) -> Float[Tensor, ""] | Float[Tensor, "*b"]:
         """Mean (0 without entries) or sum over the counted entries, or their values with zeros elsewhere."""
         reduction = self.reduction if reduction is None else reduction
         # Selected, not multiplied: what is left out may not be finite.
@@ -118,7 +127,7 @@ class MaskedLoss(LossModule):
         number = self._number(counted)
         return values.sum() / torch.where(number > 0, number, 1)
 
-    def _number(self, counted: Tensor) -> Tensor:
+    def _number(self, counted: Bool[Tensor, "*b"]) -> Num[Tensor, ""]:
         """How many entries count, or what stands for it where processes train together."""
         return counted.sum() if self.share_count is None else self.share_count(counted.sum())
 
@@ -134,11 +143,11 @@ class Fit(NamedTuple):
         hit: 1.0 where the actor's mode is the action; None unless it is categorical.
     """
 
-    cost: Tensor
-    nll: Tensor
-    counted: Tensor
-    entropy: Tensor | None
-    hit: Tensor | None
+    cost: Float[Tensor, "*b"]
+    nll: Float[Tensor, "*b"]
+    counted: Bool[Tensor, "*b"]
+    entropy: Float[Tensor, "*b"] | None
+    hit: Float[Tensor, "*b"] | None
 
 
 class ActorLoss(MaskedLoss):
@@ -194,7 +203,7 @@ class ActorLoss(MaskedLoss):
             hit = (dist.logits.argmax(-1) == action).to(dist.logits.dtype)
             return Fit(cost, nll, counted, dist.entropy(), hit)
 
-    def _statistics(self, fit: Fit, counted: Tensor) -> dict[str, Tensor]:
+    def _statistics(self, fit: Fit, counted: Bool[Tensor, "*b"]) -> dict[str, Float[Tensor, ...]]:
         """Entropy and accuracy over some entries, of a categorical actor."""
         if fit.entropy is None or fit.hit is None:
             return {}

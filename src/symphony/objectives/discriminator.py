@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
@@ -42,7 +43,7 @@ class DiscriminatorLoss(MaskedLoss):
             which keeps the shape `[..., N]`, with zeros elsewhere. The penalty is reduced and added alike.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
-    Writes `loss_discriminator` and, detached, per kind the share judged right `accuracy_simulated` and
+    Writes `loss_discriminator` and, detached, per kind the share classified right `accuracy_simulated` and
     `accuracy_data`, the mean logits `score_simulated` and `score_data`, and `auc` of the logits (0.5: cannot tell;
     above: simulated states score higher), scalars whatever the reduction and NaN for a kind that is absent. With a
     penalty also the unweighted mean `gradient_penalty`.
@@ -164,7 +165,7 @@ class DiscriminatorLoss(MaskedLoss):
             inputs.set(key, value + self.instance_noise * noise.to(value.device))
         return inputs
 
-    def _leaves(self, inputs: TensorDictBase) -> list[Tensor]:
+    def _leaves(self, inputs: TensorDictBase) -> list[Float[Tensor, ...]]:
         """The inputs to differentiate by, put in place as leaves."""
         chosen = self.penalty_keys
         if chosen is None:
@@ -175,21 +176,25 @@ class DiscriminatorLoss(MaskedLoss):
         return leaves
 
     @staticmethod
-    def _floating(inputs: TensorDictBase, key: NestedKey) -> Tensor:
+    def _floating(inputs: TensorDictBase, key: NestedKey) -> Float[Tensor, ...]:
         value = inputs.get(key)
         if not value.is_floating_point():
             raise ValueError(f"{key!r} is {value.dtype}, expected floating point")
         return value
 
-    def _cross_entropy(self, logit: Tensor, fake: Tensor, real: Tensor) -> Tensor:
+    def _cross_entropy(
+        self, logit: Float[Tensor, "*b"], fake: Bool[Tensor, "*b"], real: Bool[Tensor, "*b"]
+    ) -> Float[Tensor, ""] | Float[Tensor, "*b"]:
         target = fake.to(logit.dtype) * (1.0 - self.label_smoothing) + 0.5 * self.label_smoothing
         entropy = functional.binary_cross_entropy_with_logits(logit, target, reduction="none")
         if self.reduction != "mean":
             return self._reduced(entropy, fake | real)
         return 0.5 * (self._reduced(entropy, fake) + self._reduced(entropy, real))
 
-    def _statistics(self, logit: Tensor, fake: Tensor, real: Tensor) -> dict[str, Tensor]:
-        def mean(values: Tensor, where: Tensor) -> Tensor:
+    def _statistics(
+        self, logit: Float[Tensor, "*b"], fake: Bool[Tensor, "*b"], real: Bool[Tensor, "*b"]
+    ) -> dict[str, Float[Tensor, ""]]:
+        def mean(values: Float[Tensor, "*b"], where: Bool[Tensor, "*b"]) -> Float[Tensor, ""]:
             return torch.where(where, values, 0.0).sum() / self._number(where)
 
         return {
@@ -201,7 +206,13 @@ class DiscriminatorLoss(MaskedLoss):
         }
 
 
-def _squared_norm(logit: Tensor, leaves: list[Tensor], where: Tensor, *, create_graph: bool) -> Tensor:
+def _squared_norm(
+    logit: Float[Tensor, "*b"],
+    leaves: list[Float[Tensor, ...]],
+    where: Bool[Tensor, "*b"],
+    *,
+    create_graph: bool,
+) -> Float[Tensor, "*b"]:
     """Squared norm `[..., N]` of each logit's gradient with respect to its own entry's inputs."""
     total = torch.where(where, logit, 0.0).sum()
     gradients = torch.autograd.grad(total, leaves, create_graph=create_graph, allow_unused=True)

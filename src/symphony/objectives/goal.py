@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
@@ -115,7 +116,7 @@ class GoalLoss(MaskedLoss):
         self._clear_weakrefs(tensordict, result, "goal_network_params")
         return result
 
-    def _logits(self, tensordict: TensorDictBase) -> Tensor:
+    def _logits(self, tensordict: TensorDictBase) -> Float[Tensor, "*b N G"]:
         network, inputs = self.goal_network, tensordict.copy()
         with self.goal_network_params.to_module(network):
             sampling = isinstance(network, ProbabilisticTensorDictSequential)
@@ -125,7 +126,9 @@ class GoalLoss(MaskedLoss):
             raise KeyError(f"the network writes no logits under {self.tensor_keys.logits!r}")
         return logits
 
-    def _right(self, tensordict: TensorDictBase, shape: torch.Size) -> tuple[Tensor, Tensor]:
+    def _right(
+        self, tensordict: TensorDictBase, shape: torch.Size
+    ) -> tuple[Bool[Tensor, "*b N G"], Bool[Tensor, "*b N"]]:
         """The right goals `[..., N, G]`, and where any is known `[..., N]`."""
         if tensordict.get(self.tensor_keys.label_set, default=None) is not None:
             right = self._flags(tensordict, self.tensor_keys.label_set, "set of labels", shape)
@@ -133,11 +136,16 @@ class GoalLoss(MaskedLoss):
         label = self._entries(tensordict, self.tensor_keys.label, "label", shape[:-1])
         return label[..., None] == torch.arange(shape[-1], device=label.device), label >= 0
 
-    def _check(self, right: Tensor, feasible: Tensor, counted: Tensor) -> None:
-        """Raises ValueError for a label that is none of the feasible goals."""
+    def _check(
+        self, right: Bool[Tensor, "*b N G"], feasible: Bool[Tensor, "*b N G"], counted: Bool[Tensor, "*b N"]
+    ) -> None:
+        """Raises ValueError for a label that is no feasible goal; an accelerator stops with an error of its own."""
         wrong = counted & (~right.any(-1) | (right & ~feasible).any(-1))
-        if bool(wrong.any()):
-            key = self.tensor_keys.label
+        key = self.tensor_keys.label
+        if wrong.device.type != "cpu":
+            # Found out on the device: to look at the numbers would wait for it.
+            torch._assert_async(~wrong.any(), f"label {key!r} is not one of the feasible goals")
+        elif bool(wrong.any()):
             raise ValueError(
                 f"label {key!r} at {wrong.nonzero()[0].tolist()} is not one of the feasible goals"
             )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
@@ -124,7 +125,7 @@ class MGAILLoss(MaskedLoss):
 
     @property
     def discriminator(self) -> TensorDictModuleBase:
-        """The judge, which is not trained here."""
+        """The discriminator, which is not trained here."""
         return self._held["discriminator"]
 
     @property
@@ -200,8 +201,13 @@ class MGAILLoss(MaskedLoss):
         return torch.Size([*now.shape, 1]) if mask is None else mask.shape
 
     def _simulate(
-        self, env: EnvBase, now: TensorDictBase, numbers: Tensor | None, first: int, length: int
-    ) -> tuple[Tensor, Tensor, TensorDictBase]:
+        self,
+        env: EnvBase,
+        now: TensorDictBase,
+        numbers: Float[Tensor, ...] | None,
+        first: int,
+        length: int,
+    ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"], TensorDictBase]:
         """Logits and whether the episode still ran, `[..., length, N]`, and the state after the last step."""
         batch, scores, going = now.batch_dims, [], []
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
@@ -224,8 +230,8 @@ class MGAILLoss(MaskedLoss):
                     drawn.set(key, acting.get(key))
                 alive = ~now.get(self.tensor_keys.done)
                 now = env.step_mdp(env.step(drawn))
-                judged = functional_call(self.discriminator, frozen, (now.copy(),))
-                score = judged.get(self.tensor_keys.score, default=None)
+                scored = functional_call(self.discriminator, frozen, (now.copy(),))
+                score = scored.get(self.tensor_keys.score, default=None)
                 if score is None:
                     raise KeyError(f"the discriminator writes no score under {self.tensor_keys.score!r}")
                 scores.append(score)

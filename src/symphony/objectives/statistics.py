@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def auc(scores: Tensor, positive: Tensor, valid: Tensor | None = None) -> Tensor:
+def auc(
+    scores: Float[Tensor, "*b"], positive: Bool[Tensor, "*b"], valid: Bool[Tensor, "*b"] | None = None
+) -> Float[Tensor, ""]:
     """Probability that a positive scores higher than a negative, ties counting one half (area under the ROC curve).
 
     The rank statistic of Mann and Whitney, O(n log n), over all entries. No gradient.

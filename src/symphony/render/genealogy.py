@@ -42,7 +42,7 @@ def rows(tree: SearchTree) -> NDArray[np.int64]:
     return found
 
 
-def plot_genealogy(tree: SearchTree, target: Target, *, dt: float = 0.2, start: int = 0) -> Axes:
+def plot_genealogy(tree: SearchTree, target: Target, *, dt: float, start: int = 0) -> Axes:
     """Draw every branch of a beam search in a row of its own, from left to right in time.
 
     Coloured by the highest score among the agents, step by step. What reaches a leaf is thick, what was pruned ends.

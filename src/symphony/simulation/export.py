@@ -1,4 +1,4 @@
-"""Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a) and plain JSON.
+"""Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a) and JSON.
 
 Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the source: the segment's, plus its origin.
 """
@@ -255,7 +255,7 @@ def _normals(line: Reals) -> Reals:
     return middle * np.minimum(2 / np.maximum(length, 1e-6), 1.5)
 
 
-def plain(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
+def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
     """A rollout as JSON can hold it: agents with their states by step, lights, map, routes, events.
 
     States are lists of step, x, y (m), heading (rad), speed (m/s).

@@ -59,7 +59,7 @@ class FiniteWatch:
             out_keys: floating-point entries [*b, N, ...] that must be finite for valid agents; absent ones are not
                 looked at.
             what: its name in the error.
-            scores: whether it judges states, the last of a scene among them; others act in those before. Past a
+            scores: whether it scores states, the last of a scene among them; others act in those before. Past a
                 scene's end there is only the padding of its batch.
         """
         return Watched(module, out_keys, lambda tensordict, value: self._see(tensordict, value, what, scores))

@@ -1,4 +1,4 @@
-"""A planner of one's own as the ego: what it is told, what it sees and what it gives back.
+"""A planner of one's own as the ego: what it is told, what it observes and what it gives back.
 
 Plain Python and NumPy. World frame of the run segment, metres, seconds, m/s, radians counter-clockwise. Arrays are
 read-only. Legend: A agents of the segment, Q lights, P points, T logged steps.

@@ -34,6 +34,9 @@ _LEARNED = (
 class SearchReplay:
     """The last search and what is drawn from it, until the next.
 
+    Not one of TorchRL's replay buffers: a state names a row of the scenes that its search drew, so it ends with them,
+    and what networks observe is made only for the states drawn.
+
     Args:
         collector: keeps the whole tree.
         env: it searches in.

@@ -32,7 +32,7 @@ class About:
     """What all rollouts of a folder have in common.
 
     Attributes:
-        agent: name of what is judged.
+        agent: name of what is evaluated.
         seed: of everything drawn at random.
         drivers: who drove whom, such as ``{"interactive": "bc", "others": "playback"}``.
         settings: of the simulation, as JSON can hold them.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -108,7 +109,7 @@ class Previewer:
         return Preview(video, samples)
 
     @torch.no_grad()
-    def _scores(self, step: int) -> dict[str, Tensor]:
+    def _scores(self, step: int) -> dict[str, Float[Tensor, " K"]]:
         """The discriminator's logits [K] of simulated and logged states; which, the number of the update says."""
         if self.agent.discriminator is None:
             return {}
@@ -138,7 +139,9 @@ def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> S
     return samples | {"ade": _finite((away * both).sum((1, 2, 3)) / both.sum((1, 2, 3)))}
 
 
-def _motion(state: Tensor, valid: Tensor, dt: Tensor) -> Samples:
+def _motion(
+    state: Float[Tensor, "B K U N 4"], valid: Bool[Tensor, "B K T N"], dt: Float[Tensor, "B 1 1 1"]
+) -> Samples:
     """Of the valid [B, K, T, N] steps to the later of states [B, K, T + 1, N, 4]."""
     change = state[:, :, 1:] - state[:, :, :-1]
     found = {
@@ -149,5 +152,5 @@ def _motion(state: Tensor, valid: Tensor, dt: Tensor) -> Samples:
     return {name: _finite(values[valid]) for name, values in found.items()}
 
 
-def _finite(values: Tensor) -> NDArray[np.float64]:
+def _finite(values: Float[Tensor, ...]) -> NDArray[np.float64]:
     return values[values.isfinite()].double().numpy()

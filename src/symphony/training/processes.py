@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float, Num
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
@@ -81,7 +82,7 @@ class Processes:
         loss.share_count = self._mean
         return SharedLoss(loss)
 
-    def mean(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def mean(self, values: Mapping[str, Num[Tensor, ""]]) -> dict[str, Num[Tensor, ""]]:
         """Means over the processes of the numbers each has under the same names; those that are NaN are left out.
 
         What a loss reports becomes exactly its value on the joint batch. AUCs and what searches report become means
@@ -103,7 +104,7 @@ class Processes:
             # A reduction, as a barrier of NCCL guesses the device.
             dist.all_reduce(torch.zeros((), device=self.device))
 
-    def _mean(self, number: Tensor) -> Tensor:
+    def _mean(self, number: Num[Tensor, ""]) -> Float[Tensor, ""]:
         total = number.double()
         dist.all_reduce(total)
         return (total / self.count).float()

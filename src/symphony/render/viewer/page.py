@@ -26,7 +26,7 @@ def view_page(
     ``#segment=ID&rollout=K&t=SECONDS&agent=ID`` behind its address names what it shows.
 
     Args:
-        agent: name of what is judged.
+        agent: name of what is evaluated.
         found: rollouts of each segment, and what is to be marked in them.
         settings: of the simulation.
     """

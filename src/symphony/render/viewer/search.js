@@ -1,4 +1,4 @@
-// The branches of a search: periods from left to right, slots from top to bottom, coloured by what they were judged.
+// The branches of a search: periods from left to right, slots from top to bottom, coloured by their scores.
 const SCALE = [[0, 114, 178], [214, 214, 205], [213, 94, 0]];
 
 function scoreColor(f) {
