@@ -19,12 +19,14 @@ from typing import Any
 import numpy as np
 
 from symphony.evaluation.comparison import Entry
+from symphony.evaluation.paired import clustered_mean
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
+from symphony.evaluation.wosac_table import read_wosac, wosac_grid
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
-PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/rollouts.md")
+PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/rollouts.md", "docs/wosac.md")
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 
 Record = dict[str, Any]
@@ -90,6 +92,13 @@ SEARCH = (
     ("only the bad replaced, goals of each branch", "replace-branch", ""),
 )
 """Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
+REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
+REAL_ROWS = (
+    ("constant velocity", "ngsim-constant-velocity"),
+    ("BC", "ngsim-bc"),
+    ("BC+TS+H without its search", "ngsim-none"),
+    ("BC+TS+H", "ngsim-replace-branch"),
+)
 PLAYBACK = "log playback"
 NGSIM = (
     (PLAYBACK, "ngsim/{}/playback"),
@@ -100,6 +109,17 @@ NGSIM = (
     ("BC+TS+H", "ngsim/{}/bc_ts_h-0-often"),
     ("BC+TS+H, freeways among the simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
 )
+WOSAC = (
+    ("BC", "bc"),
+    ("BC+H", "bc_h"),
+    ("BC+H, goals of the log", "bc_h-logged"),
+    ("BC+TS+H", "bc_ts_h"),
+    ("BC+TS+H, goals of the log", "bc_ts_h-logged"),
+    ("MGAIL+TS+H", "mgail_ts_h"),
+    ("MGAIL+TS+H, goals of the log", "mgail_ts_h-logged"),
+)
+"""Rows of the WOSAC score, as far as there are records: label, end of the record's name."""
+WOSAC_LOGS = (("sumo", "playback"), ("ngsim", "playback"), ("ngsim", "playback_thinned"))
 NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
 
 
@@ -221,11 +241,11 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {error:.{digits}f}"
 
 
-def searched(data: str) -> Grid:
+def searched(folder: str, data: str) -> Grid:
     """One agent simulated in several ways: errors over recordings, and CPU seconds per segment."""
     grid = [["", *(heading for heading, _ in COLUMNS.values()), "CPU s"]]
     for label, name, part in SEARCH:
-        (record,) = records(f"search/{data}-{name}")
+        (record,) = records(f"{folder}/{data}-{name}")
         row = record[part] if part else record
         cells = [
             f"{row[key]:.{digits}f} ± {row[f'{key}_se']:.{digits}f}" for key, (_, digits) in COLUMNS.items()
@@ -265,6 +285,41 @@ def crowd(data: str) -> Grid:
     return grid
 
 
+def by_place() -> Grid:
+    """Each place of the NGSIM test part apart; errors over snippets."""
+    grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
+    for label, name in REAL_ROWS:
+        (record,) = records(f"driving/{name}")
+        line = [label]
+        for place in REAL:
+            rows = [row for row in record["per_segment"] if place in row["group"]]
+            groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
+            for key, digits in (("collision_rate", 1), ("ade", 2)):
+                values = np.array([row[key] for row in rows], np.float64)
+                mean, error = clustered_mean(values, groups)
+                line.append(f"{mean:.{digits}f} ± {error:.{digits}f}")
+        grid.append(line)
+    return grid
+
+
+def wosac(data: str) -> Grid:
+    """The WOSAC score of agents, beside the baselines."""
+    files = [(label, RECORDS / "wosac" / f"{data}-{name}.json") for label, name in WOSAC]
+    found = [(label, read_wosac(file)) for label, file in files if file.is_file()]
+    return wosac_grid([record for _, record in found], [label for label, _ in found])
+
+
+def wosac_log() -> Grid:
+    """What the log itself scores in every component."""
+    columns = [records(f"wosac/{data}-bc_h")[0]["agents"][name] for data, name in WOSAC_LOGS]
+    names = [name for name in columns[0] if name.endswith("_likelihood")]
+    grid = [["", "town-small, 5 Hz", "NGSIM, 10 Hz", "NGSIM, at 5 Hz and back"]]
+    for name in ("metametric", *names):
+        label = name.removesuffix("_likelihood").replace("_", " ")
+        grid.append([label, *(f"{numbers[name]:.4f}" for numbers in columns)])
+    return grid
+
+
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
@@ -279,8 +334,14 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "many": lambda: setting("many"),
     "paper": against_paper,
     "sweep": sweep,
-    "search-town": lambda: searched("town"),
-    "search-ngsim": lambda: searched("ngsim"),
+    "search-town": lambda: searched("search", "town"),
+    "search-ngsim": lambda: searched("search", "ngsim"),
+    "driving-town": lambda: searched("driving", "town"),
+    "driving-ngsim": lambda: searched("driving", "ngsim"),
+    "driving-places": by_place,
+    "wosac-log": wosac_log,
+    "wosac-sumo": lambda: wosac("sumo"),
+    "wosac-ngsim": lambda: wosac("ngsim"),
     "crowd-town": lambda: crowd("town"),
     "crowd-ngsim": lambda: crowd("ngsim"),
 }

@@ -27,7 +27,8 @@ from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, 
 from symphony.data.store import SegmentStore
 from symphony.data.submission_check import check_submission, required_agents
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.wosac import evaluate_wosac, log_playback, wosac_scenario, wosac_window
+from symphony.evaluation.wosac import evaluate_wosac
+from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wosac_window
 from symphony.metrics.wosac import SimulatedRollouts, WosacScenario, score
 from symphony.simulation.wosac import between_decisions, constant_velocity, history_only, wosac_rollouts
 
@@ -265,6 +266,8 @@ def test_short_logs_have_a_shorter_history() -> None:
     assert not window.valid[:, :6].any()
     assert window.valid[:, 6:].all()
     np.testing.assert_allclose(window.position[:, 10], segment.position[:, 2], atol=1e-5)
+    # What is not known goes back at the first velocity: no jump at the first step that is.
+    np.testing.assert_allclose(np.diff(window.position[..., :2], 2, axis=1), 0, atol=1e-4)
     assert scored(wosac_scenario(segment), constant_velocity(window))["min_ade"] < 0.01
     with pytest.raises(DataError, match=r"has 7\.8 s, the score needs 8"):
         wosac_window(straight_road(steps=40))
@@ -278,7 +281,8 @@ def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command) == 0
     assert "WOSAC 2025, 3 run segments, 2 recordings" in capsys.readouterr().out
     record = json.loads(out.read_text())
-    assert list(record["agents"]) == ["playback", "constant_velocity", AGENT]
+    assert list(record["agents"]) == ["playback", "constant_velocity", "random", AGENT]
+    assert record["how"] == {"search": "none", "seed": 0, "logged_goals": False}
     for numbers in record["agents"].values():
         each = [one["metametric"] for one in numbers["segments"].values()]
         assert numbers["metametric"] == pytest.approx(np.mean(each))

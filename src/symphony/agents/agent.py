@@ -20,7 +20,7 @@ from symphony.agents.networks import (
     policy_network,
 )
 from symphony.config import AgentSpec, SearchConfig, read_json
-from symphony.envs.baselines import ConstantVelocity
+from symphony.envs.baselines import ConstantVelocity, RandomActions
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
@@ -115,9 +115,9 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     """An agent by name.
 
     Args:
-        name: ``playback``, ``constant_velocity``, ``pretrained:NAME`` (an agent that comes with the package), or the
-            folder of a run, of which the best checkpoint is taken if it was validated, else the last; ``RUN@last``,
-            ``RUN@best`` or ``RUN@3000`` (a step) names another.
+        name: ``playback``, ``constant_velocity``, ``random``, ``pretrained:NAME`` (an agent that comes with the
+            package), or the folder of a run, of which the best checkpoint is taken if it was validated, else the
+            last; ``RUN@last``, ``RUN@best`` or ``RUN@3000`` (a step) names another.
         device: where its weights go.
 
     Raises:
@@ -128,6 +128,8 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
         return Agent(name, None)
     if name == "constant_velocity":
         return Agent(name, ConstantVelocity(Bicycle()))
+    if name == "random":
+        return Agent(name, RandomActions(Bicycle()))
     folder, which = split_name(name)
     agent = build_agent(name, read_spec(folder))
     load_checkpoint(choose(folder, which), modules=agent.modules, partial=True, restore_rng=False)
@@ -145,7 +147,7 @@ def read_spec(folder: Path) -> AgentSpec:
     path = folder / FILE
     if not path.is_file():
         raise ConfigError(
-            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', '{PREFIX}NAME' or the folder of a "
-            f"run (one with an {FILE})"
+            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', 'random', '{PREFIX}NAME' or the "
+            f"folder of a run (one with an {FILE})"
         )
     return read_json(AgentSpec, path)

@@ -6,12 +6,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from symphony.cli.tables import print_metrics
-from symphony.config import EvaluateConfig
+from symphony.config import EvaluateConfig, WosacSettings
 from symphony.errors import ConfigError
 from symphony.files import write_json
 
@@ -47,6 +47,11 @@ class Evaluate:
     """That quantile: a branch that drives as the log does is replaced once in a hundred prunings."""
     keep: bool = True
     """Leave the folder of the run as it is."""
+    metrics: tuple[Literal["wosac"], ...] = ()
+    """More scores for the record and for `symphony table`: `wosac`, of 32 rollouts of everyone for 8 s, by the same
+    search or without it (see docs/wosac.md)."""
+    wosac_config: Literal["2024", "2025"] = "2025"
+    """Year of the challenge whose weights the WOSAC score has."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> None:
@@ -61,13 +66,15 @@ class Evaluate:
 
         if self.figure is not None:
             check_picture(self.figure)
+        if self.metrics:
+            WosacSettings.of(self.config)  # or complain now
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         clips = ClipKeeper(evenly_spaced(len(store), PANELS if self.figure is not None else 0))
         keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
         if self.save_rollouts is not None:
-            settings = plain_settings(config, agent.interactive, agent.duration)
-            about = About.of(agent.name, store, settings, seed=config.seed)
+            plain = plain_settings(config, agent.interactive, agent.duration)
+            about = About.of(agent.name, store, plain, seed=config.seed)
             keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
 
         def observe(batch: EvaluatedBatch) -> None:
@@ -77,6 +84,8 @@ class Evaluate:
         found = evaluate_with_bar(agent, store, config, observe=observe if keepers else None, baselines=True)
         print_evaluation(found, self.data)
         record = evaluation_record(agent, found, store)
+        if "wosac" in self.metrics:
+            record |= self._wosac(agent, store, WosacSettings.of(config), record)
         if self.keep:
             keep_evaluation(agent.name, record)
         if self.json is not None:
@@ -111,6 +120,18 @@ class Evaluate:
         threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch), 3)
         sys.stderr.write(f"threshold {threshold:g}: quantile {self.quantile:g} of the logs in {folder}\n")
         return replace(config, threshold=threshold)
+
+    def _wosac(
+        self, agent: Agent, store: SegmentStore, settings: WosacSettings, record: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Parts of the record with the WOSAC score."""
+        from symphony.cli.wosac_evaluate import print_wosac
+        from symphony.evaluation.wosac import evaluate_wosac, wosac_parts
+
+        with segments_bar(f"WOSAC score of {agent.name}") as advance:
+            found = evaluate_wosac(agent, store, range(len(store)), settings, self.wosac_config, advance)
+        print_wosac(found)
+        return wosac_parts(found, record)
 
 
 def print_evaluation(found: Evaluation, data: Path) -> None:

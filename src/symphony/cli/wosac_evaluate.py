@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Simulate 32 rollouts of every run segment and score them, beside log playback and constant velocity.
+    """Simulate 32 rollouts of every run segment and score them, beside log playback, constant velocity and random.
 
     The agent drives all vehicles; pedestrians and cyclists keep their velocity. Standard errors are over recordings.
     """
@@ -33,6 +33,8 @@ class Evaluate:
     """File to write all numbers to, those of every run segment included."""
     segments: tuple[str, ...] = ()
     """Ids of the run segments, or their numbers in the store; by default all."""
+    baselines: bool = True
+    """Score the agent alone."""
     settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
 
     def run(self) -> None:
@@ -46,19 +48,23 @@ class Evaluate:
         agent, store = load_agent(self.agent, self.settings.device), SegmentStore(self.data)
         items = [segment_index(store, name) for name in self.segments] or list(range(len(store)))
         with segments_bar(f"scoring {agent.name}") as advance:
-            found = evaluate_wosac(agent, store, items, self.settings, self.config, advance)
-        _print(found)
+            found = evaluate_wosac(
+                agent, store, items, self.settings, self.config, advance, baselines=self.baselines
+            )
+        print_wosac(found)
         if self.json is not None:
             write_json(self.json, found.record())
 
 
-def _print(found: WosacEvaluation) -> None:
+def print_wosac(found: WosacEvaluation) -> None:
+    """Print the numbers of every agent side by side."""
     from rich.console import Console
     from rich.table import Table
 
     title = f"WOSAC {found.config}, {len(found.segments)} run segments, {len(set(found.groups))} recordings"
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    columns = {name: found.numbers(name) for name in found.scores}
+    columns = {name: found.numbers(name) for name in found.results}
+    orders = {name: found.order(name) for name in found.results}
     table.add_column("", overflow="fold")
     for name in columns:
         table.add_column(name, justify="right")
@@ -66,9 +72,15 @@ def _print(found: WosacEvaluation) -> None:
         table.add_row(
             number.removesuffix("_likelihood"), *(_shown(*numbers[number]) for numbers in columns.values())
         )
-    table.add_row("CPU seconds", *(f"{seconds:.1f}" for seconds in found.seconds.values()))
+    pairs = next(iter(orders.values())).pairs
+    for share in ("kept", "reversed", "apart"):
+        cells = (_shown(getattr(order, share), math.nan) for order in orders.values())
+        table.add_row(f"order {share}, of {pairs} pairs", *cells)
+    table.add_row("CPU seconds", *(f"{result.seconds:.1f}" for result in found.results.values()))
     Console().print(table)
 
 
 def _shown(mean: float, error: float) -> str:
+    if math.isnan(mean):
+        return "–"
     return f"{mean:.4f}" if math.isnan(error) else f"{mean:.4f} ± {error:.4f}"

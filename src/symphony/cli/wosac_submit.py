@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -43,6 +44,10 @@ class Submit:
     def __post_init__(self) -> None:
         if self.shards < 0:
             raise ConfigError(f"--shards must not be negative, is {self.shards}")
+        if self.settings.logged_goals:
+            raise ConfigError(
+                "a submission must not know the routes of the log: --logged-goals is not for it"
+            )
 
     def run(self) -> None:
         """Simulate, showing how far it is, and write."""
@@ -75,16 +80,34 @@ def simulated_scenarios(
     Raises:
         DataError: a record can't be used; names file, scenario and field.
     """
-    from symphony.data.segment import validate
-    from symphony.data.sources.womd import scenario_to_segment
-    from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, scenario_files
-    from symphony.simulation.wosac import wosac_rollouts
+    from symphony.data.sources.wosac import read_scenario_payloads, scenario_files
+    from symphony.simulation.workers import shared
 
-    for done, (file, record, payload) in enumerate(read_scenario_payloads(scenario_files(data))):
+    packed = read_scenario_payloads(scenario_files(data))
+    with closing(shared(_Simulation(agent, settings), packed, settings.config(1, 0))) as results:
+        for done, found in enumerate(results, 1):
+            yield found
+            progress(done)
+
+
+@dataclass(frozen=True)
+class _Simulation:
+    """Simulates a packed scenario."""
+
+    agent: Agent
+    settings: WosacSettings
+
+    def __call__(self, packed: tuple[Path, int, bytes]) -> tuple[str, RolloutArrays]:
+        """Id and rollouts."""
+        from symphony.data.segment import validate
+        from symphony.data.sources.womd import scenario_to_segment
+        from symphony.data.sources.wosac import parse_scenario
+        from symphony.simulation.wosac import wosac_rollouts
+
+        file, record, payload = packed
         scenario = parse_scenario(payload, file, record)
         try:
             segment = validate(scenario_to_segment(scenario, file=file.name))
         except DataError as error:
             raise error.at(file=file, segment=scenario.scenario_id) from None
-        yield scenario.scenario_id, wosac_rollouts(agent, segment, settings)
-        progress(done + 1)
+        return scenario.scenario_id, wosac_rollouts(self.agent, segment, self.settings)

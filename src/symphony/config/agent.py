@@ -120,6 +120,9 @@ class SearchConfig:
     aggregate: str = "max_then_sum"
     """From scores of steps and agents to one per branch: `max_then_sum` (the paper), `mean_then_sum`, or the import
     path of a function of your own."""
+    goals: Literal["tree", "branch"] = "tree"
+    """Who draws goals together in evaluation: all branches of a `tree` (the paper), or each `branch` alone. In
+    training all follow the routes of the log."""
     segments: int = 16
     """Run segments searched at a time."""
     updates: int = 10
@@ -135,6 +138,7 @@ class SearchConfig:
         positive(self, "branches", "test_branches", "prune_every", "keep", "temperature")
         positive(self, "segments", "updates", "states")
         one_of(self, "survivors", get_args(Survivors))
+        one_of(self, "goals", ["tree", "branch"])
         one_of(self, "rule", RULES, path=True)
         one_of(self, "aggregate", AGGREGATES, path=True)
         if self.keep > 1:

@@ -11,7 +11,7 @@ from symphony.config.checks import not_negative, one_of, positive
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "oracle", "best"]
-Goals = Literal["tree", "branch"]
+Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 MOST = 128
 """Agents of a run segment that are driven, at most."""
@@ -48,8 +48,9 @@ class EvaluateConfig:
     """Of rule `systematic`; 0: as the agent was trained."""
     threshold: float | None = None
     """Of rule `replace`; by default as the agent was trained."""
-    goals: Goals = "tree"
-    """Who draws goals together: all branches of a `tree`, or each `branch` alone."""
+    goals: Goals = "agent"
+    """Who draws goals together: all branches of a `tree` (the paper), or each `branch` alone; `agent`: as it is
+    meant."""
     retries: int = 0
     """How often the steps between two prunings are simulated again for branches that end them with a score above
     `retry-above` (each time costs as much as the whole search)."""
@@ -113,4 +114,5 @@ class EvaluateConfig:
             prune_every=self.prune_every or trained.prune_every,
             temperature=self.temperature or trained.temperature,
             threshold=trained.threshold if self.threshold is None else self.threshold,
+            goals=trained.goals if self.goals == "agent" else self.goals,
         )

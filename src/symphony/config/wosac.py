@@ -2,41 +2,69 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
-from symphony.config.checks import not_negative, one_of
-from symphony.config.evaluation import EvaluateConfig
+from symphony.config.checks import not_negative, one_of, positive
+from symphony.config.evaluation import EvaluateConfig, Goals
 
 WosacSearch = Literal["agent", "none", "tree", "best"]
 """Without the search by true flags: what is simulated must not know them beforehand."""
+WosacYear = Literal["2024", "2025"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class WosacSettings:
-    """How the learned agent is simulated."""
+    """How the agent is simulated."""
 
     search: WosacSearch = "agent"
     """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `best`: the best of independent
     rollouts. Each of the 32 rollouts of a search comes from a tree of its own."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
+    rule: str = "agent"
+    """How trees are pruned: `agent` as it was trained, else see `search.rule` of training."""
+    prune_every: int = 0
+    """Steps between prunings; 0: as the agent was trained."""
+    temperature: float = 0.0
+    """Of rule `systematic`; 0: as the agent was trained."""
+    threshold: float | None = None
+    """Of rule `replace`; by default as the agent was trained."""
+    goals: Goals = "tree"
+    """Who draws goals together: all branches of a `tree`, or each `branch` alone."""
+    logged_goals: bool = False
+    """Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the
+    future."""
+    retries: int = 0
+    """How often the steps between two prunings are simulated again for branches that end them with a score above
+    `retry-above`."""
+    retry_above: float = 0.0
+    """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     seed: int = 0
     """Of everything drawn at random."""
     device: str = "cpu"
     """`cpu`, `cuda` or `cuda:N`."""
+    workers: int = 1
+    """Processes that share the run segments, with one thread each (changes speed, not results)."""
 
     def __post_init__(self) -> None:
         one_of(self, "search", get_args(WosacSearch))
         not_negative(self, "branches", "seed")
+        positive(self, "workers")
+        self.config(1, self.seed)  # or complain now
+
+    @classmethod
+    def of(cls, config: EvaluateConfig) -> Self:
+        """The same simulation, of everyone.
+
+        Raises:
+            ConfigError: it searches by the true flags.
+        """
+        return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(cls)})
 
     def config(self, rollouts: int, seed: int) -> EvaluateConfig:
         """Of some rollouts, each from a tree of its own where there is a search."""
         return EvaluateConfig(
-            rollouts=rollouts,
-            trees=rollouts,
-            search=self.search,
-            branches=self.branches,
-            seed=seed,
-            device=self.device,
+            **dataclasses.asdict(self) | {"rollouts": rollouts, "trees": rollouts, "seed": seed}
         )

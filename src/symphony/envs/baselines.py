@@ -37,3 +37,24 @@ class ConstantVelocity(TensorDictModuleBase):
         else:
             action = torch.stack([speed * self.dt, torch.zeros_like(speed)], -1)
         return tensordict.set(keys.ACTION, action)
+
+
+class RandomActions(TensorDictModuleBase):
+    """Accelerates and steers at random, every action as likely as any other: what knows nothing.
+
+    Args:
+        dynamics: action space to act in.
+    """
+
+    in_keys = [keys.NOISE]  # noqa: RUF012
+    out_keys = [keys.ACTION]  # noqa: RUF012
+
+    def __init__(self, dynamics: Bicycle) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action [..., N]."""
+        count = self.dynamics.num_actions
+        action = (tensordict.get(keys.NOISE) * count).long().clamp(max=count - 1)
+        return tensordict.set(keys.ACTION, action)

@@ -78,6 +78,14 @@ COLUMNS = (
     Column("curvature_jsd", "curvature JSD", "10⁻³", 1000.0),
 )
 """In the paper's order and units."""
+WOSAC = (
+    Column("wosac_metametric", "WOSAC", "", digits=3, optional=True),
+    Column("wosac_kinematic_metrics", "kinematic", "", digits=3, optional=True),
+    Column("wosac_interactive_metrics", "interactive", "", digits=3, optional=True),
+    Column("wosac_map_based_metrics", "map", "", digits=3, optional=True),
+    Column("wosac_min_ade", "minADE", "m", optional=True),
+)
+"""Of evaluations with `--metrics wosac`; the metametric and the three means of its components, 0 to 1."""
 COST = Column("cost", "CPU", "s/segment", digits=2)
 """Of the simulation of all rollouts of a segment."""
 
@@ -342,7 +350,11 @@ def compare(
     # Beside the paper's figures stand only what the paper has.
     floor = () if any(FLOOR.key not in entry.record for entry in entries) else (FLOOR,)
     more = [column for name in dict.fromkeys(asked) for column in ASKED[name]]
-    columns = (*COLUMNS, *more) if figures else (*COLUMNS, *floor, *more, *_own_columns(entries), COST)
+    columns = (
+        (*COLUMNS, *more)
+        if figures
+        else (*COLUMNS, *floor, *more, *_wosac_columns(entries), *_own_columns(entries), COST)
+    )
     rows = [_baseline_row(entries[0], name, columns) for name in BASELINES]
     for method, way in dict.fromkeys((entry.method, entry.way) for entry in entries):
         mine = [entry for entry in entries if (entry.method, entry.way) == (method, way)]
@@ -357,6 +369,14 @@ def compare(
         replace(row, cells=ours[row.method, row.way], paper=theirs.get((row.method, ""), {})) for row in rows
     ]
     return Comparison(setting, dataset, columns, tuple(rows), tuple(_notes(entries, dataset)))
+
+
+def _wosac_columns(entries: Sequence[Entry]) -> tuple[Column, ...]:
+    """The WOSAC score where all evaluations have it, of one year."""
+    years = {entry.record.get("wosac", {}).get("config") for entry in entries}
+    if len(years) > 1 and None not in years:
+        raise ConfigError(f"WOSAC scores of {', '.join(sorted(years))}, choose with --evaluation")
+    return () if None in years else WOSAC
 
 
 def _own_columns(entries: Sequence[Entry]) -> list[Column]:
@@ -470,6 +490,10 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
         differing = [name for name in names if len({json.dumps(c.get(name)) for c in mine}) > 1]
         if differing:
             notes.append(f"runs of {method_name(method)} differ in {', '.join(differing)}")
+    if dataset is None and _wosac_columns(entries):
+        notes.append(
+            f"WOSAC {record['wosac']['config']}: 32 rollouts of 8 s of all vehicles; higher is better"
+        )
     for entry in entries:
         then, now = entry.record["run"]["updates"], updates_done(entry.folder)
         if then and now and then != now:

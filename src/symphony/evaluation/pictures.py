@@ -164,7 +164,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         branches=config.branches or settings.test_branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
-        goals_per=config.goals,
+        goals_per=config.pruning(agent.search).goals,
     )[:, 0]
     with torch.no_grad():
         result = search(

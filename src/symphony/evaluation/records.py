@@ -30,6 +30,8 @@ FOLDER = "evaluations"
 
 _MEMORY = ("batch", "device", "workers", "engine")
 """Settings that change no result."""
+_USUAL = {"threshold": None, "goals": "tree", "retries": 0, "logged_goals": False}
+"""What goes without saying in the name of a way to simulate."""
 _NAMED = ("search", "trees", "branches", "rule", "interactive", "rollouts", "duration", "seed")
 _PRUNING = ("prune_every", "temperature")
 """Part of the name of the simulation; evaluations from before they could be set have none."""
@@ -60,7 +62,8 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         store; ``config``: the settings of the evaluation, with what was left to the agent filled
         in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and ``parts``,
         pseudo-values of the divergence by recording (see :func:`symphony.metrics.sampled_divergence`);
-        ``per_segment``: a row for each run segment.
+        ``per_segment``: a row for each run segment. `symphony evaluate --metrics wosac` adds ``wosac`` and numbers
+        whose names begin so (see :func:`symphony.evaluation.wosac.wosac_parts`).
     """
     visited, visited_log = result.metrics.curvature_histograms()
     divergence, names = result.metrics.curvature_divergence()
@@ -101,6 +104,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "search": result.search,
         "interactive": result.interactive,
         "duration": config.duration or agent.duration,
+        "goals": "tree",
         "branches": 0,
         "trees": 0,
         "rule": "",
@@ -118,6 +122,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         filled["rule"], filled["prune_every"] = used.rule, used.prune_every
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
         filled["threshold"] = used.threshold if used.rule == "replace" else None
+        filled["goals"] = used.goals
         filled["retries"] = config.retries
         filled["retry_above"] = config.retry_above if config.retries else 0.0
     return {name: value for name, value in filled.items() if name not in _MEMORY}
@@ -134,10 +139,13 @@ def evaluation_name(record: dict[str, Any]) -> str:
     if record["run"]["named"]:
         parts.append(f"step{record['run']['checkpoint']}")
     for field in dataclasses.fields(EvaluateConfig):
-        value = config.get(field.name, field.default)
-        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY, "metric") and value != field.default:
+        usual = _USUAL.get(field.name, field.default)
+        value = config.get(field.name, usual)
+        if field.name not in (*_NAMED, *_PRUNING, *_MEMORY, "metric") and value != usual:
             parts.append(field.name if value is True else f"{field.name}={value}")
     parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
+    if "wosac" in record:
+        parts.append(f"wosac{record['wosac']['config']}")
     return "-".join(parts)
 
 
@@ -158,7 +166,7 @@ def simulation_name(config: dict[str, Any]) -> str:
 def simulation_way(config: dict[str, Any]) -> str:
     """How rollouts came about, with all that tells searches apart: ``tree-1x16-replace-every2-goals=branch``."""
     words = [simulation_name(config)]
-    for name, usual in (("threshold", None), ("goals", "tree"), ("retries", 0), ("logged_goals", False)):
+    for name, usual in _USUAL.items():
         value = config.get(name, usual)
         if value != usual:
             words.append(name if value is True else f"{name}={value}")

@@ -108,7 +108,7 @@ def simulation(
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
-        goals_per=config.goals,
+        goals_per=config.pruning(agent.search).goals,
     )
     start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
     settings, planned = config.pruning(agent.search), None

@@ -1,9 +1,9 @@
-"""Batches of run segments, shared among processes."""
+"""Run segments, shared among processes."""
 
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import lru_cache
 from typing import Any, TypeVar, cast
@@ -14,9 +14,10 @@ from symphony.data.engine import ordered_map
 from symphony.errors import ConfigError, SymphonyError
 from symphony.simulation.demonstrations import SceneDataset
 
+T = TypeVar("T")
 R = TypeVar("R")
-Work = Callable[[list[int]], R]
-"""What is done with a batch of items; a picklable object, with the dataset and the agent inside."""
+Work = Callable[[T], R]
+"""What is done with a task, such as a batch of items; a picklable object, with the dataset and the agent inside."""
 
 
 def batches(items: Sequence[int], config: EvaluateConfig) -> list[list[int]]:
@@ -24,8 +25,8 @@ def batches(items: Sequence[int], config: EvaluateConfig) -> list[list[int]]:
     return [list(items[first : first + config.batch]) for first in range(0, len(items), config.batch)]
 
 
-def shared(work: Work[R], tasks: Sequence[list[int]], config: EvaluateConfig) -> Generator[R, None, None]:
-    """The results of some work on every batch, in the order of the batches, by ``config.workers`` processes.
+def shared(work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig) -> Generator[R, None, None]:
+    """The results of some work on every task, in the order of the tasks, by ``config.workers`` processes.
 
     One local worker is this very process. ``close`` ends the others.
 
@@ -60,13 +61,13 @@ def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
 
 
 @lru_cache(1)
-def _opened(sent: bytes) -> Work[Any]:
-    """The work, once per process: it keeps what it prepared from one batch to the next."""
+def _opened(sent: bytes) -> Work[Any, Any]:
+    """The work, once per process: it keeps what it prepared from one task to the next."""
     allocator.tune()  # this process is ours
-    return cast("Work[Any]", pickle.loads(sent))  # noqa: S301  (from our own parent)
+    return cast("Work[Any, Any]", pickle.loads(sent))  # noqa: S301  (from our own parent)
 
 
-def _done(pair: tuple[bytes, list[int]]) -> bytes:
+def _done(pair: tuple[bytes, Any]) -> bytes:
     # As bytes: tensors of their own would travel through shared memory, of which containers have little.
-    sent, items = pair
-    return pickle.dumps(_opened(sent)(items))
+    sent, task = pair
+    return pickle.dumps(_opened(sent)(task))

@@ -23,6 +23,7 @@ from symphony.data.rollouts import RolloutArrays
 from symphony.data.segment import AgentType, RunSegment, SignalState
 from symphony.data.sources.wosac import CURRENT, DT
 from symphony.data.submission import FUTURE, ROLLOUTS
+from symphony.envs.routes import route_table
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
@@ -42,7 +43,8 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings | 
 
     Args:
         agent: drives the vehicles.
-        segment: with steps of 0.1 s; what lies behind its current step, 10, is not looked at.
+        segment: with steps of 0.1 s; what lies behind its current step, 10, is not looked at, but for the routes
+            where they are the log's.
         settings: how the agent is simulated.
 
     Returns:
@@ -63,7 +65,8 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings | 
     states = np.broadcast_to(_extrapolated(segment, rows), (ROLLOUTS, len(rows), FUTURE, 3)).copy()
     if len(vehicles):
         try:
-            states[:, vehicles] = between_decisions(_driven(agent, start, vehicles, settings), dt)
+            log = future_log(segment) if settings.logged_goals else None
+            states[:, vehicles] = between_decisions(_driven(agent, start, vehicles, settings, log), dt)
         except NotFiniteError as error:
             raise error.named(segment.segment_id) from error
     return _arrays(segment, rows, states)
@@ -106,6 +109,23 @@ def history_only(segment: RunSegment, dt: float) -> RunSegment:
         velocity=np.repeat(segment.velocity[rows, now, None], steps, 1),
         valid=np.ones((len(rows), steps), bool),
         signal_state=np.repeat(_latest_lights(segment)[:, None], steps, 1),
+        current_step=0,
+        interest=np.zeros(0, np.int32),
+        predict=np.zeros(0, np.int32),
+    )
+
+
+def future_log(segment: RunSegment) -> RunSegment:
+    """What became of those who are valid at the current step, from it on, in the rows of :func:`history_only`."""
+    rows, now = _present(segment), segment.current_step
+    timed = ("position", "heading", "velocity", "valid")
+    return segment.replace(
+        ego=0,
+        agent_id=segment.agent_id[rows],
+        agent_type=segment.agent_type[rows],
+        size=segment.size[rows],
+        **{name: getattr(segment, name)[rows, now:] for name in timed},
+        signal_state=segment.signal_state[:, now:],
         current_step=0,
         interest=np.zeros(0, np.int32),
         predict=np.zeros(0, np.int32),
@@ -156,10 +176,21 @@ def _extrapolated(segment: RunSegment, rows: NDArray[np.int64]) -> Doubles:
     return np.concatenate([path, heading[..., None]], -1)
 
 
-def _driven(agent: Agent, start: RunSegment, vehicles: NDArray[np.int64], settings: WosacSettings) -> Doubles:
-    """[R, U, N, 3] x, y, heading of the vehicles."""
+def _driven(
+    agent: Agent,
+    start: RunSegment,
+    vehicles: NDArray[np.int64],
+    settings: WosacSettings,
+    log: RunSegment | None = None,
+) -> Doubles:
+    """[R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
     graph = LaneGraph(start.road) if agent.goals is not None else None
-    scenes = scene(start, vehicles.tolist(), graph).to(torch.device(settings.device))
+    scenes = scene(start, vehicles.tolist(), graph)
+    if graph is not None and log is not None:
+        # The first state is the same, so the routes are; which of them was taken is for the log to say.
+        taken = [route_table(log, graph, int(row)).logged for row in vehicles]
+        scenes.route_logged = torch.tensor([taken])
+    scenes = scenes.to(torch.device(settings.device))
     if search_kind(agent, settings.config(1, 0)) == "none":
         plans = [settings.config(ROLLOUTS, settings.seed)]
     else:
