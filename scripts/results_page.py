@@ -27,7 +27,10 @@ from symphony.evaluation.wosac_table import read_wosac, wosac_grid
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
-PAGES = ("README.md", "docs/results.md", "docs/appendix.md", "docs/wosac.md", "docs/planners.md")
+PAGES = (
+    "README.md",
+    *(f"docs/{name}.md" for name in ("results", "appendix", "wosac", "planners", "rollouts")),
+)
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 
 Record = dict[str, Any]
@@ -256,6 +259,36 @@ def searched(folder: str, data: str) -> Grid:
     return grid
 
 
+CROWD = ("2", "8", "16", "32", "all")
+"""How many agents are driven."""
+AGENTS = {
+    "agent_collision_rate": ("collide %", 1),
+    "agent_collision_into_leader": ("into a leader", 1),
+    "agent_collision_rear_ended": ("rear-ended", 1),
+    "agent_collision_sideswipe": ("sideswipe", 1),
+    "agent_collision_crossing": ("crossing", 1),
+    "agent_collision_with_playback": ("with playback", 1),
+    "agent_offroad_time": ("off-road %", 2),
+    "agent_progress": ("way of the log %", 0),
+    "agent_standing": ("standing %", 0),
+    "agent_speed_distance": ("speeds off by m/s", 2),
+}
+"""Figures of single agents: their headings, and the digits after their points."""
+
+
+def crowd(data: str) -> Grid:
+    """What becomes of single agents, the more of the traffic is theirs."""
+    grid = [["driven", "search", *(heading for heading, _ in AGENTS.values()), "CPU s"]]
+    for number in CROWD:
+        for search, word in (("none", "no"), ("tree", "yes")):
+            (record,) = records(f"crowd/{data}-{number}-{search}")
+            cells = [f"{record[key]:.{digits}f}" for key, (_, digits) in AGENTS.items()]
+            error = record["agent_collision_rate_se"]
+            cells[0] += f" ± {error:.1f}"
+            grid.append([number, word, *cells, f"{record['cost']['simulation'] / record['segments']:.2f}"])
+    return grid
+
+
 def by_place() -> Grid:
     """Each place of the NGSIM test part apart; errors over snippets."""
     grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
@@ -345,6 +378,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "wosac-ngsim": lambda: wosac("ngsim"),
     "planners": lambda: planner_grid(records("planners/*")),
     "planners-search": flattered,
+    "crowd-town": lambda: crowd("town"),
+    "crowd-ngsim": lambda: crowd("ngsim"),
 }
 
 

@@ -254,8 +254,8 @@ def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
         load_agent(str(tmp_path / "nowhere"))
     with pytest.raises(DataError, match="nowhere"):
         evaluate("playback", tmp_path / "nowhere")
-    with pytest.raises(DataError, match="9 interactive agents"):
-        evaluate("constant_velocity", store, EvaluateConfig(interactive=9))
+    with pytest.raises(ConfigError, match="up to 128"):
+        EvaluateConfig(interactive=129)
     with pytest.raises(ConfigError, match="unknown device"):
         train(config(store, tmp_path / "x", device="tpu-like"))
     assert not (tmp_path / "x").exists()

@@ -21,8 +21,13 @@ PLANNER: Key = "planner"
 PLANNED: Key = "planned"
 """[..., 4] float: x, y, heading, speed that a planner gives the ego at the next step."""
 
+BACKGROUND: Key = ("agents", "background")
+"""[..., N, 4] float: x, y, heading, speed that a rule gives background agents at the next step."""
+
 VALID: Key = ("agents", "valid")
-"""[..., N] bool: False for padding."""
+"""[..., N] bool: False for padding, and in open traffic for agents that are not there yet or no more."""
+WAITING: Key = ("agents", "waiting")
+"""[..., N] bool: in open traffic, agents that have not entered yet."""
 STATE: Key = ("agents", "state")
 """[..., N, 4] float: x, y, heading, speed."""
 GOAL: Key = ("agents", "goal")

@@ -98,7 +98,7 @@ class Evaluate:
         if self.save_rollouts is not None:
             plain = plain_settings(config, agent.interactive, agent.duration)
             about = About.of(agent.name, store, plain, seed=config.seed)
-            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name))
+            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
 
         def observe(batch: EvaluatedBatch) -> None:
             for keeper in keepers:
@@ -137,6 +137,10 @@ class Evaluate:
             )
         if config.threshold is not None:
             raise ConfigError("the threshold is either given or calibrated")
+        if config.interactive == "all" or config.open_traffic or config.others != "log":
+            raise ConfigError(
+                "a threshold is calibrated for a fixed number of agents: give it as --threshold"
+            )
         data = SceneDataset(
             SegmentStore(folder),
             config.interactive or agent.interactive,

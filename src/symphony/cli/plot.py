@@ -44,19 +44,12 @@ class Tree:
         from symphony.evaluation.pictures import search_tree
         from symphony.render import plot_search
         from symphony.render.style import picture_path
-        from symphony.simulation.demonstrations import SceneDataset
+        from symphony.simulation.crowd import crowd_dataset
 
         picture_path(self.out)
         agent, config = load_agent(self.agent, self.config.device), self.config
         store = SegmentStore(self.data)
-        dataset = SceneDataset(
-            store,
-            config.interactive or agent.interactive,
-            agent.dynamics,
-            [segment_index(store, self.segment)],
-            routes=agent.goals is not None,
-            duration=config.duration or agent.duration,
-        )
+        dataset = crowd_dataset(store, agent, config, [segment_index(store, self.segment)])
         plot_search(dataset.segment(0), search_tree(agent, dataset, 0, config), self.out)
 
 
@@ -94,7 +87,8 @@ class Rollouts:
         from symphony.data.store import SegmentStore
         from symphony.evaluation.evaluator import evaluate_dataset
         from symphony.evaluation.pictures import ClipKeeper, check_picture, draw_clips
-        from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
+        from symphony.simulation.crowd import crowd_dataset
+        from symphony.simulation.demonstrations import evenly_spaced
 
         check_picture(self.out)
         agent, store, config = (
@@ -105,14 +99,7 @@ class Rollouts:
         if len(store) == 0:
             raise DataError("the store holds no run segments", file=store.path)
         chosen = [segment_index(store, name) for name in self.segments]
-        dataset = SceneDataset(
-            store,
-            config.interactive or agent.interactive,
-            agent.dynamics,
-            chosen or evenly_spaced(len(store), self.panels),
-            routes=agent.goals is not None,
-            duration=config.duration or agent.duration,
-        )
+        dataset = crowd_dataset(store, agent, config, chosen or evenly_spaced(len(store), self.panels))
         clips = ClipKeeper(range(len(dataset)), self.drawn, f"{short_name(agent.name)}: ")
         with segments_bar(f"simulating {agent.name}") as advance:
             evaluate_dataset(agent, dataset, config, advance, observe=clips)

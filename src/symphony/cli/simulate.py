@@ -40,6 +40,9 @@ class Simulate:
     back the log."""
     planner_seconds: float = 60.0
     """That a planner has for one answer; more fails the run."""
+    goal: tuple[str, ...] = ()
+    """Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
+    for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them."""
     tree: bool = True
     """Leave out the branches that a search pruned."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -56,7 +59,8 @@ class Simulate:
         from symphony.cli.evaluate import segments_bar
         from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore
-        from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
+        from symphony.simulation.crowd import crowd_dataset
+        from symphony.simulation.demonstrations import evenly_spaced
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
@@ -69,14 +73,13 @@ class Simulate:
         chosen = [segment_index(store, name) for name in self.segments]
         if self.runs:
             chosen = evenly_spaced(len(store), min(-(-self.runs // config.rollouts), len(store)))
-        dataset = SceneDataset(
+        dataset = crowd_dataset(
             store,
-            config.interactive or others,
-            agent.dynamics,
+            agent,
+            config,
             chosen or None,
-            routes=agent.goals is not None or bool(self.planner),
-            duration=config.duration or agent.duration,
-            keep=config.batch,
+            default=others,
+            routes=bool(self.planner or self.goal),
         )
         with segments_bar(f"simulating {agent.name}") as advance:
             return save_simulation(
@@ -87,6 +90,7 @@ class Simulate:
                 keep_tree=self.tree,
                 planner=self.planner,
                 planner_seconds=self.planner_seconds,
+                goals=self.goal,
                 progress=advance,
             )
 

@@ -85,10 +85,16 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
             )
         for line in _more(row):
             console.print(f"{escape(short_name(str(row['agent'])))}: {line}", style="dim")
+    for row in rows:
+        if first["interactive"] not in (1, 2) and row.get("agent_collision_rate", math.nan) > 0:
+            console.print(
+                f"{escape(short_name(str(row['agent'])))}: {_agents_of(row)}", style="dim", highlight=False
+            )
     most = max(row["rollouts"] for row in rows)
+    driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
     console.print(
-        f"{first['segments']} run segments of {first['groups']} recordings, {first['interactive']} interactive "
-        f"agents each, up to {most} rollouts; ± standard error over recordings; seed {first['seed']}",
+        f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
+        f"± standard error over recordings; seed {first['seed']}",
         style="dim",
     )
 
@@ -134,6 +140,17 @@ def short_name(agent: str) -> str:
 def _kinds_of(row: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and words of the kinds a row has; older results know no pedestrians and cyclists."""
     return [(f"collision_{kind}", text) for kind, text in KINDS if f"collision_{kind}" in row]
+
+
+def _agents_of(row: dict[str, Any]) -> str:
+    """What becomes of single agents, in words."""
+    found = ((row[f"agent_collision_{kind}"], text) for kind, text in KINDS)
+    kinds = ", ".join(f"{value:.1f} {text}" for value, text in found if value > 0)
+    rate = number_cell(row["agent_collision_rate"], row["agent_collision_rate_se"], 1)
+    return (
+        f"{rate} % of agents collide while their log exists: {kinds}; they drive {row['agent_progress']:.0f} % of "
+        f"the log's way, at speeds {row['agent_speed_distance']:.2f} m/s from the log's"
+    )
 
 
 def number_cell(value: float | None, error: float | None, digits: int) -> str:

@@ -12,6 +12,9 @@ from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "oracle", "best"]
 Goals = Literal["agent", "tree", "branch"]
+Others = Literal["log", "constant_velocity", "idm", "learned"]
+MOST = 128
+"""Agents of a run segment that are driven, at most."""
 Engine = Literal["local", "ray"]
 Setting = Literal["main", "long", "many"]
 """Of the paper's tables: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
@@ -53,14 +56,27 @@ class EvaluateConfig:
     `retry-above` (each time costs as much as the whole search)."""
     retry_above: float = 0.0
     """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
+    action_temperature: float = 1.0
+    """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
     """Of everything drawn at random in them."""
     duration: int = 0
     """Seconds of each run segment that are simulated; 0 takes what the agent was trained with."""
-    interactive: int = 0
-    """Interactive agents per run segment; 0 takes what the agent was trained with (2 for the baselines)."""
+    interactive: int | Literal["all"] = 0
+    """Agents per run segment that the agent drives, at most 128: the ego, then the nearest (in a segment with fewer
+    those that there are); 0 takes what it was trained with (2 for the baselines). `all`: every vehicle that moves or
+    stands in a lane, in open traffic."""
+    radius: float = 0.0
+    """Metres from the ego within which vehicles beyond the first two must come in the log to be driven; 0: no
+    limit."""
+    open_traffic: bool = False
+    """Vehicles enter where the log brings them in and leave at the edge of the map, as they do with `all`; otherwise
+    the same ones are driven from the first step to the last."""
+    others: Others = "log"
+    """What drives the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
+    log) or the agent itself (`learned`). Nobody judges them; traffic is open for all but the log."""
     metric: tuple[str, ...] = ()
     """Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout."""
     batch: int = 16
@@ -77,12 +93,15 @@ class EvaluateConfig:
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         one_of(self, "engine", get_args(Engine))
-        positive(self, "rollouts", "batch", "trees", "workers")
+        positive(self, "rollouts", "batch", "trees", "workers", "action_temperature")
         if self.engine == "ray" and self.device != "cpu":
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        not_negative(self, "interactive", "branches", "duration", "prune_every", "temperature", "retries")
+        one_of(self, "others", get_args(Others))
+        not_negative(self, "radius", "branches", "duration", "prune_every", "temperature", "retries")
+        if self.interactive != "all" and not 0 <= self.interactive <= MOST:
+            raise ConfigError(f"interactive is 'all' or a number up to {MOST}, is {self.interactive}")
         for path in self.metric:
             if ":" not in path:
                 raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")

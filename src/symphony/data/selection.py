@@ -53,7 +53,9 @@ class InteractiveChoice:
     context: Context | None
 
 
-def interactive_choice(segment: RunSegment, count: int, *, moving: float = MOVING) -> InteractiveChoice:
+def interactive_choice(
+    segment: RunSegment, count: int, *, moving: float = MOVING, fewer: bool = False
+) -> InteractiveChoice:
     """Pick the agents that are simulated.
 
     First the ego. Then one partner, chosen by context: the nearest of the agents the source marks as interacting,
@@ -67,9 +69,10 @@ def interactive_choice(segment: RunSegment, count: int, *, moving: float = MOVIN
         segment: the segment.
         count: how many, N_I (2 or 8 in the paper).
         moving: metres of :func:`travel` past which an agent moves.
+        fewer: take those that there are, if they are not as many.
 
     Raises:
-        DataError: there are not as many.
+        DataError: there are not as many, or no ego.
     """
     if count < 1:
         raise ValueError(f"count must be positive, is {count}")
@@ -83,7 +86,7 @@ def interactive_choice(segment: RunSegment, count: int, *, moving: float = MOVIN
         partner, context = _partner(segment, others, moves)
     chosen = [segment.ego] if partner is None else [segment.ego, partner]
     chosen += [agent for agent in moves.tolist() if agent != partner]
-    if len(chosen) < count or not has_ego:
+    if (len(chosen) < count and not fewer) or not has_ego:
         has = len(chosen) if has_ego else "no ego"
         message = f"needs {count} interactive agents at its first step, has {has}"
         raise DataError(message, file=segment.file or None, segment=segment.segment_id, field="agents")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.observation import (
     OBJECT_FEATURES,
@@ -28,6 +29,7 @@ from symphony.envs.observation import (
 from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, pick_routes, route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.tables import Tables
+from symphony.envs.traffic import entering, without
 from symphony.errors import ConfigError
 from symphony.geometry.frames import forward_speed
 from symphony.streams import fold_in
@@ -48,7 +50,9 @@ class DrivingEnv(EnvBase):
 
     All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity
     (``stream``), the state of the interactive agents and the routes they follow. The environment holds only
-    constants, so forking a branch is an index and one instance serves every batch shape. An episode ends at the last
+    constants, so forking a branch is an index and one instance serves every batch shape. Where the scenes say where
+    their maps end, traffic is open: agents enter where the log brings them in, once there is room for them (they wait
+    beside the road), and leave at the edge of the map; who is not there is not ``valid``. An episode ends at the last
     logged step (``truncated``), or at what ``ends_on`` names (``terminated``).
 
     Args:
@@ -75,6 +79,7 @@ class DrivingEnv(EnvBase):
     branchable = True
     _supports_set_state = True
     _scenes: SceneBatch | None = None
+    open_traffic: bool = False
 
     def __init__(
         self,
@@ -132,6 +137,8 @@ class DrivingEnv(EnvBase):
         """Seconds per step, that of the scenes."""
         self.decisions = int(scenes.last_step.max())
         """Actions until the last logged step of the longest scene."""
+        self.open_traffic = scenes.exits.shape[1] + scenes.hull.shape[1] > 0
+        """Whether agents enter and leave."""
 
     def _make_specs(self) -> None:
         n, config, device = self.num_agents, self.observation, self.device
@@ -170,7 +177,14 @@ class DrivingEnv(EnvBase):
         def goals() -> Unbounded:
             return Unbounded(shape=(n,), dtype=torch.int64, device=device)
 
-        agents = {"valid": flags(n), "state": floats(n, 4), "goal": goals()}
+        state: dict[str, Callable[[], Any]] = {
+            "valid": lambda: flags(n),
+            "state": lambda: floats(n, 4),
+            "goal": goals,
+        }
+        if self.open_traffic:
+            state["waiting"] = lambda: flags(n)
+        agents = {name: spec() for name, spec in state.items()}
         if not seen.is_empty():
             agents["observation"] = seen
         outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
@@ -181,7 +195,7 @@ class DrivingEnv(EnvBase):
         self.state_spec = Composite(
             {
                 **{name: spec.clone() for name, spec in progress.items()},
-                "agents": Composite({"valid": flags(n), "state": floats(n, 4), "goal": goals()}, shape=(n,)),
+                "agents": Composite({name: spec() for name, spec in state.items()}, shape=(n,)),
             }
         )
         if self.dynamics.discrete:
@@ -215,11 +229,11 @@ class DrivingEnv(EnvBase):
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)
-        valid = self._valid(scene)
-        goal = torch.full_like(valid, -1, dtype=torch.int64)
-        return self._from_state(
-            scene, torch.zeros_like(scene), stream, self._logged_state(scene), valid, goal
-        )
+        real, early = self.scenes.interactive_valid[scene], self.scenes.enter[scene] == 0
+        goal = torch.full_like(real, -1, dtype=torch.int64)
+        waiting = real & ~early if self.open_traffic else None
+        first = self._logged_state(scene)
+        return self._from_state(scene, torch.zeros_like(scene), stream, first, real & early, goal, waiting)
 
     def at(self, state: TensorDictBase) -> TensorDict:
         """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
@@ -244,9 +258,9 @@ class DrivingEnv(EnvBase):
 
     def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
         """A start state whose agents follow the given routes (by default those nearest to the log)."""
-        scene, step, stream, agents, valid, _ = self._read(state)
+        scene, step, stream, agents, valid, _, waiting = self._read(state)
         goal = self.scenes.route_logged[scene] if goal is None else goal
-        return self._from_state(scene, step, stream, agents, valid, goal)
+        return self._from_state(scene, step, stream, agents, valid, goal, waiting)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
@@ -281,12 +295,14 @@ class DrivingEnv(EnvBase):
         return (torch.arange(shape.numel()) % len(items)).reshape(shape)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scene, step, stream, state, valid, goal = self._read(tensordict)
+        scene, step, stream, state, valid, goal, waiting = self._read(tensordict)
         index = self.scenes.interactive[scene]
         size = _rows(self.scenes.box_size, scene, index)
         after = self._moved(tensordict, state, size)
         after = torch.where(valid[..., None], after, state)
-        out = self._from_state(scene, step + 1, stream, after, valid, goal)
+        if waiting is not None:
+            valid, waiting = self._flow(scene, step + 1, state, after, valid, waiting)
+        out = self._from_state(scene, step + 1, stream, after, valid, goal, waiting)
         earned = self.reward(tensordict, out)
         return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
 
@@ -296,29 +312,83 @@ class DrivingEnv(EnvBase):
         """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
         return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
-    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _flow(
+        self, scene: Tensor, step: Tensor, before: Tensor, after: Tensor, valid: Tensor, waiting: Tensor
+    ) -> tuple[Bool[Tensor, "*b N"], Bool[Tensor, "*b N"]]:
+        """Who is there after a step [..., N], and who waits: those that have left do neither."""
+        row, at = scene.flatten(), step.flatten()
+        old, new, there, waits = (v.flatten(0, scene.ndim - 1) for v in (before, after, valid, waiting))
+        gone = leaving(old[..., :2], new[..., :2], self.scenes.exits[row], self.scenes.hull[row])
+        there = there & ~gone
+        ready = waits & (at[:, None] >= self.scenes.enter[row])
+        # Of what is there to enter, most steps have nothing.
+        if bool(ready.any()):
+            index = self.scenes.interactive[row]
+            enters = entering(self.objects(row, at, new, there | ready), index, ready)
+            there, waits = there | enters, waits & ~enters
+        return there.reshape(valid.shape), waits.reshape(valid.shape)
+
+    def objects(
+        self,
+        row: Int[Tensor, " M"],
+        step: Int[Tensor, " M"],
+        state: Float[Tensor, "M N 4"],
+        valid: Bool[Tensor, "M N"],
+    ) -> Objects:
+        """Everyone at a step: driven agents in their states, and all others as logged.
+
+        Args:
+            row: of the scene batch.
+            step: logged step.
+            state: x, y, heading, speed of the driven agents.
+            valid: which of them are there.
+        """
+        index = self.scenes.interactive[row]
+        found = objects_at(self.scenes, row, step, state, index, valid)
+        # One that has left, or not entered yet, must not be played back in the meantime.
+        return (
+            without(found, index, self.scenes.interactive_valid[row] & ~valid) if self.open_traffic else found
+        )
+
+    def _read(
+        self, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
         state, valid, goal = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL))
-        return scene, step, stream, state, valid, goal
-
-    def _valid(self, scene: Tensor) -> Bool[Tensor, "*b N"]:
-        return self.scenes.interactive_valid[scene]
+        return (
+            scene,
+            step,
+            stream,
+            state,
+            valid,
+            goal,
+            tensordict.get(keys.WAITING) if self.open_traffic else None,
+        )
 
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
-        logged = _rows(self.scenes.log_state[:, 0], scene, self.scenes.interactive[scene])
+        """The logged states [..., N, 4] in which agents begin, those that enter later included."""
+        row, index = scene[..., None], self.scenes.interactive[scene]
+        logged = self.scenes.log_state[row, self.scenes.enter[scene], index]
         heading, velocity = logged[..., 2], logged[..., 3:]
         speed = forward_speed(velocity, heading)
         return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
 
     def _from_state(
-        self, scene: Tensor, step: Tensor, stream: Tensor, state: Tensor, valid: Tensor, goal: Tensor
+        self,
+        scene: Tensor,
+        step: Tensor,
+        stream: Tensor,
+        state: Tensor,
+        valid: Tensor,
+        goal: Tensor,
+        waiting: Tensor | None = None,
     ) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
         shape = scene.shape
         row, at = scene.flatten(), step.flatten()
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
         index = self.scenes.interactive[row]
-        objects = objects_at(self.scenes, row, at, moved, index, real)
+        objects = self.objects(row, at, moved, real)
         routes = None
         if self.observation.route or self.observation.along:
             follows = goal.reshape(-1, goal.shape[-1])
@@ -347,6 +417,8 @@ class DrivingEnv(EnvBase):
             batch_size=each,
             device=self.device,  # one without a device would be taken for a transfer, and waited for
         )
+        if waiting is not None:
+            agents.set("waiting", waiting)
         if observation:
             parts = {name: back(value) for name, value in observation.items()}
             agents.set("observation", TensorDict(parts, batch_size=each, device=self.device))

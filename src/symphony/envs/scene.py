@@ -19,6 +19,7 @@ from torch import Tensor
 
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
+from symphony.envs.edge import MapEdge, beyond
 from symphony.envs.routes import POINTS, RouteTable, route_table
 from symphony.errors import DataError
 from symphony.geometry.polylines import segments_of
@@ -79,6 +80,11 @@ class SceneBatch(TensorClass):
         agent_type: [B, A] int64.
         interactive: [B, N] int64 rows of A; 0 for padding.
         interactive_valid: [B, N].
+        enter: [B, N] int64 step at which the log brings an interactive agent in; 0 for those there from the start.
+        background: [B, N] agents that a rule drives, which nobody judges.
+        exits: [B, X, 4] where agents leave the map, see :class:`symphony.envs.edge.MapEdge`; zeros for padding.
+            None, nor any hull, where the same agents are driven from the first step to the last.
+        hull: [B, H, 3] outline of the map, likewise.
         last_step: [B] int64, the segment's last logged step.
         point: [B, P, 2].
         point_direction: [B, P, 2] unit vector along the line; for lights from the stop point to where their lane
@@ -107,6 +113,10 @@ class SceneBatch(TensorClass):
     agent_type: Tensor
     interactive: Tensor
     interactive_valid: Tensor
+    enter: Tensor
+    background: Tensor
+    exits: Tensor
+    hull: Tensor
     last_step: Tensor
     point: Tensor
     point_direction: Tensor
@@ -134,6 +144,8 @@ def scene(
     graph: LaneGraph | None = None,
     *,
     number: int = 0,
+    edge: MapEdge | None = None,
+    background: Sequence[bool] | NDArray[np.bool_] | None = None,
 ) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
@@ -142,6 +154,9 @@ def scene(
         interactive: how many agents are interactive (chosen by the paper's rule), or their rows.
         graph: of the segment's lanes; with it the scene holds the routes of its interactive agents.
         number: of the segment among those that scenes are drawn from.
+        edge: of the map; with it the traffic is open: interactive agents enter where the log first has them within
+            the map, and leave at its edge.
+        background: [N] which of the interactive agents a rule drives; by default none.
 
     Raises:
         DataError: if the segment has fewer usable agents.
@@ -150,7 +165,7 @@ def scene(
         chosen = interactive_agents(segment, interactive)
     else:
         chosen = np.asarray(interactive, dtype=np.int64)
-        if not (segment.valid[chosen, 0]).all():
+        if edge is None and not segment.valid[chosen, 0].all():
             raise DataError(
                 "an interactive agent is not valid at the first step",
                 segment=segment.segment_id,
@@ -167,6 +182,10 @@ def scene(
         "agent_type": segment.agent_type.astype(np.int64),
         "interactive": chosen.astype(np.int64),
         "interactive_valid": np.ones(len(chosen), bool),
+        "enter": np.zeros(len(chosen), np.int64) if edge is None else _first_inside(segment, chosen, edge),
+        "background": np.zeros(len(chosen), bool) if background is None else np.asarray(background, bool),
+        "exits": np.zeros((0, 4), np.float32) if edge is None else edge.exits,
+        "hull": np.zeros((0, 3), np.float32) if edge is None else edge.hull,
         "last_step": np.array(segment.num_steps - 1),
         "light": segment.signal_state.T.astype(np.uint8),
         "edge_start": start,
@@ -225,6 +244,20 @@ def _routes(tables: Sequence[RouteTable], agents: int) -> dict[str, NDArray[Any]
         points[k, : len(table.count)], count[k, : len(table.count)] = table.points, table.count
     logged = np.array([table.logged for table in tables] or [-1] * agents, np.int64)
     return {"route": points, "route_count": count, "route_logged": logged}
+
+
+def _first_inside(segment: RunSegment, chosen: NDArray[np.int64], edge: MapEdge) -> NDArray[np.int64]:
+    """The first step at which the log has agents within the map.
+
+    Raises:
+        DataError: there is none.
+    """
+    there = segment.valid[chosen] & ~beyond(segment.position[chosen, :, :2], edge)
+    if not there.any(1).all():
+        raise DataError(
+            "an interactive agent is never within the map", segment=segment.segment_id, field="interactive"
+        )
+    return there.argmax(1)
 
 
 def _edges(boundary: Polylines) -> tuple[NDArray[Any], ...]:

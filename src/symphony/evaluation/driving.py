@@ -138,7 +138,7 @@ def progress(saved: SavedRollouts, judged: Indices) -> Progress:
     one; without a route, the length of its path.
     """
     rows, within = saved.agents[judged], slice(saved.start, saved.last + 1)
-    there = np.concatenate([saved.counted[:, :1], saved.counted], 1)[..., judged].swapaxes(1, 2)
+    there = saved.there[..., judged].swapaxes(1, 2)
     path = saved.state[:, :, judged, :2].swapaxes(1, 2).astype(np.float64)
     log = saved.segment.position[rows, within, :2].astype(np.float64)
     seen = saved.segment.valid[rows, within]
@@ -181,9 +181,8 @@ class Comfort(NamedTuple):
 
 def comfort(saved: SavedRollouts, judged: Indices) -> Comfort:
     """Differences of speed, of acceleration, and speed times yaw rate, over one step each, not smoothed."""
-    state, counted = saved.state[:, :, judged].astype(np.float64), saved.counted[:, :, judged]
-    dt = saved.segment.dt
-    state = np.where(np.concatenate([counted[:, :1], counted], 1)[..., None], state, np.nan)
+    state, dt = saved.state[:, :, judged].astype(np.float64), saved.segment.dt
+    state = np.where(saved.there[:, :, judged][..., None], state, np.nan)
     speed, heading = state[..., 3], state[..., 2]
     acceleration = np.diff(speed, axis=1) / dt
     turn = (np.diff(heading, axis=1) + np.pi) % (2 * np.pi) - np.pi

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
 from symphony.metrics import (
+    AgentSteps,
     Choice,
     CollisionKinds,
     RolloutMetrics,
@@ -34,6 +35,7 @@ from symphony.metrics import (
     standing_at_end,
 )
 from symphony.roadgraph import LaneGraph, visited_curvatures
+from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.demonstrations import SceneDataset, logged
 from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
@@ -72,7 +74,7 @@ class Evaluation:
         agent: its name.
         metrics: accumulated over all run segments.
         config: how it was evaluated.
-        interactive: agents per segment that acted.
+        interactive: agents per segment that acted, at most, or ``all``.
         search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
         own: mean of each metric of the user's own per run segment, by import path.
         seconds: CPU time of the simulation, what it costs.
@@ -82,7 +84,7 @@ class Evaluation:
     agent: str
     metrics: RolloutMetrics
     config: EvaluateConfig
-    interactive: int
+    interactive: int | Literal["all"]
     search: str
     own: dict[str, list[float]] = field(default_factory=dict)
     seconds: float = 0.0
@@ -130,23 +132,21 @@ def evaluate(
 
     Raises:
         ConfigError: if the agent learned another time step than the store has.
-        DataError: if the store is empty, or a segment has too few agents for so many interactive ones.
+        DataError: if the store is empty, or a segment has no ego at its first step.
     """
     config = EvaluateConfig() if config is None else config
     agent = load_agent(agent, config.device) if isinstance(agent, str) else agent
     store = data if isinstance(data, SegmentStore) else SegmentStore(data)
     if len(store) == 0:
         raise DataError("the store holds no run segments", file=store.path)
-    dataset = SceneDataset(
-        store,
-        config.interactive or agent.interactive,
-        agent.dynamics,
-        items,
-        routes=agent.goals is not None,
-        duration=config.duration or agent.duration,
-        keep=config.batch,
+    return evaluate_dataset(
+        agent,
+        crowd_dataset(store, agent, config, items),
+        config,
+        progress,
+        baselines=baselines,
+        observe=observe,
     )
-    return evaluate_dataset(agent, dataset, config, progress, baselines=baselines, observe=observe)
 
 
 def evaluate_dataset(
@@ -178,10 +178,11 @@ def evaluate_dataset(
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.
-    once = dataclasses.replace(config, rollouts=1, trees=1, search="none")
+    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0)
+    acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     hows = [config] + [once] * (len(everyone) - 1)
     found = [
-        Evaluation(one.name, RolloutMetrics(), how, dataset.interactive, search_kind(one, how))
+        Evaluation(one.name, RolloutMetrics(), how, acting, search_kind(one, how))
         for one, how in zip(everyone, hows, strict=True)
     ]
     for path in config.metric:
@@ -263,8 +264,11 @@ def _add(
 ) -> None:
     """Add the rollouts of some run segments to what was found."""
     rollouts, (log, log_valid) = found.rollouts, logged(scenes)
-    standing = standing_at_end(rollouts.state, log, log_valid, scenes.last_step)
-    kinds = _kinds(scenes, rollouts, log_valid if evaluation.search == "log" else None)
+    judged = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
+    exists = _there(scenes, rollouts, log_valid if evaluation.search == "log" else None)
+    both = judged._replace(counted=judged.counted & log_valid[:, None, 1:])
+    judged_log = log_valid & ~scenes.background[:, None]
+    standing = standing_at_end(rollouts.state, log, judged_log, scenes.last_step)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     for path, metric in own.items():
         values = metric(scenes, rollouts)
@@ -272,7 +276,16 @@ def _add(
             shape = tuple(rollouts.state.shape[:2])
             raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")
         evaluation.own.setdefault(path, []).extend(values.double().nanmean(-1).tolist())
-    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, rollouts.counted, log, log_valid))
+    kinds = _kinds(scenes, judged, exists)
+    single = AgentSteps(
+        judged.counted.transpose(2, 3),
+        log_valid[:, 1:].transpose(1, 2),
+        rollouts.offroad.transpose(2, 3),
+        _kinds(scenes, both, exists),
+        rollouts.state[..., 1:, :, 3].transpose(2, 3),
+        log[:, 1:, :, 3].transpose(1, 2),
+    )
+    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, judged.counted, log, log_valid))
     regions, regions_log = [], []
     for b, item in enumerate(items):
         graph = dataset.graph(item)
@@ -291,6 +304,7 @@ def _add(
         kinds=kinds,
         # Segments of one recording share its traffic, so errors are over recordings.
         groups=[segment.group or segment.segment_id for segment in segments],
+        single=single,
         standing=Standing(*(part.cpu() for part in standing)),
         choices=_choices(scenes, found),
     )
@@ -309,13 +323,18 @@ def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
     return choices(drawn.cpu(), found.goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
 
 
-def _kinds(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> CollisionKinds:
+def _there(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> Bool[Tensor, "B K N T+1"]:
+    """Which driven agents are there at each state; where the log is played back, those that it has."""
+    if log_valid is not None:
+        return log_valid.transpose(1, 2)[:, None]
+    first = scenes.interactive_valid & (scenes.enter == 0)
+    later = rollouts.counted.transpose(2, 3)
+    return torch.cat([first[:, None, :, None].expand(*later.shape[:-1], 1), later], -1)
+
+
+def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T+1"]) -> CollisionKinds:
     """Who ran into whom, in the first collision of each agent."""
     steps = rollouts.state.shape[-3]
-    if log_valid is None:
-        exists = scenes.interactive_valid[:, None, :, None].expand(-1, rollouts.state.shape[1], -1, steps)
-    else:
-        exists = log_valid.transpose(1, 2)[:, None]
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None]
     return collision_kinds(
         (rollouts.collision & rollouts.counted).transpose(2, 3),

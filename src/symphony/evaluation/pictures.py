@@ -12,13 +12,14 @@ from symphony import keys
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment
-from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.driving import acting
+from symphony.simulation.planned import PlannedEnv
 from symphony.simulation.rollouts import Rollouts, start_states
 from symphony.simulation.saved import SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import RolloutWriter
@@ -36,10 +37,11 @@ class RolloutKeeper:
     Args:
         writer: of the folder.
         driver: name of the agent.
+        others: what drives background agents.
     """
 
-    def __init__(self, writer: RolloutWriter, driver: str) -> None:
-        self.writer, self.driver = writer, driver
+    def __init__(self, writer: RolloutWriter, driver: str, others: str = "log") -> None:
+        self.writer, self.driver, self.others = writer, driver, others
 
     def __call__(self, batch: EvaluatedBatch) -> None:
         """Save a batch, but for segments that are there already."""
@@ -47,7 +49,13 @@ class RolloutKeeper:
             if not self.writer.has(segment.segment_id):
                 self.writer.add(
                     saved_rollouts(
-                        segment, batch.scenes, batch.rollouts, row, goal=batch.goal, driver=self.driver
+                        segment,
+                        batch.scenes,
+                        batch.rollouts,
+                        row,
+                        goal=batch.goal,
+                        driver=self.driver,
+                        others=self.others,
                     )
                 )
 
@@ -167,7 +175,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         raise ConfigError(f"{agent.name} has no discriminator to search by: it was not trained with one")
     agent.check_step(dataset.dt)
     scene = dataset.scene(item).to(torch.device(config.device))
-    env = DrivingEnv(scene, agent.dynamics, agent.observation)
+    env = PlannedEnv(scene, agent.dynamics, agent.observation)
     settings = config.pruning(agent.search)
     start = start_states(
         env,
@@ -181,7 +189,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
     with torch.no_grad():
         result = search(
             env,
-            agent.policy,
+            acting(agent.policy, env, config),
             agent.discriminator,
             start,
             seed=config.seed,

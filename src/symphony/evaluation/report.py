@@ -139,7 +139,7 @@ def report(
 def add_segment(found: Report, saved: SavedRollouts) -> None:
     """Judge the rollouts of one segment and add them to a report."""
     segment = saved.segment
-    who = np.arange(len(saved.agents))
+    who = saved.judged
     if found.judged == "ego":
         who = np.flatnonzero(saved.agents == segment.ego)
         if not len(who):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from symphony.metrics.agents import AgentResult, AgentSteps
 from symphony.metrics.choices import Choice, Standing, choices, route_turns, standing_at_end
 from symphony.metrics.curvature import (
     Divergence,
@@ -16,6 +17,8 @@ from symphony.metrics.realism import collisions, displacement, offroad
 from symphony.metrics.summary import RolloutMetrics, SegmentResult
 
 __all__ = [
+    "AgentResult",
+    "AgentSteps",
     "Choice",
     "CollisionKind",
     "CollisionKinds",

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.metrics.agents import AgentResult, AgentSteps, agent_rates, agent_results, speed_distance
 from symphony.metrics.choices import Choice, Standing, choice_numbers
 from symphony.metrics.curvature import (
     BINS,
@@ -46,6 +47,7 @@ class SegmentResult:
             agents; None where kinds are.
         simulated: egos, and other interactive agents, in all rollouts.
         group: the recording the segment is part of; None where not given.
+        single: what became of single agents while their log exists; None where not asked for.
         standing: agents that stand at the end, of all rollouts and of the log, and agents whose log lasts that long;
             None where not given.
         choice: what the search made of the goals; None without search or goals.
@@ -63,6 +65,7 @@ class SegmentResult:
     agents: NDArray[np.int64] | None = None
     simulated: tuple[int, int] = (0, 0)
     group: str | None = None
+    single: AgentResult | None = None
     standing: tuple[int, int, int] | None = None
     choice: Choice | None = None
 
@@ -89,6 +92,7 @@ class RolloutMetrics:
         curvature_log: Sequence[NDArray[Any]],
         kinds: CollisionKinds | None = None,
         groups: Sequence[str] | None = None,
+        single: AgentSteps | None = None,
         standing: Standing | None = None,
         choices: Sequence[Choice] | None = None,
     ) -> None:
@@ -106,6 +110,7 @@ class RolloutMetrics:
             kinds: [B, K, N] of the collisions of simulated agents, the ego first, for all segments or for none.
             groups: [B] the recording each segment is part of (see ``RunSegment.group``), for all segments or for
                 none. Segments of one recording are no independent samples: standard errors are then over groups.
+            single: what single agents did, for all segments or for none.
             standing: who stands at the end, for all segments or for none.
             choices: [B] what the search made of the goals, for all segments or for none.
 
@@ -129,6 +134,7 @@ class RolloutMetrics:
         there = simulated.any(-1).sum(1)
         if groups is not None and len(groups) != len(segment_ids):
             raise ValueError(f"{len(groups)} groups for {len(segment_ids)} segments")
+        singles = None if single is None else agent_results(single)
         ends = None if standing is None else _count_standing(standing)
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
@@ -150,6 +156,7 @@ class RolloutMetrics:
                 agents=None if by_agent is None else by_agent[b],
                 simulated=(int(there[b, 0]), int(there[b, 1:].sum())),
                 group=None if groups is None else groups[b],
+                single=None if singles is None else singles[b],
                 standing=None if ends is None else ends[b],
                 choice=None if choices is None else choices[b],
             )
@@ -219,6 +226,11 @@ class RolloutMetrics:
             ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
             themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
             ``others_collision_rate``, and by kind, ``ego_collision_into_leader`` and so on.
+            Where steps of single agents were given, of those at which an agent is driven and logged: the percent of
+            agents that collide, ``agent_collision_rate``, by kind and ``agent_collision_with_playback``;
+            ``agent_offroad_time``; metres driven in percent of the log's, ``agent_progress``; mean speed,
+            ``agent_speed``, and the percent of time that agents stand, ``agent_standing``, both also as ``*_log``;
+            and how far the speeds are from the log's, ``agent_speed_distance`` (Wasserstein, m/s).
             Where standing was given, ``standing`` and ``standing_log`` are the percent of agents that stand at the
             last step, of those whose log lasts that long. Where choices were given, see :func:`choice_numbers`.
             Where groups were given, ``groups`` is how many, and all standard errors are over them (as if each were
@@ -234,6 +246,9 @@ class RolloutMetrics:
         def column(values: Sequence[float]) -> NDArray[np.float64]:
             return np.array(values, dtype=np.float64)
 
+        single = [s.single for s in found if s.single is not None]
+        if 0 < len(single) < len(found):
+            raise ValueError(f"steps of agents were given for {len(single)} of {len(found)} segments")
         logged = column([s.logged for s in found])
         parts = {
             "collision_rate": (
@@ -245,6 +260,7 @@ class RolloutMetrics:
             "min_sade": (column([s.error.min() for s in found]), logged),
             **_kind_rates(found),
             **_agent_rates(found),
+            **(agent_rates(single) if single else {}),
             **_standing_rates(found),
         }
         member = _groups(found)
@@ -257,6 +273,8 @@ class RolloutMetrics:
         out["curvature_jsd_corrected"] = divergence.corrected
         chosen = [s.choice for s in found if s.choice is not None]
         out |= choice_numbers(chosen) if chosen else {}
+        if single:
+            out["agent_speed_distance"] = speed_distance(single)
         out["segments"] = len(found)
         if member is not None:
             out["groups"] = int(member.max()) + 1

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Int
-from tensordict.nn import TensorDictSequential
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
@@ -20,11 +22,19 @@ from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.metrics import collisions, offroad
 from symphony.modules import SeededNoise
+from symphony.simulation.background import CarFollower, ConstantSpeed
+from symphony.simulation.control import Tempered
 from symphony.simulation.demonstrations import logged
 from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
 from symphony.simulation.search import aggregate_of, pruning_rule, search
+
+RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
+    "constant_velocity": ConstantSpeed,
+    "idm": CarFollower,
+}
+"""What can drive background agents in place of the agent."""
 
 
 class Simulation(NamedTuple):
@@ -61,6 +71,7 @@ def simulation(
     *,
     keep_tree: bool = False,
     egos: EgoPlanners | None = None,
+    given: Int[Tensor, "B N"] | None = None,
 ) -> Simulation:
     """K rollouts of every scene, and how they came about.
 
@@ -70,6 +81,7 @@ def simulation(
         config: how.
         keep_tree: of a search keep the pruned branches, too.
         egos: plan the first agent of every scene, which no search judges; the agent drives the others.
+        given: number of the route that an agent is to follow, -1 where that is left open.
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
@@ -80,15 +92,15 @@ def simulation(
     if policy is None:
         if egos is None:
             raise ValueError("log playback has nothing to simulate")
-        if scenes.interactive.shape[1] > 1:
+        if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
             raise ConfigError("beside log playback the planner's ego is the only interactive agent")
         policy = ConstantVelocity(Bicycle())
     agent.check_step(float(scenes.dt[0]))
-    env = (DrivingEnv if egos is None else PlannedEnv)(scenes, agent.dynamics, agent.observation)
+    env = PlannedEnv(scenes, agent.dynamics, agent.observation)
     trees, branches, taken = _plan(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
-    actor = watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy")
+    actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
     start = start_states(
         env,
         goals,
@@ -98,6 +110,7 @@ def simulation(
         logged_goals=config.logged_goals,
         goals_per=config.pruning(agent.search).goals,
     )
+    start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
     settings, planned = config.pruning(agent.search), None
     if egos is not None:
         keep_every = settings.prune_every if config.retries else 0
@@ -148,6 +161,37 @@ def simulation(
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
+
+
+def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
+    """A policy with what a configuration changes in its draws, and with the rule that drives background agents.
+
+    Raises:
+        ConfigError: a temperature for a policy without discrete actions.
+    """
+    found = policy
+    if config.action_temperature != 1.0:
+        if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
+            raise ConfigError(
+                "this agent draws no discrete actions, so action-temperature means nothing to it"
+            )
+        found = TensorDictSequential(found, Tempered(config.action_temperature))
+    if config.others in RULES:
+        found = TensorDictSequential(found, RULES[config.others](env))
+    return found
+
+
+def _with_fixed_goals(
+    env: DrivingEnv, start: TensorDictBase, given: Tensor | None, *, along_log: bool
+) -> TensorDictBase:
+    """A start state in which goals are as given, and with ``along_log`` those of background agents the log's."""
+    scene, goal = start.get(keys.SCENE).squeeze(-1), start.get(keys.GOAL)
+    if along_log:
+        goal = torch.where(env.scenes.background[scene], env.scenes.route_logged[scene], goal)
+    if given is not None:
+        chosen = given.to(goal.device)[scene]
+        goal = torch.where(chosen >= 0, chosen, goal)
+    return start if goal is start.get(keys.GOAL) else env.with_goals(start, goal)
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
@@ -207,10 +251,11 @@ def driven_by(
     *,
     keep_tree: bool = False,
     egos: EgoPlanners | None = None,
+    given: Int[Tensor, "B N"] | None = None,
 ) -> Simulation:
     """What an agent does: :func:`playback` of the log, or a :func:`simulation`."""
     if agent.policy is not None or egos is not None:
-        return simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos)
+        return simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
     found = playback(scenes)
     return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
 

@@ -19,7 +19,6 @@ from symphony import keys
 from symphony.data.segment import RunSegment
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import bicycle_step
-from symphony.envs.observation import objects_at
 from symphony.errors import ConfigError
 from symphony.simulation.planner import Planner, Traffic, checked_plan, fixed, scenario_of
 from symphony.simulation.planner_calls import SECONDS, answer, plans_of
@@ -30,11 +29,17 @@ _PLANNERS = (1 << 40) + 3
 
 
 class PlannedEnv(DrivingEnv):
-    """Driving whose first interactive agent, the ego, goes where ``PLANNED`` says instead of its action."""
+    """Driving in which actions are not all: background agents go where ``BACKGROUND`` says, and the first interactive
+    agent, the ego, where ``PLANNED`` does; where there is no such entry, they act like the others.
+    """
 
     def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
         after = super()._moved(tensordict, state, size)
-        return torch.cat([tensordict.get(keys.PLANNED)[..., None, :], after[..., 1:, :]], -2)
+        ruled, planned = tensordict.get(keys.BACKGROUND, None), tensordict.get(keys.PLANNED, None)
+        if ruled is not None:
+            background = self.scenes.background[tensordict.get(keys.SCENE).squeeze(-1)]
+            after = torch.where(background[..., None], ruled, after)
+        return after if planned is None else torch.cat([planned[..., None, :], after[..., 1:, :]], -2)
 
 
 class Failure(NamedTuple):
@@ -141,9 +146,12 @@ class EgoPolicy(TensorDictModuleBase):
         state, valid = (
             tensordict.get(key).flatten(0, tensordict.ndim - 1) for key in (keys.STATE, keys.VALID)
         )
-        everyone = objects_at(self.env.scenes, scene, at, state, self.env.scenes.interactive[scene], valid)
-        rows, steps = scene.tolist(), at.tolist()
-        going = [step < self._last[row] for row, step in zip(rows, steps, strict=True)]
+        everyone = self.env.objects(scene, at, state, valid)
+        rows, steps, driving = scene.tolist(), at.tolist(), valid[:, 0].tolist()
+        # An ego that has left the map is over, too.
+        going = [
+            step < self._last[row] and there for row, step, there in zip(rows, steps, driving, strict=True)
+        ]
         numbers = self._own(number.tolist(), going, steps[0])
         own = state[:, 0].cpu().double()
         moves, there = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()

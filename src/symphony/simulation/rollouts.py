@@ -28,7 +28,8 @@ class Rollouts(NamedTuple):
         state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
         collision: [..., T, N].
         offroad: [..., T, N].
-        counted: [..., T, N] steps that are judged: of real agents, up to the segment's last logged step.
+        counted: [..., T, N] steps that are judged: of real agents while they are there, up to the segment's last
+            logged step.
     """
 
     state: Float[Tensor, "*b T+1 N 4"]
@@ -59,18 +60,19 @@ def simulate(
         steps: decisions; by default up to the last logged step of the longest scene.
     """
     steps = env.decisions if steps is None else steps
-    now, states, collisions, offroads = start, [start.get(keys.STATE)], [], []
+    now, states, collisions, offroads, there = start, [start.get(keys.STATE)], [], [], []
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(steps):
             now = step_mdp(env.step(policy(now)), exclude_reward=True)
             states.append(now.get(keys.STATE))
             collisions.append(now.get(keys.COLLISION).squeeze(-1))
             offroads.append(now.get(keys.OFFROAD).squeeze(-1))
+            there.append(now.get(keys.VALID))
     return Rollouts(
         torch.stack(states, -3),
         torch.stack(collisions, -2),
         torch.stack(offroads, -2),
-        counted_steps(env, start, steps),
+        counted_steps(env, start, torch.stack(there, -2)),
     )
 
 
@@ -84,6 +86,8 @@ def draw_goals(
 ) -> Int[Tensor, "*b N"]:
     """The route [..., N] each agent follows from a start state, -1 for none.
 
+    In open traffic, agents that enter later draw as if all of them were there already.
+
     Args:
         env: the environment.
         goals: the goal policy; None takes the routes nearest to the log.
@@ -93,13 +97,20 @@ def draw_goals(
     """
     if goals is None:
         return env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)]
-    seen = env.choices(start)
     stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _GOALS), tree[..., None])
-    place = torch.arange(env.num_agents, device=start.device)
-    seen.set(keys.GOAL_NOISE, uniform(seed, fold_in(stream, place), 0))
-    with set_exploration_type(ExplorationType.RANDOM):
-        seen = goals(seen)
-    return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
+    noise = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
+
+    def drawn(state: TensorDictBase) -> Tensor:
+        seen = env.choices(state).set(keys.GOAL_NOISE, noise)
+        with set_exploration_type(ExplorationType.RANDOM):
+            seen = goals(seen)
+        return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
+
+    found, waiting = drawn(start), start.get(keys.WAITING, None)
+    if waiting is None:
+        return found
+    everyone = env.at(start.copy().set(keys.VALID, start.get(keys.VALID) | waiting))
+    return torch.where(waiting, drawn(everyone), found)
 
 
 def start_states(
@@ -144,11 +155,13 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
     collision, offroad = (
         trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)
     )
-    return Rollouts(state, collision, offroad, counted_steps(env, start, collision.shape[-2]))
+    there = trajectories.get(("next", *keys.VALID))
+    return Rollouts(state, collision, offroad, counted_steps(env, start, there))
 
 
-def counted_steps(env: DrivingEnv, start: TensorDictBase, steps: int) -> Bool[Tensor, "*b T N"]:
-    """Where [..., T, N] agents are real and their segment still has logged steps."""
-    step = start.get(keys.STEP) + torch.arange(1, steps + 1, device=start.device)
-    within = step <= env.scenes.last_step[start.get(keys.SCENE)]
-    return within[..., None] & start.get(keys.VALID)[..., None, :]
+def counted_steps(
+    env: DrivingEnv, start: TensorDictBase, there: Bool[Tensor, "*b T N"]
+) -> Bool[Tensor, "*b T N"]:
+    """Where agents are there, of the states after each step, and their segment still has logged steps."""
+    step = start.get(keys.STEP) + torch.arange(1, there.shape[-2] + 1, device=start.device)
+    return (step <= env.scenes.last_step[start.get(keys.SCENE)])[..., None] & there

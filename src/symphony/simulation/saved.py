@@ -24,6 +24,8 @@ from symphony.simulation.rollouts import Rollouts
 
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
+BACKGROUND = "background:"
+"""What the names of drivers begin with whose agents nobody judges."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class SavedRollouts:
         segment: the log, its map and its lights.
         agents: [N] rows of the log that were driven; all others play back the log.
         state: [K, T + 1, N, 4] x, y, heading, speed, the first state included.
-        counted: [K, T, N] steps that are judged.
+        counted: [K, T, N] steps at which an agent is there, up to the end of a rollout that failed.
         collision: [K, T, N].
         offroad: [K, T, N].
         goal: [K, N] line of ``routes`` that an agent followed, -1 for none.
@@ -92,6 +94,22 @@ class SavedRollouts:
     drivers: tuple[str, ...] = ()
     failed: Mapping[int, str] = field(default_factory=dict)
     trees: SavedTrees | None = None
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """[K, T + 1, N] which agents are there at each state.
+
+        At the first one where the second counts and the log has them, too: who enters with the first step was not
+        there before.
+        """
+        first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
+        return np.concatenate([first, self.counted], 1)
+
+    @property
+    def judged(self) -> NDArray[np.int64]:
+        """Places among the N driven agents of those that are no background."""
+        named = self.drivers or ("",) * len(self.agents)
+        return np.flatnonzero([not name.startswith(BACKGROUND) for name in named])
 
     @property
     def rollouts(self) -> int:
@@ -123,6 +141,7 @@ def saved_rollouts(
     goal: Tensor | None = None,
     search: BeamSearchResult | None = None,
     driver: str | Sequence[str] = "",
+    others: str = "",
     failed: Mapping[int, str] | None = None,
 ) -> SavedRollouts:
     """Rollouts of one run segment, ready to be written.
@@ -135,6 +154,7 @@ def saved_rollouts(
         goal: [B, K, N] number of the route that each agent followed among its feasible ones, -1 for none.
         search: of which the rollouts are the leaves, with leading dimensions [B, R] and its tree kept.
         driver: of all interactive agents, or of each [N].
+        others: what drives background agents.
         failed: see :class:`SavedRollouts`.
 
     Raises:
@@ -147,6 +167,8 @@ def saved_rollouts(
         for part in (rollouts.counted, rollouts.collision, rollouts.offroad)
     )
     names = [driver] * len(real) if isinstance(driver, str) else list(driver)
+    background = scenes.background[row].tolist()
+    names = [BACKGROUND + others if rule else name for name, rule in zip(names, background, strict=True)]
     number, routes = _routes(scenes, row, goal, len(counted))
     return SavedRollouts(
         segment=segment,

@@ -182,8 +182,7 @@ def _checked(saved: SavedRollouts, facts: dict[str, Any], segment_id: str) -> Sa
         raise DataError(f"{len(saved.drivers)} for {sizes['N']} agents", field="drivers")
     if any(number >= sizes["K"] for number in saved.failed):
         raise DataError(f"names a rollout outside the {sizes['K']}", field="failed")
-    there = np.concatenate([saved.counted[:, :1], saved.counted], 1)
-    _check_state("state", saved.state[there])
+    _check_state("state", saved.state[saved.there])
     if saved.trees is not None:
         _check_trees(saved.trees, sizes)
     return saved

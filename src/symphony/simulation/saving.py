@@ -14,6 +14,7 @@ import torch
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
 from symphony.errors import DataError
+from symphony.simulation.control import given_goals
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
@@ -37,6 +38,7 @@ def save_simulation(
     keep_tree: bool = True,
     planner: str | Callable[..., Any] = "",
     planner_seconds: float = SECONDS,
+    goals: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset and keep the rollouts, segment by segment.
@@ -53,11 +55,12 @@ def save_simulation(
             holds routes and the agent drives the other interactive agents. Segments whose ego can't be driven are put
             on record as failed.
         planner_seconds: that it has for one answer; more fails the run.
+        goals: of agents, as :func:`symphony.simulation.control.given_goals` reads them; then the dataset has routes.
         progress: called with the segments done and their total.
 
     Raises:
         DataError: the folder holds something else, or the disk refuses.
-        ConfigError: the agent can't be simulated so.
+        ConfigError: the agent can't be simulated so, or a goal can't be reached.
         NotFiniteError: a network of the agent puts out a number that is not finite.
     """
     if planner:
@@ -65,7 +68,8 @@ def save_simulation(
     about = About.of(
         agent.name,
         dataset.store,
-        plain_settings(config, dataset.interactive, dataset.duration),
+        plain_settings(config, dataset.interactive, dataset.duration)
+        | ({"goal": list(goals)} if goals else {}),
         seed=config.seed,
     )
     writer = RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about)
@@ -74,7 +78,7 @@ def save_simulation(
     if planner:
         todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
-    drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds)
+    drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
     with closing(shared(drive, batches(todo, config), config, dataset)) as results:
         for saved in results:
             for one in saved:
@@ -95,6 +99,7 @@ class _Drive:
     keep_tree: bool
     planner: str | Callable[..., Any]
     planner_seconds: float
+    goals: tuple[str, ...]
 
     def __call__(self, items: list[int]) -> list[SavedRollouts]:
         """What they did in each."""
@@ -105,8 +110,13 @@ class _Drive:
             if self.planner:
                 name, make = planner_name(self.planner), planner_maker(self.planner)
                 egos = EgoPlanners(name, make, segments, self.planner_seconds)
+            given = (
+                given_goals(self.goals, segments, scenes, planned=bool(self.planner)) if self.goals else None
+            )
             try:
-                found = driven_by(self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos)
+                found = driven_by(
+                    self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos, given=given
+                )
             except NotFiniteError as error:
                 raise error.named(segments[error.row].segment_id) from error
             rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
@@ -118,17 +128,18 @@ class _Drive:
                     b,
                     goal=found.goal,
                     search=found.search if self.keep_tree else None,
-                    driver=self._drivers(),
+                    driver=self._drivers(on_cpu.interactive.shape[1]),
+                    others=self.config.others,
                     failed=found.failed[b] if found.failed else None,
                 )
                 for b, segment in enumerate(segments)
             ]
 
-    def _drivers(self) -> str | list[str]:
+    def _drivers(self, agents: int) -> str | list[str]:
         name = PLAYBACK if self.agent.policy is None else self.agent.name
         if not self.planner:
             return name
-        return [planner_name(self.planner), *[name] * (self.dataset.interactive - 1)]
+        return [planner_name(self.planner), *[name] * (agents - 1)]
 
 
 def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:

@@ -37,7 +37,9 @@ equally on all branches.
 _PRUNING = (1 << 40) + 1
 _RETRIES = (1 << 40) + 2
 """Numbers of the streams that prunings and repeats draw from, far above those of rollouts and agents."""
-OUTCOME: Sequence[keys.Key] = [("next", *key) for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)]
+OUTCOME: Sequence[keys.Key] = [
+    ("next", *key) for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
+]
 KEPT: Sequence[keys.Key] = [
     keys.SCENE,
     keys.STEP,
@@ -84,7 +86,7 @@ def realism_score(
     Args:
         env: whose states are scored.
         discriminator: writes them; None takes the true collision and off-road flags (an oracle).
-        ego: whether the first agent is judged; else its score is 0.
+        ego: whether the first agent is judged; else its score is 0, as that of background agents is.
     """
     score: Callable[[TensorDictBase], Tensor] = flag_score
     if discriminator is not None:
@@ -93,6 +95,7 @@ def realism_score(
     def until_the_end(state: TensorDictBase) -> Float[Tensor, "*b N"]:
         going = state.get(keys.STEP) <= env.scenes.last_step[state.get(keys.SCENE)]
         found = torch.where(going, score(state), ENDED)
+        found = found.masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
         return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
 
     return until_the_end

@@ -44,8 +44,7 @@ def world_of(saved: SavedRollouts, rollout: int) -> World:
         segment.heading[:, within].astype(np.float64),
     )
     velocity, valid = segment.velocity[:, within].astype(np.float64), segment.valid[:, within].copy()
-    counted = saved.counted[rollout]
-    there = np.concatenate([counted[:1], counted]).T
+    there = saved.there[rollout].T
     state = np.where(there[..., None], saved.state[rollout].swapaxes(0, 1), 0).astype(np.float64)
     direction = np.stack([np.cos(state[..., 2]), np.sin(state[..., 2])], -1)
     position[saved.agents], heading[saved.agents] = state[..., :2], state[..., 2]

@@ -134,8 +134,7 @@ def _packed(saved: SavedRollouts, events: Sequence[Event]) -> str:
     }
     _pack_log(packer, segment, slice(saved.start, saved.last + 1))
     packer.add("agents", "i16", saved.agents)
-    # A state is there if the step to it counts; the first one if the second is.
-    there = np.concatenate([saved.counted[:, :1], saved.counted], 1)
+    there = saved.there
     packer.states("sim", np.where(there[..., None], saved.state, 0).swapaxes(1, 2))
     packer.add("sim.valid", "u8", there.swapaxes(1, 2))
     packer.add("goal", "i16", saved.goal)

@@ -1,0 +1,379 @@
+"""Everyone reacts: who is driven, how agents enter and leave, and what the others do meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, straight_road
+from helpers_store import fill
+from symphony import keys
+from symphony.agents import Agent, build_agent, load_agent
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
+from symphony.data.segment import AgentType, RunSegment
+from symphony.data.store import SegmentStore
+from symphony.envs import DrivingEnv, scene
+from symphony.envs.edge import map_edge
+from symphony.envs.observation import ObservationConfig
+from symphony.envs.scene import SceneBatch, collate
+from symphony.errors import ConfigError
+from symphony.evaluation import evaluate
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.control import given_goals
+from symphony.simulation.crowd import Crowd, crowd_dataset
+from symphony.simulation.driving import simulation
+from symphony.simulation.saving import save_simulation
+from symphony.simulation.world import world_of
+
+DT = 0.2
+END = 200.0
+ALL = Crowd(128, everyone=True, open_traffic=True)
+
+
+def row(cars: list[tuple[float, float, int]], steps: int = 31, name: str = "row") -> RunSegment:
+    """Cars (first place, speed, lane) on a one-way road of three lanes to x = 200, who are in the log while on it."""
+    time = DT * np.arange(steps)
+    start, speed, lane = (np.array(part, float)[:, None] for part in zip(*cars, strict=True))
+    x = start + speed * time
+    xs = np.arange(0.0, END + 1, 2.0)
+    lines = [np.stack([xs, np.full_like(xs, k * LANE_WIDTH)], -1) for k in range(3)]
+    pairs = np.array([[0, 1], [1, 2]])
+    position = np.stack([x, lane * LANE_WIDTH + 0 * x], -1)
+    velocity = np.stack([speed + 0 * x, 0 * x], -1)
+    road = make_road(lines, left=pairs, right=pairs[:, ::-1])
+    found = make_segment(road, position, 0 * x, velocity, segment_id=name)
+    for a, there in enumerate((x >= 0) & (x <= END)):
+        for t in np.flatnonzero(~there):
+            found = hide(found, a, slice(t, t + 1))
+    return found
+
+
+FLOW = row([(60, 10, 0), (100, 10, 0), (185, 12, 1), (-30, 12, 2), (-55, 12, 0), (120, 0, 2), (20, 5, 1)])
+"""Agent 2 leaves, 3 and 4 enter, 5 waits in its lane."""
+
+
+def tiny(**changes: Any) -> Agent:
+    """An untrained agent that follows routes and searches."""
+    spec = AgentSpec(
+        action_space="bicycle",
+        dt=DT,
+        goals=True,
+        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        searches=True,
+        search=SearchConfig(branches=4, test_branches=4, prune_every=3),
+    )
+    torch.manual_seed(0)
+    return build_agent("tiny", replace(spec, **changes))
+
+
+def crowded(segment: RunSegment, crowd: Crowd = ALL, *, routes: bool = True) -> SceneBatch:
+    graph = LaneGraph(segment.road)
+    driven, background = crowd.choose(segment, graph)
+    return scene(
+        segment,
+        [*driven, *background],
+        graph if routes else None,
+        edge=map_edge(graph) if crowd.open_traffic else None,
+        background=np.arange(len(driven) + len(background)) >= len(driven),
+    )
+
+
+class Playback(DrivingEnv):
+    """Driven agents go where the log has them next; without one straight on."""
+
+    def _moved(self, tensordict: Any, state: Tensor, size: Tensor) -> Tensor:
+        at, b = tensordict.get(keys.STEP).squeeze(-1), tensordict.get(keys.SCENE).squeeze(-1)
+        index = self.scenes.interactive[b]
+        step = (at + 1).clamp(max=self.scenes.log_state.shape[1] - 1)
+        log = self.scenes.log_state[b[..., None], step[..., None], index]
+        there = self.scenes.log_valid[b[..., None], step[..., None], index]
+        speed = log[..., 3:].norm(dim=-1, keepdim=True)
+        way = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
+        straight = torch.cat([state[..., :2] + state[..., 3:] * self.dt * way, state[..., 2:]], -1)
+        return torch.where(there[..., None], torch.cat([log[..., :3], speed], -1), straight)
+
+
+def course(env: DrivingEnv, steps: int) -> list[Any]:
+    """States of an environment whose actions mean nothing."""
+    now = env.start(torch.arange(len(env.scenes)))
+    found = [now]
+    for _ in range(steps):
+        action = torch.full(now.get(keys.VALID).shape, 73)
+        now = step_mdp(env.step(now.set(keys.ACTION, action)))
+        found.append(now)
+    return found
+
+
+def looking(scenes: SceneBatch) -> Playback:
+    return Playback(scenes, None, ObservationConfig.nothing())
+
+
+def test_everyone_who_plays_back_the_log_changes_nothing() -> None:
+    env = looking(crowded(FLOW))
+    assert sorted(env.scenes.interactive[0].tolist()) == list(range(FLOW.num_agents))
+    zero = torch.zeros(1, dtype=torch.int64)
+    for t, now in enumerate(course(env, 30)):
+        found = env.objects(zero, zero + t, now.get(keys.STATE), now.get(keys.VALID))
+        assert found.valid[0].tolist() == FLOW.valid[:, t].tolist(), t
+        seen = FLOW.valid[:, t]
+        assert np.allclose(found.state[0, seen, :2], FLOW.position[seen, t, :2], atol=1e-4)
+        assert not now.get(keys.COLLISION).any()
+
+
+def test_who_leaves_changes_nobody_elsewhere() -> None:
+    scenes = crowded(FLOW)
+    closed = replace_fields(scenes, exits=scenes.exits[:, :0], hull=scenes.hull[:, :0] * 0)
+    # Without exits and outline nobody leaves; a side of zeros keeps the traffic open.
+    closed = replace_fields(closed, hull=torch.zeros(1, 1, 3))
+    gone = scenes.interactive[0].tolist().index(2)
+    ways = [course(looking(one), 30) for one in (scenes, closed)]
+    assert not ways[0][-1][keys.VALID][0, gone]
+    assert ways[1][-1][keys.VALID][0, gone]
+    for a, b in zip(*ways, strict=True):
+        others = torch.arange(len(FLOW.agent_id)) != gone
+        assert torch.equal(a[keys.STATE][:, others], b[keys.STATE][:, others])
+        assert torch.equal(a[keys.COLLISION][:, others], b[keys.COLLISION][:, others])
+        assert torch.equal(a[keys.VALID][:, others], b[keys.VALID][:, others])
+
+
+def replace_fields(scenes: SceneBatch, **changes: Tensor) -> SceneBatch:
+    fields = {name: getattr(scenes, name) for name in SceneBatch.__annotations__}
+    return SceneBatch(**{**fields, **changes}, batch_size=[len(scenes)])
+
+
+def test_who_has_left_is_neither_hit_nor_counted_and_never_comes_back() -> None:
+    found = simulation(
+        load_agent("constant_velocity"), crowded(FLOW, routes=False), EvaluateConfig(rollouts=1)
+    )
+    counted = found.rollouts.counted[0, 0].numpy()
+    x = found.rollouts.state[0, 0, 1:, :, 0].numpy()
+    assert (counted == (x <= END)).all(1).any()
+    for n in range(counted.shape[1]):
+        there = np.flatnonzero(counted[:, n])
+        assert (np.diff(there) == 1).all()
+    assert not found.rollouts.collision[~found.rollouts.counted].any()
+
+
+def test_the_edge_is_where_lanes_end_not_where_one_joins_another() -> None:
+    xs = np.arange(0.0, 101.0, 2.0)
+    main = [np.stack([xs + k, np.zeros_like(xs)], -1) for k in (0, 100)]
+    ramp = np.stack([xs, np.full_like(xs, -LANE_WIDTH)], -1)
+    road = make_road([*main, ramp], successors=[(0, 1)], left=[(2, 0)], right=[(0, 2)])
+    edge = map_edge(LaneGraph(road))
+    assert np.allclose(edge.exits, [[200, 0, 1, 0]])
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 10_000), st.integers(1, 3))
+def test_nobody_enters_into_another(seed: int, lanes: int) -> None:
+    rng = np.random.default_rng(seed)
+    there = [(float(x), float(rng.uniform(0, 4)), int(rng.integers(lanes))) for x in rng.uniform(0, 60, 6)]
+    come = [
+        (float(-rng.uniform(0, 60)), float(rng.uniform(3, 15)), int(rng.integers(lanes))) for _ in range(8)
+    ]
+    env = looking(crowded(row([(150, 5, 0), *there, *come], steps=41), routes=False))
+    before = None
+    for now in course(env, 40):
+        valid, hit = now[keys.VALID], now[keys.COLLISION].squeeze(-1)
+        if before is not None:
+            assert not (hit & valid & ~before).any()
+        before = valid
+
+
+def test_one_that_finds_no_room_waits_until_there_is() -> None:
+    """A car stands where another is to enter; it drives on after a while."""
+    segment = row([(100, 5, 0), (3, 0, 0), (-12, 10, 0)], steps=31)
+    position, velocity = segment.position.copy(), segment.velocity.copy()
+    position[1, 15:, 0] = 3 + 8 * DT * np.arange(16)
+    velocity[1, 15:, 0] = 8
+    segment = segment.replace(position=position, velocity=velocity)
+    scenes = crowded(segment)
+    late = scenes.interactive[0].tolist().index(2)
+    entered = [bool(now[keys.VALID][0, late]) for now in course(looking(scenes), 30)]
+    first = entered.index(True)
+    assert int(scenes.enter[0, late]) < 12
+    assert first > 15
+    assert all(entered[first:])
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
+    path = tmp_path_factory.mktemp("crowd") / "store"
+    fill(path, [row(cars(k), steps=11, name=f"row-{k}") for k in range(3)] + [crossing(4, steps=11)])
+    return SegmentStore(path)
+
+
+def cars(k: int) -> list[tuple[float, float, int]]:
+    return [(60, 10, 0), (85, 10, 0), (190, 12, 1), (-6, 12, 2), (120, 0, 2)][: 3 + k]
+
+
+SEARCHES = ("none", "tree")
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize("others", ["log", "idm", "learned"])
+def test_batch_and_padding_change_nothing(store: SegmentStore, search: Any, others: Any) -> None:
+    config = EvaluateConfig(rollouts=4, search=search, interactive=2, others=others, seed=3)
+    config = config if others != "log" else replace(config, interactive="all")
+    dataset = crowd_dataset(store, tiny(), config)
+    together = simulation(tiny(), dataset.scenes(range(4)), config)
+    assert len({int(n) for n in dataset.scenes(range(4)).interactive_valid.sum(1)}) > 1
+    for b in (0, 3):
+        alone = simulation(tiny(), dataset.scenes([b]), config)
+        count = alone.rollouts.counted.shape[-1]
+        for one, many in zip(alone.rollouts, together.rollouts, strict=True):
+            assert torch.equal(one[0], many[b, :, :, :count])
+        assert torch.equal(alone.goal[0], together.goal[b, :, :count])
+
+
+def test_fewer_agents_than_asked_for(store: SegmentStore) -> None:
+    found = evaluate(tiny(), store, EvaluateConfig(rollouts=2, interactive=8))
+    driven = [int(crowd_dataset(store, tiny(), EvaluateConfig(interactive=8)).scene(i).interactive.shape[1])
+              for i in range(4)]  # fmt: skip
+    agents = [found.metrics.segments[name].single.agents for name in store.ids]
+    # Of those who move and are there at the first step, everyone.
+    assert driven == [3, 3, 3, 4]
+    assert agents == [2 * n for n in driven]
+
+
+def test_who_is_driven_is_a_matter_of_choice() -> None:
+    graph = LaneGraph(FLOW.road)
+    kinds = FLOW.agent_type.copy()
+    kinds[6] = AgentType.PEDESTRIAN
+    segment = FLOW.replace(agent_type=kinds)
+    driven, _ = ALL.choose(segment, graph)
+    # The ego and its partner, the others that move, who stands in a lane, then who comes, by time; nobody on foot.
+    assert sorted(driven[:3].tolist()) == [0, 1, 2]
+    assert driven[3:].tolist() == [5, 3, 4]
+    near = replace(ALL, radius=70.0).choose(segment, graph)[0]
+    away = np.linalg.norm(segment.position[..., :2] - segment.position[0, :, :2], axis=-1)
+    close = (segment.valid & segment.valid[0] & (away <= 70)).any(1)
+    assert set(near[2:].tolist()) == set(driven[2:].tolist()) & set(np.flatnonzero(close).tolist())
+    few, rest = Crowd(2, open_traffic=True, background=True).choose(segment, graph)
+    assert few.tolist() == driven[:2].tolist()
+    assert sorted([*few, *rest]) == sorted(driven)
+
+
+@pytest.mark.parametrize("others", ["constant_velocity", "idm", "learned"])
+def test_others_are_driven_but_not_judged(store: SegmentStore, others: Any, tmp_path: Path) -> None:
+    config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
+    found = evaluate(tiny(), store, config)
+    assert [found.metrics.segments[name].single.agents for name in store.ids] == [4] * 4
+    saved = next(iter(save_simulation(tmp_path, tiny(), crowd_dataset(store, tiny(), config, [2]), config)))
+    assert len(saved.agents) > 2
+    assert saved.judged.tolist() == [0, 1]
+    assert set(saved.drivers[2:]) == {f"background:{others}"}
+
+
+@pytest.mark.parametrize("settings", [{"interactive": "all"}, {"interactive": 2, "others": "idm"}])
+def test_the_same_seed_gives_the_same_bytes(store: SegmentStore, settings: Any, tmp_path: Path) -> None:
+    def files(name: str, **more: Any) -> list[bytes]:
+        config = EvaluateConfig(rollouts=2, branches=4, **{"seed": 5, **settings, **more})
+        save_simulation(tmp_path / name, tiny(), crowd_dataset(store, tiny(), config), config)
+        return [path.read_bytes() for path in sorted((tmp_path / name / "segments").iterdir())]
+
+    assert files("a") == files("b", batch=1)
+    assert files("a") != files("c", seed=6)
+
+
+def test_a_saved_world_shows_who_is_there(store: SegmentStore, tmp_path: Path) -> None:
+    config = EvaluateConfig(rollouts=1, search="none", interactive="all")
+    dataset = crowd_dataset(store, load_agent("constant_velocity"), config, [2])
+    (saved,) = save_simulation(tmp_path, load_agent("constant_velocity"), dataset, config)
+    world, segment = world_of(saved, 0), saved.segment
+    # At constant speed all is as logged, entering and leaving included.
+    assert (world.valid == segment.valid).all()
+    assert not segment.valid.all()
+
+
+@pytest.mark.parametrize(
+    "segment", [straight_road(6, seed=2), crossing(4, seed=1), crossing(4, seed=5), row(cars(2))]
+)
+def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
+    from symphony.simulation.planned import EgoPlanners
+    from symphony.simulation.planner import planner_maker
+
+    graph, quiet = LaneGraph(segment.road), load_agent("constant_velocity")
+    alone = scene(segment, [segment.ego], graph)
+    egos = EgoPlanners("idm", planner_maker("idm"), [segment])
+    one = simulation(quiet, alone, EvaluateConfig(rollouts=1), egos=egos).rollouts.state
+    ruled = scene(segment, [segment.ego], graph, background=[True])
+    many = simulation(quiet, ruled, EvaluateConfig(rollouts=1, others="idm")).rollouts.state
+    assert (one - many).abs().max() < 0.05
+
+
+def test_the_car_follower_hits_nobody_in_front() -> None:
+    segment = row([(60, 14, 0), (90, 3, 0), (20, 14, 0), (110, 0, 1), (30, 14, 1), (80, 14, 2)], steps=41)
+    config = EvaluateConfig(rollouts=1, interactive=1, others="idm")
+    scenes = crowded(segment, Crowd.of(config, 2))
+    found = simulation(load_agent("constant_velocity"), scenes, config)
+    place = {agent: n for n, agent in enumerate(scenes.interactive[0].tolist())}
+    hit = found.rollouts.collision[0, 0].any(0)
+    # The ego keeps its speed and drives into agent 1; nobody else touches anybody.
+    assert {agent for agent, n in place.items() if bool(hit[n])} <= {0, 1}
+
+
+def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:
+    segment = crossing(4, seed=1)
+    scenes = scene(segment, [0, 1], LaneGraph(segment.road))
+    name = segment.agent_id.tolist()
+    for m in range(3):
+        lane = 8 + 3 * 0 + m
+        route = int(given_goals([f"{name[0]}=lane:{100 + lane}"], [segment], scenes)[0, 0])
+        points = scenes.route[0, 0, route, : int(scenes.route_count[0, 0, route])].numpy()
+        ends = segment.road.lanes[lane][[0, -1], :2]
+        assert max(np.linalg.norm(points - end, axis=-1).min() for end in ends) < 3.5
+        x, y = segment.road.lanes[4 + (2, 3, 1)[m]][-20, :2].tolist()
+        assert int(given_goals([f"{name[0]}={x},{y}"], [segment], scenes)[0, 0]) == route
+    chosen = given_goals([f"{name[1]}=lane:112"], [segment], scenes)
+    config = EvaluateConfig(rollouts=2, search="none")
+    goal = simulation(tiny(), scenes, config, given=chosen).goal
+    assert (goal[..., 1] == chosen[0, 1]).all()
+    for bad in ("7", "7=", "x=1,2", "7=1", "7=a,b", "7=lane:99", "12345=lane:100", "7=9e9,0"):
+        with pytest.raises(ConfigError, match="goal"):
+            given_goals([bad], [segment], scenes)
+    with pytest.raises(ConfigError, match="planner drives"):
+        given_goals([f"{name[0]}=lane:108"], [segment], scenes, planned=True)
+
+
+def test_a_cold_draw_is_the_likeliest_action() -> None:
+    scenes = scene(straight_road(4), 3, LaneGraph(straight_road(4).road))
+
+    def rollouts(temperature: float) -> Tensor:
+        config = EvaluateConfig(rollouts=3, search="none", action_temperature=temperature, logged_goals=True)
+        return simulation(tiny(), scenes, config).rollouts.state
+
+    plain = simulation(tiny(), scenes, EvaluateConfig(rollouts=3, search="none", logged_goals=True))
+    assert torch.equal(rollouts(1.0 + 1e-9), plain.rollouts.state)
+    cold, warm = rollouts(1e-4), rollouts(3.0)
+    assert (cold == cold[:, :1]).all()
+    assert not (warm == warm[:, :1]).all()
+    with pytest.raises(ConfigError, match="no discrete actions"):
+        simulation(load_agent("constant_velocity"), scenes, EvaluateConfig(action_temperature=0.5))
+
+
+def test_padded_scenes_have_an_edge_of_their_own() -> None:
+    small, large = crowded(row(cars(0))), crowded(crossing(4))
+    both = collate([small, large])
+    assert both.hull.shape[1] == max(small.hull.shape[1], large.hull.shape[1])
+    zero = torch.zeros(1, dtype=torch.int64)
+    for b, one in enumerate((small, large)):
+        env, alone = looking(both), looking(one)
+        states = (env.start(zero + b), alone.start(zero))
+        for _ in range(30):
+            states = tuple(
+                step_mdp(e.step(now.set(keys.ACTION, torch.full(now.get(keys.VALID).shape, 73))))
+                for e, now in zip((env, alone), states, strict=True)
+            )
+        count = one.interactive.shape[1]
+        assert torch.equal(states[0][keys.VALID][:, :count], states[1][keys.VALID])
