@@ -24,7 +24,7 @@ def nearest_points(scenes: SceneBatch, scene: Tensor, origin: Tensor, count: int
     return nearest_first(squared.masked_fill(~scenes.point_valid[scene][:, None], torch.inf), count)
 
 
-def see_points(
+def observed_points(
     scenes: SceneBatch,
     scene: Tensor,
     step: Tensor,

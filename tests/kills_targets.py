@@ -78,8 +78,8 @@ def _convert(logs: Path, out: Path) -> None:
 
 
 def _train(method: Any, store: Path, out: Path) -> None:
-    judged = ValidationConfig(data=store, segments=1, rollouts=1)
-    train(helpers_runs.tiny(method, store, out, steps=8, validation=judged, resume=True))
+    evaluated = ValidationConfig(data=store, segments=1, rollouts=1)
+    train(helpers_runs.tiny(method, store, out, steps=8, validation=evaluated, resume=True))
 
 
 def _train_by_two(store: Path, out: Path) -> None:

@@ -220,7 +220,7 @@ def test_bad_parameters_are_errors():
 
 @given(st.integers(1, 12), st.integers(0, 2**31), NOISE)
 def test_replace_bad_takes_a_goal_from_nobody_who_drives_well_with_it(branches, seed, noise):
-    """Goals are lost only with the last good branch that has them: what is judged is the driving, not the goal."""
+    """Goals are lost only with the last good branch that has them: what is evaluated is the driving, not the goal."""
     torch.manual_seed(seed)
     totals, groups = torch.randn(20, branches), torch.randint(4, (20, branches))
     parents = ReplaceBad(0.0)(totals, torch.full((20,), noise), groups)

@@ -265,13 +265,13 @@ def test_who_is_driven_is_a_matter_of_choice() -> None:
 
 
 @pytest.mark.parametrize("others", ["constant_velocity", "idm", "learned"])
-def test_others_are_driven_but_not_judged(store: SegmentStore, others: Any, tmp_path: Path) -> None:
+def test_others_are_driven_but_not_evaluated(store: SegmentStore, others: Any, tmp_path: Path) -> None:
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
     found = evaluate(tiny(), store, config)
     assert [found.metrics.segments[name].single.agents for name in store.ids] == [4] * 4
     saved = next(iter(save_simulation(tmp_path, tiny(), crowd_dataset(store, tiny(), config, [2]), config)))
     assert len(saved.agents) > 2
-    assert saved.judged.tolist() == [0, 1]
+    assert saved.evaluated.tolist() == [0, 1]
     assert set(saved.drivers[2:]) == {f"background:{others}"}
 
 

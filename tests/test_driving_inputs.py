@@ -19,7 +19,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
 from symphony.envs.observation import OBJECT_FEATURES, ObservationConfig
-from symphony.envs.points import see_lights
+from symphony.envs.points import observed_lights
 from symphony.envs.routes import ALONG_FEATURES, POINTS, SPACING, along_route
 from symphony.envs.scene import collate
 from symphony.envs.tables import Tables
@@ -170,10 +170,10 @@ def test_lights_seen_are_the_nearest_of_all(data: SceneDataset) -> None:
     heading, speed = torch.randn(len(items), 2, generator=rng), torch.rand(len(items), 2, generator=rng)
     row, step = torch.arange(len(items)), torch.zeros(len(items), dtype=torch.int64)
     tables = Tables(scenes, EVERYTHING)
-    found, mask = see_lights(tables, row, step, origin, heading, speed)
+    found, mask = observed_lights(tables, row, step, origin, heading, speed)
     # All points at once, of which those of lights are told by their state.
     wide = replace(EVERYTHING, num_lights=scenes.point.shape[1])
-    everything, known = see_lights(Tables(scenes, wide), row, step, origin, heading, speed)
+    everything, known = observed_lights(Tables(scenes, wide), row, step, origin, heading, speed)
     assert mask.all()
     for b in range(len(items)):
         lights = scenes.point[b][(scenes.point_light[b] >= 0) & scenes.point_valid[b]]

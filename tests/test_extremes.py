@@ -19,7 +19,7 @@ from symphony.config import METHODS, AgentConfig, EvaluateConfig, MGAILConfig
 from symphony.data.segment import RunSegment, validate
 from symphony.evaluation import evaluate
 
-JUDGED = ("bc", "bc_ts_h", "mgail_ts_h")
+SETTINGS = ("bc", "bc_ts_h", "mgail_ts_h")
 """One without search, and those that have every part, with either action space; others are simulated like them."""
 
 
@@ -65,7 +65,7 @@ def scenes() -> list[RunSegment]:
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method(scenes: list[RunSegment], method: str, tmp_path: Path) -> None:
     agent = learned([each for each in scenes if each.dt == 0.2], method, tmp_path)
-    if method in JUDGED:
+    if method in SETTINGS:
         assert_metrics_finite(agent, tmp_path / "store")
 
 

@@ -19,7 +19,7 @@ from symphony.envs import ObservationConfig, SceneBatch, collate, grids, scene
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.grids import GridCache
 from symphony.envs.observation import objects_at
-from symphony.envs.points import nearest_points, see_points
+from symphony.envs.points import nearest_points, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.tables import Tables
 from symphony.geometry import NO_BOUNDARY
@@ -91,10 +91,10 @@ def test_points_are_seen_as_by_the_plain_formula_with_and_without_a_gradient(sce
     step = torch.randint(60, (len(row),), generator=rng)
     tables = Tables(scenes, FEW)
     inputs = pose[..., :2].clone().requires_grad_(), pose[..., 2], pose[..., 3]
-    with_graph, mask = see_points(tables, row, step, *inputs)
-    plain, again = see_points(tables, row, step, pose[..., :2], pose[..., 2], pose[..., 3])
+    with_graph, mask = observed_points(tables, row, step, *inputs)
+    plain, again = observed_points(tables, row, step, pose[..., :2], pose[..., 2], pose[..., 3])
     chosen = oracle.nearest_points(scenes, row, where, FEW.num_points)
-    expected, exist = oracle.see_points(scenes, row, step, chosen, pose, FEW)
+    expected, exist = oracle.observed_points(scenes, row, step, chosen, pose, FEW)
     assert with_graph.requires_grad
     assert not plain.requires_grad
     assert torch.equal(mask, exist)

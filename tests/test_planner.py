@@ -1,4 +1,4 @@
-"""A planner as the ego: what it sees, that it is forked with its branches, and that its failures are counted."""
+"""A planner as the ego: what it observes, that it is forked with its branches, and that its failures are counted."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ def test_the_command_simulates_reports_and_shows(
     assert found.totals()["runs"] == 6
     assert found.totals()["failed_runs"] == 4
     assert found.agent == f"mine:Planner among {AGENT}"
-    assert main(["report", sim, "--judged", "ego"]) == 0
+    assert main(["report", sim, "--evaluated", "ego"]) == 0
     assert json.loads((Path(sim) / "report.json").read_text())["failed_runs"] == 4
     assert main(["view", sim]) == 0
     assert "mine:Planner" in (Path(sim) / "view.html").read_text()

@@ -176,8 +176,8 @@ def test_a_known_profile_has_its_acceleration_jerk_and_lateral_acceleration() ->
     assert rows(turning)[0]["max_jerk"] == 0
 
 
-def rows(saved: SavedRollouts, judged: Any = "interactive") -> list[dict[str, Any]]:
-    found = Report("made", judged)
+def rows(saved: SavedRollouts, evaluated: Any = "interactive") -> list[dict[str, Any]]:
+    found = Report("made", evaluated)
     add_segment(found, saved)
     return found.rows
 
@@ -285,7 +285,7 @@ def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     assert totals["max_jerk"] == pytest.approx(0, abs=1e-3)
 
 
-def test_the_ego_alone_is_judged_on_request() -> None:
+def test_the_ego_alone_is_evaluated_on_request() -> None:
     segment = driving((-30, LANE_WIDTH, 0, 5), (0, 0, 0, 12), (10, 0, 0, 7))
     saved = played(segment, [0, 1])
     assert rows(saved)[0]["collision"]

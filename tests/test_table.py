@@ -317,7 +317,7 @@ def test_settings_tell_runs_apart(tmp_path: Path) -> None:
     assert any("not evaluated" in reason for reason in collect([tmp_path / "runs"], "main")[1])
 
 
-def test_runs_judged_in_another_setting_than_their_own_do_not_count(tmp_path: Path) -> None:
+def test_runs_evaluated_in_another_setting_than_their_own_do_not_count(tmp_path: Path) -> None:
     run = make_run(tmp_path / "bc", "bc", 0, make_record(interactive=8), make_record(duration=20))
     assert collect([run], "main")[0] == []
     keep_evaluation(str(run), make_record(duration=10))
@@ -462,8 +462,8 @@ def test_names_are_file_names_whatever_the_store_is_called(store: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A tiny run, and a store to judge it on."""
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A tiny run, and a store to evaluate it on."""
     folder = tmp_path_factory.mktemp("table")
     with StoreWriter(folder / "test") as writer:
         writer.append(straight_road(4, seed=1, steps=12))
@@ -482,10 +482,10 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
-    judged: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    evaluated: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, store = tmp_path / "bc", judged[1]
-    shutil.copytree(judged[0], run)
+    run, store = tmp_path / "bc", evaluated[1]
+    shutil.copytree(evaluated[0], run)
     file = tmp_path / "numbers.json"
     command = ["evaluate", str(run), "--data", str(store), "--rollouts", "2"]
     assert main([*command, "--no-keep", "--json", str(file)]) == 0
@@ -534,11 +534,11 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
 
 
 def test_baselines_leave_nothing_behind(
-    judged: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    evaluated: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("playback", "constant_velocity"):
-        assert main(["evaluate", name, "--data", str(judged[1]), "--rollouts", "1"]) == 0
+        assert main(["evaluate", name, "--data", str(evaluated[1]), "--rollouts", "1"]) == 0
     assert not list(tmp_path.iterdir())
 
 

@@ -66,7 +66,7 @@ POINTS: Key = ("agents", "observation", "points")
 """[..., N, P, Fp] float."""
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
 ROUTE: Key = ("agents", "observation", "route")
-"""[..., N, Fr] float: the agent's route as it sees it."""
+"""[..., N, Fr] float: the agent's route as it observes it."""
 GAP: Key = ("agents", "observation", "gap")
 """[..., N, O] float: signed gap to the box of each object, metres."""
 GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")
@@ -82,7 +82,7 @@ ROAD: Key = ("agents", "observation", "road")
 """[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
 
 ROUTES: Key = ("agents", "routes")
-"""[..., N, G, Fg] float: every feasible route, as the goal policy sees it."""
+"""[..., N, G, Fg] float: every feasible route, as the goal policy observes it."""
 ROUTES_MASK: Key = ("agents", "routes_mask")
 GOAL_LOGITS: Key = ("agents", "goal_logits")
 """[..., N, G] float."""

@@ -39,7 +39,7 @@ class Evaluate:
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File to write all numbers to, those of every run segment included; - for standard output."""
     planner: str = ""
-    """Judge a planner as the ego instead, among agents that the agent drives (among the log with `playback`): see
+    """Evaluate a planner as the ego instead, among agents that the agent drives (among the log with `playback`): see
     `symphony simulate`. Its numbers are those of `symphony planners`; no folder of a run is touched."""
     planner_seconds: float = 60.0
     """That it has for one answer; more fails the run."""
@@ -74,7 +74,7 @@ class Evaluate:
     def run(self) -> None:
         """Evaluate, print the numbers and write them."""
         if self.planner:
-            self._judge_planner()
+            self._evaluate_planner()
             return
         from symphony.agents import load_agent
         from symphony.cli.plot import segment_index
@@ -169,7 +169,7 @@ class Evaluate:
         print_wosac(found)
         return wosac_parts(found, record)
 
-    def _judge_planner(self) -> None:
+    def _evaluate_planner(self) -> None:
         from tempfile import TemporaryDirectory
 
         from symphony.cli.planners import table_text

@@ -40,7 +40,7 @@ class Planners:
             raise ConfigError("no rollouts and no records given")
 
     def run(self) -> None:
-        """Judge what is not judged yet, and write the table."""
+        """Evaluate what is not evaluated yet, and write the table."""
         from symphony.evaluation.planners import planner_record, read_planner_record
         from symphony.files import write_file
         from symphony.simulation.saved_files import load_rollouts

@@ -1,4 +1,4 @@
-"""Judge saved rollouts one by one."""
+"""Evaluate saved rollouts one by one."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Report:
     """Folder of saved rollouts."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Where the report goes; by default the same folder."""
-    judged: Literal["interactive", "ego"] = "interactive"
-    """Which of the driven agents are judged: all, or only the ego."""
+    evaluated: Literal["interactive", "ego"] = "interactive"
+    """Which of the driven agents are evaluated: all, or only the ego."""
     view: bool = True
     """Leave the page that plays the rollouts unwritten."""
 
     def run(self) -> None:
-        """Judge, write, and print the totals."""
+        """Evaluate, write, and print the totals."""
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
         from rich.table import Table
@@ -47,9 +47,9 @@ class Report:
             TextColumn("segments"),
         )
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task("Judging", total=len(folder))
+            task = bar.add_task("Evaluating", total=len(folder))
             found = report(
-                folder, self.judged, lambda done, total: bar.update(task, completed=done, total=total)
+                folder, self.evaluated, lambda done, total: bar.update(task, completed=done, total=total)
             )
         plain = found.plain()
         with naming(out):

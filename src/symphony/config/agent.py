@@ -1,4 +1,4 @@
-"""What an agent is: what it sees, how large its networks are, how it is simulated."""
+"""What an agent is: what it observes, how large its networks are, how it is simulated."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ AGGREGATES = ("max_then_sum", "mean_then_sum")
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig:
-    """What an agent sees and how large its networks are."""
+    """What an agent observes and how large its networks are."""
 
     interactive: Annotated[int, arg(aliases=("--interactive",))] = 2
     """Interactive agents per run segment (the paper uses 2 and 8)."""
     num_objects: int = 16
-    """Nearest other agents it sees."""
+    """Nearest other agents it observes."""
     num_points: int = 200
-    """Nearest map and light points it sees (the paper: 1 000)."""
+    """Nearest map and light points it observes (the paper: 1 000)."""
     num_lights: int = 0
     """Nearest lights it sees beside the points, as a group of their own, however far they are (the paper: none)."""
     features: Literal["paper", "gaps"] = "paper"
@@ -57,13 +57,13 @@ class AgentConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DiscriminatorConfig:
-    """The network that judges realism, and how it learns."""
+    """The network that scores realism, and how it learns."""
 
     features: Features = "clearance"
     """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge;
     `foresight`: also the gaps within the next 2 s, were everyone to keep speed and course."""
     radius: float = 20.0
-    """Metres around an agent that it sees."""
+    """Metres around an agent that it observes."""
     hidden: int = 32
     """Width of its encoders."""
     head: int = 64
@@ -77,7 +77,7 @@ class DiscriminatorConfig:
     gradient_penalty: float = 0.0
     """Weight of the squared gradient at logged states (0: none)."""
     instance_noise: float = 0.0
-    """Standard deviation of noise on what it sees in training (0: none)."""
+    """Standard deviation of noise on what it observes in training (0: none)."""
 
     def __post_init__(self) -> None:
         one_of(self, "features", get_args(Features))
@@ -155,8 +155,8 @@ class AgentSpec:
         dt: seconds per step it learned.
         duration: seconds of a segment it learned from; 0 for all.
         goals: whether it follows routes.
-        agent: what it sees and how large it is.
-        discriminator: of its judge; None without one.
+        agent: what it observes and how large it is.
+        discriminator: of its discriminator; None without one.
         searches: whether it is meant to be simulated with search.
         search: how.
     """

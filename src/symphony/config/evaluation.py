@@ -76,7 +76,7 @@ class EvaluateConfig:
     the same ones are driven from the first step to the last."""
     others: Others = "log"
     """What drives the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
-    log) or the agent itself (`learned`). Nobody judges them; traffic is open for all but the log."""
+    log) or the agent itself (`learned`). Nobody evaluates them; traffic is open for all but the log."""
     metric: tuple[str, ...] = ()
     """Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout."""
     batch: int = 16

@@ -1,4 +1,4 @@
-"""What an agent sees (paper, section IV-C): nearest objects and nearest map and light points, in its own frame.
+"""What an agent observes (paper, section IV-C): nearest objects and nearest map and light points, in its own frame.
 
 Shapes: M rows (any flattened batch), N observing agents, A agents of the scene, O objects, P points.
 """
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.points import see_lights, see_points
+from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.routes import along_route, route_ahead
 from symphony.envs.scene import SceneBatch
@@ -41,7 +41,7 @@ OBJECT_FEATURES = 8 + AGENT_FEATURES
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """How much an agent sees and how it is scaled to numbers near one.
+    """How much an agent observes and how it is scaled to numbers near one.
 
     What is not asked for is neither computed nor an entry of a step: simulation without observation costs a fraction.
 
@@ -52,13 +52,13 @@ class ObservationConfig:
         speed_scale: m/s that become 1.
         size_scale: metres of a box side that become 1.
         num_lights: nearest lights seen beside the points, as a group of their own; 0 for none.
-        route: whether it sees the route that is its goal.
-        along: whether it sees where the objects are along that route.
-        gaps: whether it sees how far its box is from others.
-        clearance: whether it sees how far its box is from others and from the edge of the road.
-        foresight: seconds ahead at which it also sees how far it would be from others, were everyone to keep
+        route: whether it observes the route that is its goal.
+        along: whether it observes where the objects are along that route.
+        gaps: whether it observes how far its box is from others.
+        clearance: whether it observes how far its box is from others and from the edge of the road.
+        foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
             speed and course; with ``gaps`` or ``clearance`` only.
-        own: whether it sees its own speed and size.
+        own: whether it observes its own speed and size.
     """
 
     num_objects: int = 16
@@ -208,11 +208,11 @@ def observe(
         )
     seen = _Seen()
     if config.num_objects:
-        seen = _see_objects(tables, scene, objects, index, own, own_size, routes)
+        seen = _observed_objects(tables, scene, objects, index, own, own_size, routes)
     if config.num_points:
-        points, points_mask = see_points(tables, scene, step, origin, heading, speed)
+        points, points_mask = observed_points(tables, scene, step, origin, heading, speed)
     if config.num_lights:
-        lights, lights_mask = see_lights(tables, scene, step, origin, heading, speed)
+        lights, lights_mask = observed_lights(tables, scene, step, origin, heading, speed)
     if config.route and routes is not None:
         pose = torch.cat([own[..., :3], speed[..., None]], -1)
         route = route_ahead(pose, *routes, config.distance_scale)
@@ -243,7 +243,7 @@ class _Seen(NamedTuple):
     along: Tensor | None = None
 
 
-def _see_objects(
+def _observed_objects(
     tables: Tables,
     scene: Tensor,
     objects: Objects,

@@ -20,7 +20,7 @@ _DISTANCES = 1 << 16
 """Distances held at a time."""
 
 
-def see_points(
+def observed_points(
     tables: Tables,
     scene: Int[Tensor, " M"],
     step: Int[Tensor, " M"],
@@ -37,7 +37,7 @@ def see_points(
         return _features_in_place(tables, scene, step, flat, mask, origin, heading, speed), mask
 
 
-def see_lights(
+def observed_lights(
     tables: Tables,
     scene: Int[Tensor, " M"],
     step: Int[Tensor, " M"],

@@ -81,7 +81,7 @@ class SceneBatch(TensorClass):
         interactive: [B, N] int64 rows of A; 0 for padding.
         interactive_valid: [B, N].
         enter: [B, N] int64 step at which the log brings an interactive agent in; 0 for those there from the start.
-        background: [B, N] agents that a rule drives, which nobody judges.
+        background: [B, N] agents that a rule drives, which nobody evaluates.
         exits: [B, X, 4] where agents leave the map, see :class:`symphony.envs.edge.MapEdge`; zeros for padding.
             None, nor any hull, where the same agents are driven from the first step to the last.
         hull: [B, H, 3] outline of the map, likewise.

@@ -3,7 +3,7 @@
 Whose fault follows the sense of nuPlan's metric of at-fault collisions (https://github.com/motional/nuplan-devkit):
 an agent answers for what it drives into, not for being driven into. Of each pair the first contact counts.
 
-Metres, radians, seconds. Legend: A agents, U states of a rollout, M judged agents, E contacts.
+Metres, radians, seconds. Legend: A agents, U states of a rollout, M evaluated agents, E contacts.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _PAIRS = 1 << 20
 
 
 class Contacts(NamedTuple):
-    """The first contact of judged agents with each other agent, all [E], by step, then agent.
+    """The first contact of evaluated agents with each other agent, all [E], by step, then agent.
 
     Attributes:
         agent: row of A.
@@ -59,8 +59,8 @@ class Contacts(NamedTuple):
     fault: Bools
 
 
-def contacts(world: World, judged: Indices, graph: LaneGraph, road: RoadMap, offroad: Bools) -> Contacts:
-    """Collisions of the judged agents [M] of one rollout.
+def contacts(world: World, evaluated: Indices, graph: LaneGraph, road: RoadMap, offroad: Bools) -> Contacts:
+    """Collisions of the evaluated agents [M] of one rollout.
 
     At fault is an agent that was moving at the contact and
 
@@ -74,12 +74,12 @@ def contacts(world: World, judged: Indices, graph: LaneGraph, road: RoadMap, off
 
     Args:
         world: everyone.
-        judged: [M] rows of A.
+        evaluated: [M] rows of A.
         graph: the lanes.
         road: they are of.
-        offroad: [A, U] whether an agent is off the road; read for judged agents only.
+        offroad: [A, U] whether an agent is off the road; read for evaluated agents only.
     """
-    found = [_first_overlaps(world, part) for part in _blocks(world, judged)]
+    found = [_first_overlaps(world, part) for part in _blocks(world, evaluated)]
     agent, other, step = (np.concatenate(parts) for parts in zip(*found, strict=True))
     order = np.lexsort((other, agent, step))
     agent, other, step = agent[order], other[order], step[order]
@@ -100,16 +100,16 @@ def contacts(world: World, judged: Indices, graph: LaneGraph, road: RoadMap, off
     return Contacts(agent, other, step, kind, fault)
 
 
-def _first_overlaps(world: World, judged: Indices) -> tuple[Indices, Indices, Indices]:
+def _first_overlaps(world: World, evaluated: Indices) -> tuple[Indices, Indices, Indices]:
     """Agent, other and state [E] of the first overlap of each pair, from the second state on."""
     radius = 0.5 * np.linalg.norm(world.size, axis=-1)
-    reach = radius[judged, None] + radius[None] + _SLACK
+    reach = radius[evaluated, None] + radius[None] + _SLACK
     valid, position = world.valid[:, 1:], world.position[:, 1:]
-    x, y = _pairs(position[..., 0], judged), _pairs(position[..., 1], judged)
+    x, y = _pairs(position[..., 0], evaluated), _pairs(position[..., 1], evaluated)
     near = x * x + y * y <= (reach**2)[..., None]
-    near &= valid[judged, None] & valid[None] & (judged[:, None] != np.arange(len(radius)))[..., None]
+    near &= valid[evaluated, None] & valid[None] & (evaluated[:, None] != np.arange(len(radius)))[..., None]
     who, other, step = near.nonzero()
-    agent = judged[who]
+    agent = evaluated[who]
     one, two = (_boxes(world, row, step + 1) for row in (agent, other))
     hit = boxes_overlap(*one, *two).numpy()
     agent, other, step = agent[hit], other[hit], step[hit] + 1
@@ -177,43 +177,43 @@ def lane_widths(road: RoadMap) -> Reals:
     return np.where(np.isnan(road.lane_width), nominal, road.lane_width).astype(np.float64)
 
 
-def time_to_collision(world: World, judged: Indices) -> Reals:
-    """Seconds [M, U] until a judged agent would first overlap one that is not behind it, if both went on as they do.
+def time_to_collision(world: World, evaluated: Indices) -> Reals:
+    """Seconds [M, U] until an evaluated agent would first overlap one that is not behind it, if both go on so.
 
     Everyone keeps velocity and heading. Infinite if that is more than :data:`HORIZON` away, or the agent has stopped
     or is not there.
     """
-    return np.concatenate([_time_to_collision(world, part) for part in _blocks(world, judged)])
+    return np.concatenate([_time_to_collision(world, part) for part in _blocks(world, evaluated)])
 
 
-def _blocks(world: World, judged: Indices) -> list[Indices]:
-    """Parts of the judged agents whose pairs with everyone fit into memory."""
+def _blocks(world: World, evaluated: Indices) -> list[Indices]:
+    """Parts of the evaluated agents whose pairs with everyone fit into memory."""
     size = max(1, _PAIRS // max(world.valid.size, 1))
-    return [judged[k : k + size] for k in range(0, max(len(judged), 1), size)]
+    return [evaluated[k : k + size] for k in range(0, max(len(evaluated), 1), size)]
 
 
-def _pairs(values: Reals, judged: Indices) -> Reals:
-    """[M, A, U] how much more everyone has than the judged agents; by component, which is many times faster."""
-    return values[None] - values[judged, None]
+def _pairs(values: Reals, evaluated: Indices) -> Reals:
+    """[M, A, U] how much more everyone has than the evaluated agents; by component, which is many times faster."""
+    return values[None] - values[evaluated, None]
 
 
-def _time_to_collision(world: World, judged: Indices) -> Reals:
+def _time_to_collision(world: World, evaluated: Indices) -> Reals:
     radius = 0.5 * np.linalg.norm(world.size, axis=-1)
-    x, y = _pairs(world.position[..., 0], judged), _pairs(world.position[..., 1], judged)
-    u, v = _pairs(world.velocity[..., 0], judged), _pairs(world.velocity[..., 1], judged)
-    heading = world.heading[judged, None]
+    x, y = _pairs(world.position[..., 0], evaluated), _pairs(world.position[..., 1], evaluated)
+    u, v = _pairs(world.velocity[..., 0], evaluated), _pairs(world.velocity[..., 1], evaluated)
+    heading = world.heading[evaluated, None]
     near = x * np.cos(heading) + y * np.sin(heading) > 0
-    moving = np.linalg.norm(world.velocity[judged], axis=-1) > STILL
-    near &= (moving & world.valid[judged])[:, None] & world.valid[None]
-    near &= (judged[:, None] != np.arange(len(radius)))[..., None]
+    moving = np.linalg.norm(world.velocity[evaluated], axis=-1) > STILL
+    near &= (moving & world.valid[evaluated])[:, None] & world.valid[None]
+    near &= (evaluated[:, None] != np.arange(len(radius)))[..., None]
     # Boxes can only meet where the circles around them do, which are nearest to each other at this time.
     soonest = np.clip(-(x * u + y * v) / np.maximum(u * u + v * v, 1e-12), 0, HORIZON)
-    reach = (radius[judged, None] + radius[None] + _SLACK)[..., None]
+    reach = (radius[evaluated, None] + radius[None] + _SLACK)[..., None]
     near &= (x + soonest * u) ** 2 + (y + soonest * v) ** 2 <= reach * reach
     away, gain = np.stack([x[near], y[near]], -1), np.stack([u[near], v[near]], -1)
     who, other, step = near.nonzero()
-    found = _meeting(away, gain, world, judged[who], other, step)
-    best = np.full((len(judged), world.valid.shape[1]), math.inf)
+    found = _meeting(away, gain, world, evaluated[who], other, step)
+    best = np.full((len(evaluated), world.valid.shape[1]), math.inf)
     np.minimum.at(best, (who, step), found)
     return np.where(best <= HORIZON, best, math.inf)
 

@@ -1,6 +1,6 @@
 """How single rollouts drive: red lights, wrong way, progress, comfort, distance to the log.
 
-Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M judged agents, Q lights.
+Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M evaluated agents, Q lights.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Lights(NamedTuple):
     light: Indices
 
 
-def red_lights(world: World, judged: Indices, segment: RunSegment, start: int) -> Lights:
-    """Red lights that the judged agents [M] of one rollout ran.
+def red_lights(world: World, evaluated: Indices, segment: RunSegment, start: int) -> Lights:
+    """Red lights that the evaluated agents [M] of one rollout ran.
 
     An agent runs a light if its front crosses the stop point in the direction of the lane, within the lane's width,
     while the light is red (a plain or arrow stop, not a flashing one), and it follows that lane: of the lanes whose
@@ -48,7 +48,7 @@ def red_lights(world: World, judged: Indices, segment: RunSegment, start: int) -
 
     Args:
         world: everyone.
-        judged: [M] rows of A.
+        evaluated: [M] rows of A.
         segment: the lights, with their states in all steps of the log.
         start: step of the log at which the first state lies.
     """
@@ -59,9 +59,9 @@ def red_lights(world: World, judged: Indices, segment: RunSegment, start: int) -
     stop = segment.signal_point[:, :2].astype(np.float64)
     lines = [shapely.LineString(line) if ok else None for line, ok in zip(lanes, usable, strict=True)]
     direction = np.stack([_direction(line, point) for line, point in zip(lines, stop, strict=True)])
-    heading = world.heading[judged]
+    heading = world.heading[evaluated]
     forward = np.stack([np.cos(heading), np.sin(heading)], -1)
-    front = world.position[judged] + 0.5 * world.size[judged, 0, None, None] * forward
+    front = world.position[evaluated] + 0.5 * world.size[evaluated, 0, None, None] * forward
     # [M, U, Q] how far each front is past each stop point, and beside it.
     away = front[:, :, None] - stop
     along = (away * direction).sum(-1)
@@ -69,15 +69,15 @@ def red_lights(world: World, judged: Indices, segment: RunSegment, start: int) -
     beside = np.abs(across[:, 1:]) <= 0.5 * lane_widths(segment.road)[segment.signal_lane]
     passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < 15) & beside & usable
     same = (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
-    passing &= same & (world.valid[judged, 1:] & world.valid[judged, :-1])[..., None]
+    passing &= same & (world.valid[evaluated, 1:] & world.valid[evaluated, :-1])[..., None]
     who, step = passing.any(-1).nonzero()
     found = []
     # There are few crossings.
     for m, t in zip(who.tolist(), step.tolist(), strict=True):
-        light = _followed(world, int(judged[m]), t + 1, passing[m, t].nonzero()[0], lines, stop)
+        light = _followed(world, int(evaluated[m]), t + 1, passing[m, t].nonzero()[0], lines, stop)
         # One that changes just then is not held against the agent.
         if light >= 0 and np.isin(segment.signal_state[light, start + t : start + t + 2], RED).all():
-            found.append((int(judged[m]), t + 1, light))
+            found.append((int(evaluated[m]), t + 1, light))
     return Lights(*np.array(found, np.int64).reshape(-1, 3).T)
 
 
@@ -110,10 +110,10 @@ def _followed(
     return best
 
 
-def wrong_way(world: World, judged: Indices, graph: LaneGraph) -> Bools:
-    """[M, U] whether a judged agent drives in a lane that leads the other way, and in none that leads its way."""
-    seen = world.valid[judged] & (np.abs(world.speed[judged]) > STANDING)
-    position, heading = world.position[judged][seen], world.heading[judged][seen]
+def wrong_way(world: World, evaluated: Indices, graph: LaneGraph) -> Bools:
+    """[M, U] whether an evaluated agent drives in a lane that leads the other way, and in none that leads its way."""
+    seen = world.valid[evaluated] & (np.abs(world.speed[evaluated]) > STANDING)
+    position, heading = world.position[evaluated][seen], world.heading[evaluated][seen]
     near = graph.index.near(position, IN_LANE)
     turn = np.abs((near.heading - heading[near.point] + np.pi) % (2 * np.pi) - np.pi)
     wrong, right = np.zeros((2, len(position)), bool)
@@ -125,24 +125,24 @@ def wrong_way(world: World, judged: Indices, graph: LaneGraph) -> Bools:
 
 
 class Progress(NamedTuple):
-    """Metres [K, M] that judged agents got on, and that the log got on likewise."""
+    """Metres [K, M] that evaluated agents got on, and that the log got on likewise."""
 
     driven: Reals
     logged: Reals
 
 
-def progress(saved: SavedRollouts, judged: Indices) -> Progress:
-    """How far judged agents (numbers [M] of the driven ones) got on.
+def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
+    """How far evaluated agents (numbers [M] of the driven ones) got on.
 
     Along the route that an agent follows, from the place on it nearest to its first state to that nearest to its last
     one; without a route, the length of its path.
     """
-    rows, within = saved.agents[judged], slice(saved.start, saved.last + 1)
-    there = saved.there[..., judged].swapaxes(1, 2)
-    path = saved.state[:, :, judged, :2].swapaxes(1, 2).astype(np.float64)
+    rows, within = saved.agents[evaluated], slice(saved.start, saved.last + 1)
+    there = saved.there[..., evaluated].swapaxes(1, 2)
+    path = saved.state[:, :, evaluated, :2].swapaxes(1, 2).astype(np.float64)
     log = saved.segment.position[rows, within, :2].astype(np.float64)
     seen = saved.segment.valid[rows, within]
-    goal = saved.goal[:, judged]
+    goal = saved.goal[:, evaluated]
     counts = np.diff(saved.routes.offsets)
     lines = [
         shapely.LineString(saved.routes[k][:, :2]) if counts[k] > 1 else None
@@ -152,7 +152,7 @@ def progress(saved: SavedRollouts, judged: Indices) -> Progress:
     has = np.array([*(line is not None for line in lines), False])[goal]
     driven, logged = _length(path, there), np.broadcast_to(_length(log, seen), goal.shape).copy()
     driven[has] = _advance(along[has], path[has], there[has])
-    number = np.broadcast_to(np.arange(len(judged)), goal.shape)[has]
+    number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)[has]
     logged[has] = _advance(along[has], log[number], seen[number])
     return Progress(driven, logged)
 
@@ -172,17 +172,17 @@ def _advance(lines: NDArray[np.object_], path: Reals, valid: Bools) -> Reals:
 
 
 class Comfort(NamedTuple):
-    """Motion of judged agents [K, T, M]; NaN where it is not known: m/s^2, m/s^3, m/s^2."""
+    """Motion of evaluated agents [K, T, M]; NaN where it is not known: m/s^2, m/s^3, m/s^2."""
 
     acceleration: Reals
     jerk: Reals
     lateral: Reals
 
 
-def comfort(saved: SavedRollouts, judged: Indices) -> Comfort:
+def comfort(saved: SavedRollouts, evaluated: Indices) -> Comfort:
     """Differences of speed, of acceleration, and speed times yaw rate, over one step each, not smoothed."""
-    state, dt = saved.state[:, :, judged].astype(np.float64), saved.segment.dt
-    state = np.where(saved.there[:, :, judged][..., None], state, np.nan)
+    state, dt = saved.state[:, :, evaluated].astype(np.float64), saved.segment.dt
+    state = np.where(saved.there[:, :, evaluated][..., None], state, np.nan)
     speed, heading = state[..., 3], state[..., 2]
     acceleration = np.diff(speed, axis=1) / dt
     turn = (np.diff(heading, axis=1) + np.pi) % (2 * np.pi) - np.pi
@@ -190,10 +190,10 @@ def comfort(saved: SavedRollouts, judged: Indices) -> Comfort:
     return Comfort(acceleration, jerk, 0.5 * (speed[:, 1:] + speed[:, :-1]) * turn / dt)
 
 
-def log_distance(saved: SavedRollouts, judged: Indices) -> tuple[Reals, Indices]:
+def log_distance(saved: SavedRollouts, evaluated: Indices) -> tuple[Reals, Indices]:
     """Metres from the log, summed over the steps at which there is one, and their number: both [K]."""
-    rows, within = saved.agents[judged], slice(saved.start + 1, saved.last + 1)
+    rows, within = saved.agents[evaluated], slice(saved.start + 1, saved.last + 1)
     log = saved.segment.position[rows, within, :2].swapaxes(0, 1)
-    both = saved.counted[:, :, judged] & saved.segment.valid[rows, within].T
-    away = np.linalg.norm(saved.state[:, 1:, judged, :2].astype(np.float64) - log, axis=-1)
+    both = saved.counted[:, :, evaluated] & saved.segment.valid[rows, within].T
+    away = np.linalg.norm(saved.state[:, 1:, evaluated, :2].astype(np.float64) - log, axis=-1)
     return np.where(both, away, 0.0).sum((1, 2)), both.sum((1, 2))

@@ -264,11 +264,11 @@ def _add(
 ) -> None:
     """Add the rollouts of some run segments to what was found."""
     rollouts, (log, log_valid) = found.rollouts, logged(scenes)
-    judged = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
+    evaluated = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
     exists = _there(scenes, rollouts, log_valid if evaluation.search == "log" else None)
-    both = judged._replace(counted=judged.counted & log_valid[:, None, 1:])
-    judged_log = log_valid & ~scenes.background[:, None]
-    standing = standing_at_end(rollouts.state, log, judged_log, scenes.last_step)
+    both = evaluated._replace(counted=evaluated.counted & log_valid[:, None, 1:])
+    evaluated_log = log_valid & ~scenes.background[:, None]
+    standing = standing_at_end(rollouts.state, log, evaluated_log, scenes.last_step)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     for path, metric in own.items():
         values = metric(scenes, rollouts)
@@ -276,16 +276,16 @@ def _add(
             shape = tuple(rollouts.state.shape[:2])
             raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")
         evaluation.own.setdefault(path, []).extend(values.double().nanmean(-1).tolist())
-    kinds = _kinds(scenes, judged, exists)
+    kinds = _kinds(scenes, evaluated, exists)
     single = AgentSteps(
-        judged.counted.transpose(2, 3),
+        evaluated.counted.transpose(2, 3),
         log_valid[:, 1:].transpose(1, 2),
         rollouts.offroad.transpose(2, 3),
         _kinds(scenes, both, exists),
         rollouts.state[..., 1:, :, 3].transpose(2, 3),
         log[:, 1:, :, 3].transpose(1, 2),
     )
-    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, judged.counted, log, log_valid))
+    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, evaluated.counted, log, log_valid))
     regions, regions_log = [], []
     for b, item in enumerate(items):
         graph = dataset.graph(item)

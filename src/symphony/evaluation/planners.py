@@ -60,7 +60,7 @@ def planner_record(folder: RolloutFolder) -> Record:
     Returns:
         ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
         ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
-        judged; ``score``, the mean of :func:`run_score`, and ``score_se``; ``search``, what :func:`selection` says,
+        evaluated; ``score``, the mean of :func:`run_score`, and ``score_se``; ``search``, what :func:`selection` says,
         None where no search was kept; ``per_run``.
 
     Raises:
@@ -95,7 +95,7 @@ def _store_name(store: Any) -> str:
 
 
 def selection(found: Iterable[SavedRollouts]) -> Record | None:
-    """Whether searches flatter the ego, which they don't judge: how often it begins to collide, per 100 steps without
+    """Whether searches flatter the ego, which they don't score: how often it begins to collide, per 100 steps without
     a collision, in all that was ``simulated`` and in what was ``kept`` (the leaves); None without any search.
     """
     counts = sum((_begun(saved) for saved in found), np.zeros((2, 2)))

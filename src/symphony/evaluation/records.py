@@ -1,6 +1,6 @@
 """Evaluations of runs on disk: each run keeps its own, as ``RUN/evaluations/<name>.json``.
 
-The name says how the run was judged, so that the same evaluation made again takes the place of the earlier one and
+The name says how the run was evaluated, so that the same evaluation made again takes the place of the earlier one and
 different ones lie side by side.
 """
 
@@ -57,7 +57,7 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
     Returns:
         The numbers of ``result`` themselves; ``playback`` and ``constant_velocity``: those of baselines; ``cost``:
         seconds of CPU time for ``simulation``, all rollouts of all segments together; ``run``: ``method``, ``seed``,
-        ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was judged and whether
+        ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether
         that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
         store; ``config``: the settings of the evaluation, with what was left to the agent filled
         in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and ``parts``,

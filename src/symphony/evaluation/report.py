@@ -27,7 +27,7 @@ from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_files import RolloutFolder
 from symphony.simulation.world import world_of
 
-Judged = Literal["interactive", "ego"]
+Evaluated = Literal["interactive", "ego"]
 Row = dict[str, Any]
 
 LOW_TTC = 1.0
@@ -52,12 +52,12 @@ class Report:
         rows: one for each run, in the order of segments and rollouts.
         collisions: how many there were, by kind, type of the other, fault, and whether the other played back the log.
         events: of each segment, to be marked in its replay.
-        judged: which driven agents: all interactive ones, or the ego.
-        agent: name of what was judged.
+        evaluated: which driven agents: all interactive ones, or the ego.
+        agent: name of what was evaluated.
     """
 
     agent: str
-    judged: Judged
+    evaluated: Evaluated
     rows: list[Row] = field(default_factory=list)
     collisions: Counter[tuple[str, str, bool, bool]] = field(default_factory=Counter)
     events: dict[str, list[Event]] = field(default_factory=dict)
@@ -89,7 +89,7 @@ class Report:
         units = {"rates and times": "percent", "lengths": "m", "durations": "s", "motion": "m/s^2, m/s^3"}
         return {
             "agent": self.agent,
-            "judged": self.judged,
+            "evaluated": self.evaluated,
             "units": units,
             **self.totals(),
             "collisions": self.breakdown(),
@@ -111,20 +111,20 @@ class Report:
 
 def report(
     folder: RolloutFolder,
-    judged: Judged = "interactive",
+    evaluated: Evaluated = "interactive",
     progress_bar: Callable[[int, int], None] | None = None,
 ) -> Report:
-    """Judge all rollouts of a folder.
+    """Evaluate all rollouts of a folder.
 
     Args:
         folder: the rollouts.
-        judged: which of the driven agents.
+        evaluated: which of the driven agents.
         progress_bar: called with the segments done and their total.
 
     Raises:
-        DataError: a segment can't be read, or its ego was not driven but is to be judged.
+        DataError: a segment can't be read, or its ego was not driven but is to be evaluated.
     """
-    found = Report(folder.about.agent, judged)
+    found = Report(folder.about.agent, evaluated)
     for number, saved in enumerate(folder):
         add_segment(found, saved)
         if progress_bar is not None:
@@ -137,10 +137,10 @@ def report(
 
 
 def add_segment(found: Report, saved: SavedRollouts) -> None:
-    """Judge the rollouts of one segment and add them to a report."""
+    """Evaluate the rollouts of one segment and add them to a report."""
     segment = saved.segment
-    who = saved.judged
-    if found.judged == "ego":
+    who = saved.evaluated
+    if found.evaluated == "ego":
         who = np.flatnonzero(saved.agents == segment.ego)
         if not len(who):
             raise DataError("the ego was not driven", segment=segment.segment_id, field="agents")
@@ -295,7 +295,7 @@ def total_numbers(rows: Sequence[Row]) -> Row:
         ``runs`` (failed ones included), ``failed_runs``, ``segments`` and ``groups``; over the runs that did not fail
         the means, each with its standard error over groups under ``*_se`` (None for a single group); the largest
         ``max_*`` and the smallest ``min_ttc``. ``collision_rate``, ``at_fault_collision_rate`` and ``red_light_rate``
-        are percent of runs, ``*_time`` percent of the judged agents' time, ``log_distance`` is a mean over steps.
+        are percent of runs, ``*_time`` percent of the evaluated agents' time, ``log_distance`` is a mean over steps.
     """
     good = [row for row in rows if not row["failed"]]
     out: Row = {

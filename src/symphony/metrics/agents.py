@@ -28,7 +28,7 @@ class AgentSteps(NamedTuple):
     """What agents did.
 
     Attributes:
-        there: [B, K, N, T] where they are driven and judged.
+        there: [B, K, N, T] where they are driven and evaluated.
         logged: [B, N, T] where the log has them.
         offroad: [B, K, N, T].
         kinds: [B, K, N] of their first collisions among the steps that are both.

@@ -48,7 +48,7 @@ def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> s
     """One self-contained page.
 
     Args:
-        found: ``agent``, ``judged``, the totals, ``collisions`` and ``per_run``, as the report writes them.
+        found: ``agent``, ``evaluated``, the totals, ``collisions`` and ``per_run``, as the report writes them.
         viewer: address of the page that plays the rollouts, relative to this one; None for none.
     """
     runs = found["per_run"]
@@ -66,12 +66,12 @@ def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> s
 
 
 def _head(found: Mapping[str, Any]) -> str:
-    who = "the ego" if found["judged"] == "ego" else "all interactive agents"
+    who = "the ego" if found["evaluated"] == "ego" else "all interactive agents"
     failed = found["failed_runs"]
     lost = f', <b class="bad">{failed} failed</b>' if failed else ""
     return (
         f"<h1>{escape(found['agent'])}</h1><p>{found['runs']} runs of {found['segments']} segments{lost}; "
-        f"judged: {who}. ± is the standard error over {found['groups']} groups.</p>"
+        f"evaluated: {who}. ± is the standard error over {found['groups']} groups.</p>"
     )
 
 

@@ -1,4 +1,4 @@
-"""Background traffic: vehicles that nobody judges, driven by a rule, all rollouts at a time.
+"""Background traffic: vehicles that nobody evaluates, driven by a rule, all rollouts at a time.
 
 Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout.
 """

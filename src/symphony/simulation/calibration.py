@@ -25,7 +25,7 @@ def logged_totals(
     The log is taken as fitted to the action space, and agents that follow routes follow those they took.
 
     Args:
-        agent: whose discriminator judges.
+        agent: whose discriminator evaluates.
         dataset: with routes if the agent follows some.
         search: its periods and aggregate.
         batch: segments at a time.

@@ -80,7 +80,7 @@ def simulation(
         scenes: B scenes.
         config: how.
         keep_tree: of a search keep the pruned branches, too.
-        egos: plan the first agent of every scene, which no search judges; the agent drives the others.
+        egos: plan the first agent of every scene, which no search scores; the agent drives the others.
         given: number of the route that an agent is to follow, -1 where that is left open.
 
     Raises:
@@ -124,14 +124,14 @@ def simulation(
         )
     else:
         best = config.search == "best"
-        judge = None
+        scorer = None
         if config.search != "oracle" and agent.discriminator is not None:
-            judge = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
+            scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
             result = search(
                 env,
                 actor,
-                judge,
+                scorer,
                 start,
                 seed=config.seed,
                 rule=KeepAll() if best else pruning_rule(settings),

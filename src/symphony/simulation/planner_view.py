@@ -114,7 +114,7 @@ def lanes_of(scenario: Scenario) -> tuple[Lane, ...]:
 
 
 def observation_of(scenario: Scenario, traffic: Traffic, lanes: tuple[Lane, ...]) -> Observation:
-    """One record of what a planner is told at the start and what it sees now."""
+    """One record of what a planner is told at the start and what it observes now."""
     there = traffic.valid.copy()
     there[traffic.ego] = False
     position, velocity, size = traffic.position[there], traffic.velocity[there], traffic.size[there]

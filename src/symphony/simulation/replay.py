@@ -79,7 +79,7 @@ class SearchReplay:
         Args:
             count: K.
             rng: of the draw.
-            observation: what the policy sees.
+            observation: what the policy observes.
             which: of every surviving rollout, or only of the best of each tree.
 
         Returns:

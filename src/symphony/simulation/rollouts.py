@@ -28,7 +28,7 @@ class Rollouts(NamedTuple):
         state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
         collision: [..., T, N].
         offroad: [..., T, N].
-        counted: [..., T, N] steps that are judged: of real agents while they are there, up to the segment's last
+        counted: [..., T, N] steps that are evaluated: of real agents while they are there, up to the segment's last
             logged step.
     """
 

@@ -25,7 +25,7 @@ from symphony.simulation.rollouts import Rollouts
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
 BACKGROUND = "background:"
-"""What the names of drivers begin with whose agents nobody judges."""
+"""What the names of drivers begin with whose agents nobody evaluates."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SavedTrees:
         collision: [R, S, T, N].
         offroad: [R, S, T, N].
         score: [R, S, T, N] of those states, high is bad; NaN where there is none.
-        totals: [R, P, S] what the pruning after each period judged by.
+        totals: [R, P, S] what the pruning after each period compared.
         parents: [R, P, S] after period p slot s was continued from slot ``parents[p, s]``.
         slots: [R, P, L] the slot in which each period of each leaf's history was simulated.
         prune_every: steps per period; the last may be shorter.
@@ -106,7 +106,7 @@ class SavedRollouts:
         return np.concatenate([first, self.counted], 1)
 
     @property
-    def judged(self) -> NDArray[np.int64]:
+    def evaluated(self) -> NDArray[np.int64]:
         """Places among the N driven agents of those that are no background."""
         named = self.drivers or ("",) * len(self.agents)
         return np.flatnonzero([not name.startswith(BACKGROUND) for name in named])

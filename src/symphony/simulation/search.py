@@ -86,7 +86,7 @@ def realism_score(
     Args:
         env: whose states are scored.
         discriminator: writes them; None takes the true collision and off-road flags (an oracle).
-        ego: whether the first agent is judged; else its score is 0, as that of background agents is.
+        ego: whether the first agent is scored; else its score is 0, as that of background agents is.
     """
     score: Callable[[TensorDictBase], Tensor] = flag_score
     if discriminator is not None:
@@ -177,7 +177,7 @@ def search(
         retries: how often a period is simulated again, from its start, for branches that end it with a total above
             ``retry_above``.
         retry_above: that total.
-        ego: whether the first agent is judged, too.
+        ego: whether the first agent is scored, too.
         also: what is kept of every step beside :data:`KEPT`.
     """
     steps = env.decisions
