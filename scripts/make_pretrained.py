@@ -56,6 +56,8 @@ class Source:
         before: what it started from, in words; empty for new networks.
         data: checksum of what it learned from.
         scores: records of evaluations, each on data of its own.
+        holds: what its data is, in words.
+        limits: of what it has learned, in words.
     """
 
     config: TrainConfig
@@ -64,6 +66,8 @@ class Source:
     before: str
     data: str
     scores: Sequence[dict[str, Any]]
+    holds: str = ""
+    limits: str = ""
 
 
 def make(
@@ -72,6 +76,9 @@ def make(
     scores: Sequence[Path] = (),
     pruning: EvaluateConfig = EvaluateConfig(),  # noqa: B008  (frozen)
     folder: Path = FOLDER,
+    *,
+    holds: str = "",
+    limits: str = "",
 ) -> Path:
     """Write the folder of an agent and return it.
 
@@ -79,9 +86,11 @@ def make(
         run: ``RUN`` or ``RUN@WHICH`` (see :func:`symphony.agents.load_agent`).
         name: of the agent.
         scores: evaluations of the run as ``symphony evaluate`` writes them; by default the one that the run keeps.
-        pruning: its `rule`, `prune_every` and `temperature` say how the agent's trees are pruned from now on; by
-            default as it was trained.
+        pruning: its `rule`, `prune_every`, `temperature`, `threshold` and `goals` say how the agent is searched from
+            now on; by default as it was trained.
         folder: of all these agents.
+        holds: what its training data is, in words, where that is no standard set.
+        limits: of what it has learned, in words, where that is no standard set.
 
     Raises:
         ConfigError: if the run has no such checkpoint, its data is unknown, or the evaluation is of something else.
@@ -91,7 +100,9 @@ def make(
     config, spec, checkpoint = read_run(source), read_spec(source), choose(source, which)
     step = int(checkpoint.name[-12:])
     records = _read_scores(source, scores)
-    known = Source(config, spec, step, _before(source, config), _checksum(config.data), records)
+    known = Source(
+        config, spec, step, _before(source, config), _checksum(config.data), records, holds, limits
+    )
     out = replace(config, search=pruning.pruning(config.search))
     for record in records:
         _check_scores(record, out, step)
@@ -206,8 +217,9 @@ def _before(run: Path, config: TrainConfig) -> str:
     """What a run started from, as far as the runs beside it tell."""
     if config.warm_start is None:
         return ""
-    words = f"the networks of the run `{config.warm_start.name}`"
-    beside = run.resolve().parent / config.warm_start.name
+    name = config.warm_start.name.partition("@")[0]
+    words = f"the networks of the run `{name}`"
+    beside = run.resolve().parent / name
     folder = beside if (beside / "config.json").is_file() else run_folder(config.warm_start)
     if not (folder / "config.json").is_file():
         return words
@@ -235,8 +247,11 @@ def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> Non
     if how["search"] == "tree":
         search = config.search
         pairs += [(name, how[name], getattr(search, name)) for name in ("rule", "prune_every")]
+        pairs.append(("goals", how.get("goals", "tree"), search.goals))
         if search.rule == "systematic":
             pairs.append(("temperature", how["temperature"], search.temperature))
+        if search.rule == "replace":
+            pairs.append(("threshold", how["threshold"], search.threshold))
     for what, evaluated, own in pairs:
         if evaluated != own:
             raise ConfigError(f"the evaluation is of another agent: {what} {evaluated}, not {own}")
@@ -268,7 +283,7 @@ def card_of(name: str, source: Source, config: TrainConfig, parameters: dict[str
         },
         "settings": _settings(config, source.spec, parameters),
         "scores": [_scores_of(record) for record in source.scores],
-        "limits": _limits(source.config, source.spec, method),
+        "limits": _limits(source, method),
     }
 
 
@@ -317,7 +332,9 @@ def _training(source: Source, config: TrainConfig) -> str:
         rollouts = f"{own.mgail.rollouts} rollouts"
         update = f"{update}, {rollouts} in the rest" if update else rollouts
     text = (
-        f"Learned from `{data_name(own.data)}` (checksum `{source.data}`) with seed {own.seed}: "
+        f"Learned from `{data_name(own.data)}` (checksum `{source.data}`"
+        + (f": {source.holds}" if source.holds else "")
+        + f") with seed {own.seed}: "
         f"{_count(source.step)} updates of {update}"
         + (f", starting from {source.before}." if source.before else ", starting from new networks.")
     )
@@ -340,7 +357,9 @@ def _training(source: Source, config: TrainConfig) -> str:
 
 def _pruning(search: dict[str, Any]) -> str:
     words = f"every {search['prune_every']} steps by rule `{search['rule']}`"
-    return words + (f" (temperature {search['temperature']:g})" if search["rule"] == "systematic" else "")
+    words += f" (temperature {search['temperature']:g})" if search["rule"] == "systematic" else ""
+    words += f" (threshold {search['threshold']:g})" if search["rule"] == "replace" else ""
+    return words + (", each branch with goals of its own" if search.get("goals") == "branch" else "")
 
 
 def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) -> dict[str, str]:
@@ -361,7 +380,7 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
     if spec.searches:
         rows += [
             (f"`search.{key}`", getattr(config.search, key))
-            for key in ("test_branches", "prune_every", "rule", "survivors")
+            for key in ("test_branches", "prune_every", "rule", "goals", "survivors")
         ]
     return {key: str(value) for key, value in rows}
 
@@ -422,17 +441,17 @@ def _row(name: str, numbers: dict[str, Any]) -> str:
     return f"| {' | '.join([name, *cells])} |"
 
 
-def _limits(config: TrainConfig, spec: AgentSpec, method: str) -> str:
-    made = data_name(config.data).partition("/")[0] in PRESETS
-    source = (
+def _limits(source: Source, method: str) -> str:
+    made, spec = data_name(source.config.data).partition("/")[0] in PRESETS, source.spec
+    knows = (
         "It knows only simulated towns: rule-made driving below about 13 m/s without freeways, pedestrians, "
         "cyclists, parked cars or mistakes. On real logs expect several times more collisions and, on roads "
         "unlike those, a poor fit; it is no safe driver."
         if made
-        else "It knows only driving and maps like those it learned from."
+        else source.limits or "It knows only driving and maps like those it learned from."
     )
     parts = [
-        source,
+        knows,
         f"It is one run of one seed, much smaller than the paper's {method}, and no figure of the paper.",
     ]
     if spec.searches:
@@ -470,16 +489,25 @@ def main(args: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--prune-every", type=int, default=0, help="steps between prunings, likewise")
     parser.add_argument("--temperature", type=float, default=0.0, help="of rule systematic, likewise")
+    parser.add_argument("--threshold", type=float, help="of rule replace, likewise")
+    parser.add_argument("--goals", default="agent", help="who draws goals together, likewise")
+    parser.add_argument("--holds", default="", help="what its training data is, in words")
+    parser.add_argument("--limits", default="", help="of what it has learned, in words")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="of all these agents")
     arguments = parser.parse_args(args)
     try:
         pruning = EvaluateConfig(
-            rule=arguments.rule, prune_every=arguments.prune_every, temperature=arguments.temperature
+            rule=arguments.rule,
+            prune_every=arguments.prune_every,
+            temperature=arguments.temperature,
+            threshold=arguments.threshold,
+            goals=arguments.goals,
         )
         if arguments.run == PREFIX + arguments.name:
             place = add_scores(arguments.name, arguments.scores, arguments.folder)
         else:
-            place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder)
+            words = {"holds": arguments.holds, "limits": arguments.limits}
+            place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder, **words)
     except SymphonyError as error:
         parser.exit(1, f"error: {error}\n")
     size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())

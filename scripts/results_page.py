@@ -103,6 +103,20 @@ REAL_ROWS = (
     ("BC+TS+H without its search", "ngsim-none"),
     ("BC+TS+H", "ngsim-replace-branch"),
 )
+DRIVEN = {"town": "towns", "ngsim": "real roads"}
+INCLUDED = (
+    ("log playback", "none", "playback"),
+    ("constant velocity", "none", "constant_velocity"),
+    ("BC", "bc", ""),
+    ("BC+TS+H without its search", "none", ""),
+    ("BC+TS+H", "replace-branch", ""),
+)
+LABELS = (
+    ("BC+H, one route taught (seed 0)", "bc/bc_h-0-none"),
+    ("BC+H, the set of open routes", "labels/bc_h-0-none"),
+    ("BC+TS+H, one route taught (seed 0)", "bc/bc_ts_h-0-often"),
+    ("BC+TS+H, the set of open routes", "labels/bc_ts_h-0-systematic"),
+)
 PLAYBACK = "log playback"
 NGSIM = (
     (PLAYBACK, "ngsim/{}/playback"),
@@ -289,8 +303,24 @@ def crowd(data: str) -> Grid:
     return grid
 
 
+def included() -> Grid:
+    """The agent that comes with the package beside baselines, on simulated towns and on real roads."""
+    columns = ("collision_rate", "ade", "min_sade")
+    grid = [["", *(f"{where}: {COLUMNS[key][0]}" for where in DRIVEN.values() for key in columns)]]
+    for label, name, part in INCLUDED:
+        line = [label]
+        for data in DRIVEN:
+            (record,) = records(f"driving/{data}-{name}")
+            row = record[part] if part else record
+            line += [
+                f"{row[key]:.{COLUMNS[key][1]}f} ± {row[f'{key}_se']:.{COLUMNS[key][1]}f}" for key in columns
+            ]
+        grid.append(line)
+    return grid
+
+
 def by_place() -> Grid:
-    """Each place of the NGSIM test part apart; errors over snippets."""
+    """Each place of the NGSIM test part apart: collisions, those with playback vehicles in brackets; over snippets."""
     grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
     for label, name in REAL_ROWS:
         (record,) = records(f"driving/{name}")
@@ -301,7 +331,9 @@ def by_place() -> Grid:
             for key, digits in (("collision_rate", 1), ("ade", 2)):
                 values = np.array([row[key] for row in rows], np.float64)
                 mean, error = clustered_mean(values, groups)
-                line.append(f"{mean:.{digits}f} ± {error:.{digits}f}")
+                ghosts = np.mean([row["collision_with_playback"] for row in rows])
+                aside = f" ({ghosts:.1f})" if key == "collision_rate" else ""
+                line.append(f"{mean:.{digits}f} ± {error:.{digits}f}{aside}")
         grid.append(line)
     return grid
 
@@ -373,6 +405,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "driving-town": lambda: searched("driving", "town"),
     "driving-ngsim": lambda: searched("driving", "ngsim"),
     "driving-places": by_place,
+    "included": included,
+    "labels": lambda: means(LABELS),
     "wosac-log": wosac_log,
     "wosac-sumo": lambda: wosac("sumo"),
     "wosac-ngsim": lambda: wosac("ngsim"),

@@ -60,8 +60,8 @@ def planner_record(folder: RolloutFolder) -> Record:
     Returns:
         ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
         ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
-        evaluated; ``score``, the mean of :func:`run_score`, and ``score_se``; ``search``, what :func:`selection` says,
-        None where no search was kept; ``per_run``.
+        evaluated; ``score``, the mean of :func:`run_score`, and ``score_se``; ``search``, what :func:`selection`
+        gives, None where no search was kept; ``per_run``.
 
     Raises:
         DataError: there is no planner in it, or a file of it can't be read.
