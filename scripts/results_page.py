@@ -320,7 +320,7 @@ def included() -> Grid:
 
 
 def by_place() -> Grid:
-    """Each place of the NGSIM test part apart: collisions, in brackets those with playback vehicles; over snippets."""
+    """Each place of the NGSIM test part: collisions (in brackets those with playback vehicles) and ADE."""
     grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
     for label, name in REAL_ROWS:
         (record,) = records(f"driving/{name}")

@@ -245,11 +245,11 @@ class _Seen(NamedTuple):
 
 def _observed_objects(
     tables: Tables,
-    scene: Tensor,
+    scene: Int[Tensor, " M"],
     objects: Objects,
-    index: Tensor,
-    own: Tensor,
-    own_size: Tensor,
+    index: Int[Tensor, "M N"],
+    own: Float[Tensor, "M N 5"],
+    own_size: Float[Tensor, "M N 2"],
     routes: tuple[Tensor, Tensor] | None,
 ) -> _Seen:
     config = tables.config
@@ -294,7 +294,11 @@ def _observed_objects(
 
 
 def _gaps(
-    foresight: tuple[float, ...], own: Tensor, own_size: Tensor, state: Tensor, size: Tensor
+    foresight: tuple[float, ...],
+    own: Float[Tensor, "M N 5"],
+    own_size: Float[Tensor, "M N 2"],
+    state: Float[Tensor, "M N O 5"],
+    size: Float[Tensor, "M N O 2"],
 ) -> Float[Tensor, "M N O H"]:
     """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
     times = constant((0.0, *foresight), own.dtype, own.device)[:, None]
@@ -310,6 +314,6 @@ def _gaps(
     )
 
 
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    """values [M, A, F] at index [M, K] -> [M, K, F]."""
+def _take(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
+    """Each row's values at its own index."""
     return values.gather(1, index[..., None].expand(*index.shape, values.shape[-1]))

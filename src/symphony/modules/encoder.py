@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -71,8 +71,10 @@ class SceneEncoder(nn.Module):
         self.pool: PoolMode = pool
         self.width = hidden * (1 + len(self.groups))
 
-    def forward(self, own: Tensor, valid: Tensor, *elements_and_masks: Tensor) -> Tensor:
-        """Own features `[..., N, Fs]`, mask `[..., N]`, then elements and mask of each group; `[..., N, D]`."""
+    def forward(
+        self, own: Float[Tensor, "*b n own"], valid: Bool[Tensor, "*b n"], *elements_and_masks: Tensor
+    ) -> Float[Tensor, "*b n width"]:
+        """Own features, mask, then elements `[..., N, K, F]` and mask `[..., N, K]` of each group."""
         if len(elements_and_masks) != 2 * len(self.groups):
             raise ValueError(
                 f"expected elements and mask of {len(self.groups)} groups, got {len(elements_and_masks)} tensors"
@@ -99,7 +101,9 @@ class SceneNetwork(nn.Module):
         self.encoder = encoder
         self.head = mlp((encoder.width, *head, outputs))
 
-    def forward(self, own: Tensor, valid: Tensor, *elements_and_masks: Tensor) -> Tensor:
+    def forward(
+        self, own: Float[Tensor, "*b n own"], valid: Bool[Tensor, "*b n"], *elements_and_masks: Tensor
+    ) -> Float[Tensor, "*b n outputs"]:
         """Inputs as for :class:`SceneEncoder`."""
         return in_blocks(self.head, self.encoder(own, valid, *elements_and_masks))
 

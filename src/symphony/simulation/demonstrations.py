@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -271,22 +272,24 @@ class SceneDataset:
         return state, valid
 
 
-def logged_routes(tables: Sequence[RouteTable], row: Tensor) -> tuple[Tensor, Tensor]:
-    """Points [M, K, 2] and their number [M] (0 where there is none) of the routes that experts took."""
+def logged_routes(
+    tables: Sequence[RouteTable], row: Int[Tensor, " M"]
+) -> tuple[Float[Tensor, "M K 2"], Int[Tensor, " M"]]:
+    """Points and their number (0 where there is none) of the routes that experts took."""
     none = np.zeros((POINTS, 2), np.float32)
     points = np.stack([table.points[table.logged] if table.logged >= 0 else none for table in tables])
     count = np.array([table.count[table.logged] if table.logged >= 0 else 0 for table in tables])
     return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
 
 
-def _pose(log_state: Tensor) -> Tensor:
-    """From x, y, heading and velocity [M, 5] to x, y, heading and speed [M, 4]."""
+def _pose(log_state: Float[Tensor, "M 5"]) -> Float[Tensor, "M 4"]:
+    """From x, y, heading and velocity to x, y, heading and speed."""
     speed = forward_speed(log_state[:, 3:], log_state[:, 2])
     return torch.cat([log_state[:, :3], speed[:, None]], -1)
 
 
-def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
-    """What the interactive agents did in the log: states [B, T, N, 4] and validity [B, T, N]."""
+def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
+    """What the interactive agents did in the log: states and validity."""
     steps = scenes.log_valid.shape[1]
     index = scenes.interactive[:, None].expand(-1, steps, -1)
     log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
@@ -298,10 +301,10 @@ def logged(scenes: SceneBatch) -> tuple[Tensor, Tensor]:
 
 def expert_batch(
     scenes: SceneBatch,
-    scene_of: Tensor,
-    step: Tensor,
-    agent: Tensor,
-    state: Tensor,
+    scene_of: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    agent: Int[Tensor, " M"],
+    state: Float[Tensor, "M 4"],
     observation: ObservationConfig,
     *,
     action: Tensor | None = None,
