@@ -389,7 +389,6 @@ def flattered() -> Grid:
 PLACES = {"Lanker": "Lankershim", "US101": "US-101"}
 THREE = ("collision_rate", "ade", "min_sade")
 TABLES: dict[str, Callable[[], Grid]] = {
-    "short": lambda: means(BC),
     "methods": lambda: means((*BC, *MGAIL)),
     "relations": held,
     "features": lambda: means(FEATURES),

@@ -206,7 +206,7 @@ def test_an_evaluation_can_be_animated(store: Path, tmp_path: Path) -> None:
         ({"--segments": "nobody"}, "segment nobody: no such segment"),
         ({"--panels": "0"}, "--panels must be at least 1"),
         ({"--rollouts": "0"}, "rollouts must be positive"),
-        ({"--interactive": "-1"}, "interactive must not be negative"),
+        ({"--interactive": "-1"}, "interactive is 'all' or a number up to 128"),
         ({"--data": "nowhere"}, "nowhere"),
     ],
     ids=lambda case: "-".join(case) if isinstance(case, dict) else "",

@@ -251,7 +251,11 @@ def test_workers_end_with_the_command(store: SegmentStore, tmp_path: Path, how: 
             assert process.poll() is None
             time.sleep(0.1)
         process.send_signal(how)
-        _, errors = process.communicate(timeout=120)
+        try:
+            _, errors = process.communicate(timeout=120)
+        except subprocess.TimeoutExpired:
+            process.kill()  # or leaving the block would wait for it
+            raise
     workers = [int(path.name) for path in (tmp_path / "started").iterdir()]
     assert len(workers) == 2
     assert process.pid not in workers
