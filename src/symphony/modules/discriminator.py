@@ -21,8 +21,8 @@ FORESIGHT = (0.5, 1.0, 2.0)
 _GAP, _ROAD = 3, 2 * 5
 
 
-def road_features(distance: Tensor) -> Tensor:
-    """Signed distances to the edge of the road in metres `[..., 5]` as numbers of order one `[..., 10]`."""
+def road_features(distance: Float[Tensor, "*b points"]) -> Float[Tensor, "*b features"]:
+    """Signed distances to the edge of the road in metres as numbers of order one, two for each."""
     return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
 
 

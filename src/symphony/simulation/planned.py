@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -180,8 +181,8 @@ class EgoPolicy(TensorDictModuleBase):
         tensordict.set(keys.PLANNED, after.reshape(*tensordict.shape, 4))
         return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
 
-    def failures(self, number: Tensor) -> list[Failure | None]:
-        """Of the planners with these numbers [...], flattened."""
+    def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
+        """Of the planners with these numbers, flattened."""
         found = (self._held[n] for n in number.flatten().tolist())
         return [planner if isinstance(planner, Failure) else None for planner in found]
 

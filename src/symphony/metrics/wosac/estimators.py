@@ -6,7 +6,7 @@ import math
 from functools import cache
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.metrics.wosac.config import Bernoulli, Histogram
@@ -25,7 +25,7 @@ def _edges(low: float, high: float, bins: int) -> Tensor:
     return edges
 
 
-def bin_of(values: Float[Tensor, "*shape"], estimator: Histogram) -> Tensor:
+def bin_of(values: Float[Tensor, "*shape"], estimator: Histogram) -> Int[Tensor, "*shape"]:
     """Index of each value's bin: outside counts as the nearest bin, not a number as the last one."""
     edges = bin_edges(estimator, values.device)
     inner = edges[1:-1].contiguous()
