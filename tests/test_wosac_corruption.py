@@ -119,7 +119,7 @@ def test_damaged_bytes_are_found(good: Path, place: float, change: int, cut: boo
     content = bytearray(good.read_bytes())
     # What comes before, time and name, means nothing; nor do the last bits before the checksum.
     begin = content.index(b"\0", 10) + 1
-    where = begin + int(place * (len(content) - 10 - begin))
+    where = begin + int(place * (len(content) - 16 - begin))
     if cut:
         del content[where:]
     else:

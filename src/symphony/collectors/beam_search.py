@@ -249,7 +249,7 @@ def _take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None 
     return TensorDict(taken, [*rows.shape, *tensordict.batch_size[dims:]], device=tensordict.device)
 
 
-def _take_rows(values: Shaped[Tensor, ...], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*c ..."]:
+def _take_rows(values: Shaped[Tensor, "*_"], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*_"]:
     # index_select on whole rows is many times faster than gather or advanced indexing on wide entries.
     taken = values.flatten(0, dims - 1).index_select(0, rows.flatten())
     return taken.reshape(*rows.shape, *values.shape[dims:])

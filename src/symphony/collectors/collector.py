@@ -321,6 +321,6 @@ def _last(key: NestedKey) -> str:
     return key if isinstance(key, str) else key[-1]
 
 
-def _per_entry(flag: Bool[Tensor, "*e"], batch_dims: int) -> Bool[Tensor, ...]:
+def _per_entry(flag: Bool[Tensor, "*e"], batch_dims: int) -> Bool[Tensor, "*_"]:
     """Whether any of the flags [*b, ...] of an entry [*b] is set."""
     return flag.reshape(*flag.shape[:batch_dims], -1).any(-1)

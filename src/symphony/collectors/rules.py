@@ -251,7 +251,7 @@ def prune(
 
 
 def _checked(
-    rule: object, parents: Shaped[Tensor, ...], totals: Float[Tensor, "*b S"]
+    rule: object, parents: Shaped[Tensor, "*_"], totals: Float[Tensor, "*b S"]
 ) -> Int[Tensor, "*b S"]:
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
         raise ConfigError(

@@ -470,7 +470,7 @@ def _rows(
     return table[scene[..., None], index]
 
 
-def _like(mask: Bool[Tensor, "*b 1"], value: Shaped[Tensor, ...]) -> Bool[Tensor, "*b ..."]:
+def _like(mask: Bool[Tensor, "*b 1"], value: Shaped[Tensor, "*_"]) -> Bool[Tensor, "*_"]:
     """mask [..., 1] with trailing dimensions of one, to broadcast against value."""
     flat = mask.squeeze(-1)
     return flat.reshape(flat.shape + (1,) * (value.ndim - flat.ndim))

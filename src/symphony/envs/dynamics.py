@@ -154,7 +154,7 @@ class Bicycle:
         """Number of joint actions."""
         return self.num_acceleration * self.num_steering
 
-    def grid(self, like: Float[Tensor, ...]) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+    def grid(self, like: Float[Tensor, "*_"]) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
         acceleration, steering = self._joint
         return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
@@ -259,7 +259,7 @@ def _follow(
     speed: Float[Tensor, "*b T"],
     valid: Bool[Tensor, "*b T"],
     advance: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
-) -> tuple[Shaped[Tensor, "*b Tm1 ..."], Float[Tensor, "*b T 4"]]:
+) -> tuple[Shaped[Tensor, "*_"], Float[Tensor, "*b T 4"]]:
     """Step through a log: ``advance(state, target, known)`` gives an action and the state it leads to.
 
     ``known`` says where the target and the logged state before it are valid. Where a log begins again after a

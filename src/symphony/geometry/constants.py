@@ -10,7 +10,7 @@ from jaxtyping import Num
 from torch import Tensor
 
 
-def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, ...]:
+def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, "*_"]:
     """A tensor of these (nested tuples of) numbers; shared, so never written to."""
     if torch.compiler.is_compiling():
         return torch.tensor(values, dtype=dtype, device=device)
@@ -18,7 +18,7 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 
 
 @cache
-def made(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, ...]:
+def made(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, "*_"]:
     """What :func:`constant` keeps."""
     # Made outside of inference mode, or autograd could not save it.
     with torch.inference_mode(False), torch.no_grad():

@@ -176,7 +176,7 @@ def collision_kinds(
             kind = torch.where(hit_type == number, int(named), kind)
     playback = ~(other[:, None] == rows).any(-1)
 
-    def filled(values: Int[Tensor, " M"]) -> Int[Tensor, ...]:
+    def filled(values: Int[Tensor, " M"]) -> Int[Tensor, "*_"]:
         return torch.full(hit.shape, -1, device=hit.device).masked_scatter(hit, values)[0]
 
     return CollisionKinds(filled(kind), filled(step), filled(other), filled(playback.long()) == 1)

@@ -39,7 +39,7 @@ class RouteScores(nn.Module):
         self.head = mlp((hidden, hidden, 1))
 
     def forward(
-        self, own: Float[Tensor, "*b N F"], valid: Bool[Tensor, "*b N"], *inputs: Shaped[Tensor, "*b N ..."]
+        self, own: Float[Tensor, "*b N F"], valid: Bool[Tensor, "*b N"], *inputs: Shaped[Tensor, "*_"]
     ) -> Float[Tensor, "*b N G"]:
         """Inputs as for :class:`SceneEncoder`, then routes `[..., N, G, F]` and their mask `[..., N, G]`."""
         *elements, routes, mask = inputs

@@ -203,7 +203,7 @@ class ActorLoss(MaskedLoss):
             hit = (dist.logits.argmax(-1) == action).to(dist.logits.dtype)
             return Fit(cost, nll, counted, dist.entropy(), hit)
 
-    def _statistics(self, fit: Fit, counted: Bool[Tensor, "*b"]) -> dict[str, Float[Tensor, ...]]:
+    def _statistics(self, fit: Fit, counted: Bool[Tensor, "*b"]) -> dict[str, Float[Tensor, "*_"]]:
         """Entropy and accuracy over some entries, of a categorical actor."""
         if fit.entropy is None or fit.hit is None:
             return {}

@@ -165,7 +165,7 @@ class DiscriminatorLoss(MaskedLoss):
             inputs.set(key, value + self.instance_noise * noise.to(value.device))
         return inputs
 
-    def _leaves(self, inputs: TensorDictBase) -> list[Float[Tensor, ...]]:
+    def _leaves(self, inputs: TensorDictBase) -> list[Float[Tensor, "*_"]]:
         """The inputs to differentiate by, put in place as leaves."""
         chosen = self.penalty_keys
         if chosen is None:
@@ -176,7 +176,7 @@ class DiscriminatorLoss(MaskedLoss):
         return leaves
 
     @staticmethod
-    def _floating(inputs: TensorDictBase, key: NestedKey) -> Float[Tensor, ...]:
+    def _floating(inputs: TensorDictBase, key: NestedKey) -> Float[Tensor, "*_"]:
         value = inputs.get(key)
         if not value.is_floating_point():
             raise ValueError(f"{key!r} is {value.dtype}, expected floating point")
@@ -208,7 +208,7 @@ class DiscriminatorLoss(MaskedLoss):
 
 def _squared_norm(
     logit: Float[Tensor, "*b"],
-    leaves: list[Float[Tensor, ...]],
+    leaves: list[Float[Tensor, "*_"]],
     where: Bool[Tensor, "*b"],
     *,
     create_graph: bool,

@@ -204,7 +204,7 @@ class MGAILLoss(MaskedLoss):
         self,
         env: EnvBase,
         now: TensorDictBase,
-        numbers: Float[Tensor, ...] | None,
+        numbers: Float[Tensor, "*_"] | None,
         first: int,
         length: int,
     ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"], TensorDictBase]:

@@ -68,12 +68,12 @@ class KeptExperts:
             return
         try:
             with replacing(path) as draft, draft.open("wb") as file:
-                np.savez(file, allow_pickle=False, **_to_arrays(experts))
+                np.savez(file, **_to_arrays(experts))
         except OSError:
             self.folder = None
 
 
-def _to_arrays(experts: Experts) -> dict[str, NDArray[Any]]:
+def _to_arrays(experts: Experts) -> dict[str, Any]:
     routes = experts.routes
     arrays = {
         name: getattr(experts, name).numpy() for name in ("agent", "states", "actions", "valid", "error")

@@ -152,5 +152,5 @@ def _motion(
     return {name: _finite(values[valid]) for name, values in found.items()}
 
 
-def _finite(values: Float[Tensor, ...]) -> NDArray[np.float64]:
+def _finite(values: Float[Tensor, "*_"]) -> NDArray[np.float64]:
     return values[values.isfinite()].double().numpy()
