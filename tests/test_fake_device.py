@@ -16,7 +16,16 @@ from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.observation import objects_at, observe
 from symphony.roadgraph import LaneGraph
 
-EVERYTHING = ObservationConfig(num_objects=3, num_points=60, route=True, clearance=True, foresight=(0.5, 1.0))
+EVERYTHING = ObservationConfig(
+    num_objects=3,
+    num_points=60,
+    num_lights=2,
+    route=True,
+    along=True,
+    gaps=True,
+    clearance=True,
+    foresight=(0.5, 1.0),
+)
 CONFIGS = pytest.mark.parametrize(
     "config", [EVERYTHING, ObservationConfig(16, 4000), ObservationConfig.nothing()]
 )

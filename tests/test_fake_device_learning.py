@@ -35,7 +35,7 @@ def spec(space: Any) -> AgentSpec:
         action_space=space,
         dt=0.2,
         goals=True,
-        agent=AgentConfig(num_objects=3, num_points=20, hidden=8, head=8),
+        agent=AgentConfig(num_objects=3, num_points=20, num_lights=2, features="gaps", hidden=8, head=8),
         discriminator=DiscriminatorConfig(features="foresight", hidden=8, head=8),
         searches=True,
     )

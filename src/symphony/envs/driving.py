@@ -31,7 +31,7 @@ from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.tables import Tables
 from symphony.envs.traffic import entering, without
 from symphony.errors import ConfigError
-from symphony.geometry.frames import forward_speed
+from symphony.geometry.frames import with_speed
 from symphony.streams import fold_in
 
 Event = Literal["collision", "offroad"]
@@ -368,10 +368,8 @@ class DrivingEnv(EnvBase):
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
         """The logged states [..., N, 4] in which agents begin, those that enter later included."""
         row, index = scene[..., None], self.scenes.interactive[scene]
-        logged = self.scenes.log_state[row, self.scenes.enter[scene], index]
-        heading, velocity = logged[..., 2], logged[..., 3:]
-        speed = forward_speed(velocity, heading)
-        return torch.cat([logged[..., :3], speed.clamp_min(0.0)[..., None]], -1)
+        logged = with_speed(self.scenes.log_state[row, self.scenes.enter[scene], index])
+        return torch.cat([logged[..., :3], logged[..., 3:].clamp_min(0.0)], -1)
 
     def _from_state(
         self,

@@ -69,7 +69,7 @@ class Tables:
         """
         scenes = self.scenes
         is_light = (scenes.point_light >= 0) & scenes.point_valid
-        most = int(is_light.sum(1).max()) if self.light is not None else 0
+        most = scenes.light.shape[2]  # a light is one point
         # Lights first, each kind in the order of the scene.
         order = is_light.to(torch.int8).argsort(stable=True, dim=1, descending=True)[:, :most]
         position = scenes.point.gather(1, order[..., None].expand(*order.shape, 2))

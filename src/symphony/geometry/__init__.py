@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from symphony.geometry.boxes import box_corners, box_gap, boxes_overlap
-from symphony.geometry.frames import forward_speed, rotate, wrap
+from symphony.geometry.frames import forward_speed, rotate, with_speed, wrap
 from symphony.geometry.polylines import NO_BOUNDARY, segments_of, signed_distance
 
 __all__ = [
@@ -15,5 +15,6 @@ __all__ = [
     "rotate",
     "segments_of",
     "signed_distance",
+    "with_speed",
     "wrap",
 ]

@@ -30,3 +30,9 @@ def forward_speed(
 ) -> Float[Tensor, "*batch"]:
     """Component of a velocity along a heading, m/s; negative when reversing."""
     return velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
+
+
+def with_speed(moving: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 4"]:
+    """From x, y, heading and velocity to x, y, heading and speed along the heading."""
+    speed = forward_speed(moving[..., 3:], moving[..., 2])
+    return torch.cat([moving[..., :3], speed[..., None]], -1)

@@ -21,7 +21,7 @@ from symphony.envs.observation import ObservationConfig, objects_at, observe
 from symphony.envs.routes import POINTS, RouteTable, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
-from symphony.geometry.frames import forward_speed
+from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.experts import ExpertCache, Experts, fit_experts
 from symphony.simulation.kept import KeptExperts
@@ -186,7 +186,7 @@ class SceneDataset:
         agent = torch.cat([e.agent for e in found])[row]
         scenes = self.scenes(items)
         if perturb is not None:
-            now, later = (_pose(scenes.log_state[item, when + k, agent]) for k in (0, 1))
+            now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
             size = scenes.box_size[item, agent]
             state, action = perturbed(state, action, now, later, size, self.dynamics, self.dt, perturb, rng)
         tables = [table for expert in found for table in expert.routes]
@@ -282,21 +282,13 @@ def logged_routes(
     return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
 
 
-def _pose(log_state: Float[Tensor, "M 5"]) -> Float[Tensor, "M 4"]:
-    """From x, y, heading and velocity to x, y, heading and speed."""
-    speed = forward_speed(log_state[:, 3:], log_state[:, 2])
-    return torch.cat([log_state[:, :3], speed[:, None]], -1)
-
-
 def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
     """What the interactive agents did in the log: states and validity."""
     steps = scenes.log_valid.shape[1]
     index = scenes.interactive[:, None].expand(-1, steps, -1)
     log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
-    heading, velocity = log[..., 2], log[..., 3:]
-    speed = forward_speed(velocity, heading)
     valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
-    return torch.cat([log[..., :3], speed[..., None]], -1), valid
+    return with_speed(log), valid
 
 
 def expert_batch(
