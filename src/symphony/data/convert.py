@@ -170,6 +170,7 @@ def _job(settings: Mapping[str, Any], paths: list[Path], out: Path, append: bool
     if begun is not None:
         return Job(settings, files, begun.job.before, begun.job.earlier)
     store = SegmentStore(out)
+    store.check_complete()
     if len(store) and abs(store[0].dt - dt) > 1e-6:
         message = f"holds segments at {1 / store[0].dt:g} steps per second, not {1 / dt:g}"
         raise DataError(message, file=out, field="rate")

@@ -21,11 +21,14 @@ def merge(
         progress: told how many segments are done, of how many.
 
     Raises:
-        DataError: ``out`` exists, a segment is in two stores, or stores differ in their time step; names the store.
+        DataError: ``out`` exists, a segment is in two stores, the generation of one is not finished, or stores differ
+            in their time step; names the store.
     """
     if out.exists():
         raise DataError("exists already; choose another folder", file=out)
     stores = [SegmentStore(path) for path in paths]
+    for store in stores:
+        store.check_complete()
     steps = {float(dt) for store in stores for dt in store.time_steps}
     if len(steps) > 1:
         listed = ", ".join(f"{dt:g} s" for dt in sorted(steps))

@@ -365,6 +365,22 @@ class SegmentStore(Sequence[RunSegment]):
             name = f"number {row}" if column == "segment_id" else self._name(row)
             raise error.at(file=self.path, segment=name) from error
 
+    def check_complete(self) -> None:
+        """Refuse a store that is still being generated, or whose generation was interrupted.
+
+        Raises:
+            DataError: says how many segments there are, of how many.
+        """
+        made = self.report.get("generation")
+        if isinstance(made, dict) and made.get("complete") is False:
+            settings = self.report.get("settings")
+            wanted = settings.get("segments", "more") if isinstance(settings, dict) else "more"
+            raise DataError(
+                f"holds {len(self)} of {wanted} segments: its generation is not finished; give the same "
+                "`symphony data generate` again",
+                file=self.path,
+            )
+
     def checksum(self) -> str:
         """SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.
 
