@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, ROAD, WAYS, osm
+from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.geodesy import mercator, utm
@@ -176,28 +176,6 @@ def deleted(content: str) -> str:
 
 def test_what_an_editor_deleted_is_not_there(tmp_path: Path) -> None:
     assert road_of(tmp_path, deleted(osm())).lane_id.tolist() == [101, 102, 103]
-
-
-LOT = {41: (50, 8), 42: (50, 28), 43: (80, 28), 44: (80, 8), 51: (60, 15), 52: (70, 15), 53: (65, 25)}
-"""Nodes of a parking lot beside the road, and of a house in it."""
-FENCES = {61: (41, 42, 43), 62: (43, 44), 63: (44, 41), 64: (51, 52), 65: (52, 53, 51)}
-
-
-def with_area(
-    tags: dict[str, str], turned: tuple[bool, ...] = (False,) * 5, members: str = "61o 62o 63o 64i 65i"
-) -> str:
-    ways = {
-        name: (refs[::-1] if turn else refs, {"type": "fence"})
-        for (name, refs), turn in zip(FENCES.items(), turned, strict=True)
-    }
-    roles = {"o": "outer", "i": "inner"}
-    inner = "".join(f"<member type='way' ref='{m[:-1]}' role='{roles[m[-1]]}'/>" for m in members.split())
-    every = "".join(f"<tag k='{k}' v='{v}'/>" for k, v in ({"type": "multipolygon"} | tags).items())
-    content = osm(nodes=NODES | LOT, ways=WAYS | ways)
-    return content.replace("</osm>", f"<relation id='301'>{inner}{every}</relation></osm>")
-
-
-PARKING = {"subtype": "parking"}
 
 
 @settings(max_examples=20)
