@@ -75,6 +75,8 @@ class SceneDataset:
         self.experts = ExpertCache(self._experts, keep)
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
+        # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
+        self._batch = lru_cache(1)(lambda items: collate([self.scene(i) for i in items]))
 
     def __reduce__(self) -> tuple[Any, ...]:
         build = partial(SceneDataset, routes=self.routes, duration=self.duration, keep=self.keep)
@@ -136,7 +138,8 @@ class SceneDataset:
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""
-        return collate([self.scene(i) for i in items])
+        found: SceneBatch = self._batch(tuple(items))
+        return found
 
     def _experts(self, items: Sequence[int]) -> list[Experts]:
         """The demonstrations of several items: those kept with the store, the others fitted together and kept."""
