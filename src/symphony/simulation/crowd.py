@@ -25,7 +25,7 @@ from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, scene
 from symphony.errors import DataError
 from symphony.roadgraph import LaneGraph, lane_of
-from symphony.simulation.demonstrations import KEEP, SceneDataset
+from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.experts import IN_LANE
 
 Indices = NDArray[np.int64]
@@ -134,7 +134,7 @@ class CrowdDataset(SceneDataset):
         *,
         routes: bool = False,
         duration: float = 0,
-        keep: int = KEEP,
+        keep: int | None = None,
     ) -> None:
         routes = routes or crowd.along_routes
         super().__init__(store, crowd.count, dynamics, indices, routes=routes, duration=duration, keep=keep)

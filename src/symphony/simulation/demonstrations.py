@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,12 @@ from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
 from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.experts import ExpertCache, Experts, fit_experts
+from symphony.simulation.experts import Experts, fit_experts
 from symphony.simulation.kept import KeptExperts
+from symphony.simulation.memory import ItemCache
 from symphony.simulation.perturbation import perturbed
 from symphony.simulation.weights import infractions, some_of, state_weights
 
-KEEP = 5000
-"""Segments held in memory once they are prepared: 90 kB each, 170 with routes, in the built-in data."""
 GRAPHS = 64
 """Lane graphs held in memory."""
 
@@ -50,7 +50,8 @@ class SceneDataset:
         indices: rows of the store to use; all by default.
         routes: whether scenes and experts come with their routes.
         duration: seconds of each segment that are used; 0 for all.
-        keep: segments held in memory once they are prepared.
+        keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
+            machine's memory; 170 kB each in the built-in data, with routes).
         sampling: what is drawn more often than the rest; nothing by default.
 
     Raises:
@@ -67,7 +68,7 @@ class SceneDataset:
         *,
         routes: bool = False,
         duration: float = 0,
-        keep: int = KEEP,
+        keep: int | None = None,
         sampling: SamplingConfig | None = None,
     ) -> None:
         self.store = store
@@ -78,12 +79,12 @@ class SceneDataset:
         self.sampling = SamplingConfig() if sampling is None else sampling
         hard = self.sampling.hard
         self._hard = None if hard is None else infractions(hard, store, self.indices)
-        self.scene = lru_cache(keep)(self._scene)
-        self.experts = ExpertCache(self._experts, keep)
+        self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
+        self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
         # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
-        self._batch = lru_cache(1)(lambda items: collate([self.scene(i) for i in items]))
+        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         build = partial(
@@ -144,6 +145,9 @@ class SceneDataset:
         """Item ``i`` as a batch of one scene."""
         graph = self.graph(i) if self.routes else None
         return scene(self.segment(i), self.interactive, graph, number=i)
+
+    def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
+        return [self._scene(i) for i in items]
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""
@@ -305,6 +309,10 @@ class SceneDataset:
             which, place = hit.nonzero(as_tuple=True)
             state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
         return state, valid
+
+
+def _nbytes(scene: SceneBatch) -> int:
+    return sum(getattr(scene, name).nbytes for name in SceneBatch.__annotations__)
 
 
 def logged_routes(
