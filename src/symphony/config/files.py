@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import json
 import types
 from pathlib import Path
@@ -60,7 +61,7 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
         ConfigError: for an unknown name (with the nearest known one), a missing one, another type or a value out of
             range.
     """
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:
         if name not in fields:
@@ -76,6 +77,9 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
         return kind(**built)
     except ConfigError as error:
         raise ConfigError(f"{where}{error}") from error
+
+
+_hints = functools.cache(get_type_hints)  # it compiles every annotation anew
 
 
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:

@@ -136,6 +136,9 @@ class Trainer:
             except CheckpointError as error:
                 raise error.at(file=self.done / MANIFEST) from error
         self.alarms = Alarms()
+        for dataset in (self.data, self.validator and self.validator.dataset):
+            if dataset is not None and dataset.store.unfinished is not None:
+                self._warn(str(dataset.store.path), f"{dataset.store.path} {dataset.store.unfinished}")
         if self.world.leads:
             # The process before may have died between a checkpoint and the removal of old ones.
             self._prune()
