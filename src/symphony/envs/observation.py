@@ -304,28 +304,34 @@ def _observed_objects(
         squared = (x.square() + y.square()).masked_fill(hidden, torch.inf)
         chosen, mask = nearest(squared, config.num_objects)
     shape, flat = chosen.shape, chosen.flatten(1)
-    state = _take(objects.state, flat).unflatten(1, shape[1:])
-    static = tables.agents.index_select(0, (flat + (scene * agents)[:, None]).flatten()).unflatten(0, shape)
-    angle = -heading[..., None]
-    relative = wrap(state[..., 2] + angle)
-    features = torch.cat(
-        [
-            rotate(state[..., :2] - origin[..., None, :], angle) / config.distance_scale,
-            relative.cos()[..., None],
-            relative.sin()[..., None],
-            rotate(state[..., 3:], angle) / config.speed_scale,
-            # Elements are encoded one by one, so each must tell how fast it is approached.
-            rotate(state[..., 3:] - own[..., None, 3:], angle) / config.speed_scale,
-            static,
-        ],
-        -1,
-    )
-    features = features * mask[..., None]
+    row = (flat + (scene * agents)[:, None]).flatten()
+    # Places among all agents there are now, and among those of all scenes.
+    now = (flat + torch.arange(0, objects.valid.numel(), agents, device=flat.device)[:, None]).flatten()
+    state = objects.state.flatten(0, 1).index_select(0, now).unflatten(0, shape)
+    static = tables.agents.index_select(0, row).unflatten(0, shape)
+    # Component by component: operations on a last dimension of 2 are slow.
+    angle, (_, _, _, own_x, own_y) = -heading[..., None], own[..., None, :].unbind(-1)
+    cos, sin = angle.cos(), angle.sin()
+
+    def turned(x: Float[Tensor, "M N O"], y: Float[Tensor, "M N O"], scale: float) -> list[Tensor]:
+        return [(cos * x - sin * y) / scale, (sin * x + cos * y) / scale]
+
+    x, y, course, speed_x, speed_y = state.unbind(-1)
+    relative = wrap(course + angle)
+    dynamic = [
+        *turned(x - origin[..., None, 0], y - origin[..., None, 1], config.distance_scale),
+        relative.cos(),
+        relative.sin(),
+        *turned(speed_x, speed_y, config.speed_scale),
+        # Elements are encoded one by one, so each must tell how fast it is approached.
+        *turned(speed_x - own_x, speed_y - own_y, config.speed_scale),
+    ]
+    features = torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(own.dtype)[..., None]
     follows = config.along and routes is not None
     measures = config.clearance or config.gaps
     if not follows and not measures:
         return _Seen(features, mask)
-    size = _take(objects.size, flat).unflatten(1, shape[1:])
+    size = objects.size.flatten(0, 1).index_select(0, now).unflatten(0, shape)
     along = None
     if follows and routes is not None:
         along = along_route(own, own_size, state, size, *routes) * mask[..., None]
@@ -344,17 +350,18 @@ def _gaps(
     size: Float[Tensor, "M N O 2"],
 ) -> Float[Tensor, "M N O H"]:
     """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
-    times = constant((0.0, *foresight), own.dtype, own.device)[:, None]
-    here = own[..., None, None, :2] + times * own[..., None, None, 3:]
-    there = state[..., None, :2] + times * state[..., None, 3:]
-    return box_gap(
-        here,
-        own[..., None, None, 2],
-        own_size[..., None, None, :],
-        there,
-        state[..., 2, None],
-        size[..., None, :],
+    # Times come first, so that operations run along everything else.
+    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None, None]
+    wide, wide_size = own[..., None, :].expand_as(state), own_size[..., None, :].expand_as(size)
+    gap = box_gap(
+        wide[..., :2] + times * wide[..., 3:],
+        wide[..., 2],
+        wide_size,
+        state[..., :2] + times * state[..., 3:],
+        state[..., 2],
+        size,
     )
+    return gap.movedim(0, -1).contiguous()
 
 
 def _take(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
