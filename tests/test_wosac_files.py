@@ -215,6 +215,10 @@ def cut_to_history(record: pb.Scenario) -> None:
         del track.states[11:]
 
 
+def at_times(record: pb.Scenario, every: float, jitter: float) -> None:
+    record.timestamps_seconds[:] = [every * k + jitter * (k % 2) for k in range(91)]
+
+
 @pytest.mark.parametrize(("change", "texts"), [
     (drop_edges, ("road_edge", "no road edge")),
     (hide_current, ("tracks_to_predict", "agent 100 to be scored, but not valid at step 10")),
@@ -226,6 +230,8 @@ def cut_to_history(record: pb.Scenario) -> None:
     (lambda r: r.tracks[1].states.pop(), ("tracks.states", "agent 101 has 90 states for 91 steps")),
     (lambda r: r.dynamic_map_states.pop(), ("dynamic_map_states", "90 entries for 91 steps")),
     (lambda r: r.timestamps_seconds.__setitem__(5, 0.7), ("timestamps_seconds", "steps are not of 0.1 s")),
+    (lambda r: at_times(r, 0.105, 0), ("timestamps_seconds", "steps are not of 0.1 s")),
+    (lambda r: at_times(r, 0.1, 0.06), ("timestamps_seconds", "steps are not of 0.1 s")),
     (lambda r: setattr(r.tracks[2], "id", 101), ("object_id", "agent 101 more than once")),
 ])  # fmt: skip
 def test_wrong_scenarios(
@@ -249,6 +255,12 @@ def test_damaged_scenario_files(
     refused(capsys, tmp_path / "flipped.tfrecord", one[1], "flipped.tfrecord", "record 0", "checksum")
     write_records(tmp_path / "other.tfrecord", [b"\xff\xff"])
     refused(capsys, tmp_path / "other.tfrecord", one[1], "other.tfrecord", "not a Scenario message")
+
+
+def test_recordings_jitter() -> None:
+    record = womd_record()
+    at_times(record, 0.1, 0.03)
+    assert len(scenario_arrays(record)["position"]) == 3
 
 
 def test_headings_and_positions_are_taken_as_they_are() -> None:
