@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 
 from helpers_wosac import record_rollouts, womd_record
 from symphony.cli import main
+from symphony.cli.wosac_files import score_files
 from symphony.data.rollouts import RolloutArrays, read_rollouts, write_rollouts
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.sources.wosac import scenario_arrays, simulated_ids
+from symphony.data.sources.wosac import read_scenario_payloads, scenario_arrays, simulated_ids
 from symphony.errors import DataError
 from symphony.metrics.wosac import CHALLENGE_2024, SimulatedRollouts, WosacScenario, score
 
@@ -91,6 +93,34 @@ def test_many_scenarios(many: tuple[Path, Path], tmp_path: Path) -> None:
         again = tmp_path / "again.json"
         assert run(scenario, many[1], "--json", str(again), *more) == 0
         assert again.read_text() == out.read_text()
+
+
+def test_scenarios_are_read_as_they_are_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"scenario{k:02d}" for k in range(12)]
+    write_records(tmp_path / "all.tfrecord", [womd_record(n, tracks=2).SerializeToString() for n in names])
+    (tmp_path / "rollouts").mkdir()
+    for seed, name in enumerate(names):
+        made = record_rollouts(womd_record(name, tracks=2), seed=seed % 3)
+        write_rollouts(tmp_path / "rollouts" / f"{name}.npz", made)
+    drawn = 0
+
+    def counted(files: list[Path]) -> Iterator[tuple[Path, int, bytes]]:
+        nonlocal drawn
+        for packed in read_scenario_payloads(files):
+            drawn += 1
+            yield packed
+
+    monkeypatch.setattr("symphony.data.sources.wosac.read_scenario_payloads", counted)
+    ahead = []
+    found = score_files(
+        tmp_path / "all.tfrecord",
+        tmp_path / "rollouts",
+        progress=lambda done, total: ahead.append((drawn - done, total)),
+    )
+    assert ahead == [(0, 12)] * 12
+    assert [one.scenario_id for one in found] == names
+    # What a scenario scores does not depend on those before it: the first three come again and again.
+    assert [one.scores for one in found] == [found[k % 3].scores for k in range(12)]
 
 
 def test_a_part_of_the_scenarios(
