@@ -11,7 +11,6 @@ The scorer itself uses one thread, whatever is allowed.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import resource
@@ -26,39 +25,42 @@ from typing import Any
 import torch
 
 from symphony.cli.wosac_files import score_files
+from symphony.files import write_json
+
+UNIT = 1 if sys.platform == "darwin" else 1024
+"""Bytes that the system counts peak memory in."""
 
 
 def measured(threads: int, repeat: int, scenario: Path, rollouts: Path, config: str) -> dict[str, Any]:
-    """In a process of its own: seconds and CPU seconds of every time, peak memory after imports and at last."""
+    """In a process of its own: seconds and CPU seconds of every time, and peak memory in bytes."""
     torch.set_num_threads(threads)
-    imported = peak()
     times = []
-    score = 0.0
     for _ in range(repeat + 1):
         wall, cpu = time.perf_counter(), time.process_time()
-        (found,) = score_files(scenario, rollouts, config)
+        score_files(scenario, rollouts, config)
         times.append((time.perf_counter() - wall, time.process_time() - cpu))
-        score = found.scores.metametric
-    return {"times": times, "imported": imported, "peak": peak(), "metametric": score}
+    return {"times": times, "peak": peak()}
 
 
 def commanded(repeat: int, scenario: Path, rollouts: Path, config: str) -> dict[str, Any]:
     """The same of the whole command."""
     files = ["--scenario", str(scenario), "--rollouts", str(rollouts), "--config", config]
     command = [sys.executable, "-m", "symphony", "wosac", "score", *files]
-    times = []
+    times, most = [], 0
     for _ in range(repeat + 1):
-        began = [resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603
-        used = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = used.ru_utime + used.ru_stime - began[0].ru_utime - began[0].ru_stime
-        times.append((time.perf_counter() - began[1], cpu))
-    return {"times": times}
+        wall = time.perf_counter()
+        child = subprocess.Popen(command, stdout=subprocess.DEVNULL)  # noqa: S603
+        _, status, used = os.wait4(child.pid, 0)
+        if status:
+            raise SystemExit(f"the command ended with status {status}")
+        times.append((time.perf_counter() - wall, used.ru_utime + used.ru_stime))
+        most = max(most, used.ru_maxrss * UNIT)
+    return {"times": times, "peak": most}
 
 
 def peak() -> int:
     """Peak memory of this process so far, bytes."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * UNIT
 
 
 def alone(function: Callable[..., dict[str, Any]], *args: Any) -> dict[str, Any]:
@@ -72,7 +74,7 @@ def line(name: str, found: dict[str, Any]) -> str:
     (first, _), *rest = found["times"]
     wall, cpu = zip(*rest, strict=True)
     cells = [f"{min(values):.2f} / {statistics.median(values):.2f}" for values in (wall, cpu)]
-    memory = f"{found['peak'] / 1e9:.2f} ({found['imported'] / 1e9:.2f})" if "peak" in found else ""
+    memory = f"{found['peak'] / 1e9:.2f}"
     return f"| {' | '.join([name, f'{first:.2f}', *cells, memory])} |"
 
 
@@ -93,12 +95,12 @@ def main() -> None:
     found["whole command"] = commanded(*what)
     load = os.getloadavg()[0]
     print(f"{given.repeat} times; {os.cpu_count()} cores, load {load:.1f}\n")
-    print("| | first s | s, min / median | CPU s, min / median | peak GB (after imports) |")
+    print("| | first s | s, min / median | CPU s, min / median | peak GB |")
     print("| --- | --- | --- | --- | --- |")
     for name, part in found.items():
         print(line(name, part))
     if given.json is not None:
-        given.json.write_text(json.dumps({"load": load, **found}, indent=1) + "\n")
+        write_json(given.json, {"cores": os.cpu_count(), "load": load, "measured": found})
 
 
 if __name__ == "__main__":
