@@ -97,12 +97,47 @@ SEARCH = (
 )
 """Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
 REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
-REAL_ROWS = (
-    ("constant velocity", "ngsim-constant-velocity"),
-    ("BC", "ngsim-bc"),
-    ("BC+TS+H without its search", "ngsim-none"),
-    ("BC+TS+H", "ngsim-replace-branch"),
+ROAD_BASELINES = (("log playback", "playback"), ("constant velocity", "constant_velocity"), ("IDM", "idm"))
+ROAD_AGENTS = {
+    "bc": "BC",
+    "bc_h": "BC+H",
+    "bc_ts": "BC+TS",
+    "none": "BC+TS+H without its search",
+    "bc_ts_h": "BC+TS+H",
+    "mgail_ts_h": "MGAIL+TS+H",
+}
+LEARNED_FROM = {"sumo": "SUMO", "ngsim": "NGSIM", "both": "SUMO, NGSIM"}
+ELSEWHERE = {
+    "2-constant_velocity": "driving/ngsim-constant-velocity",
+    "2-both-bc": "driving/ngsim-bc",
+    "2-both-none": "driving/ngsim-none",
+    "2-both-bc_ts_h": "driving/ngsim-replace-branch",
+}
+"""Records of the table on real roads that other tables have, too."""
+UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
+UNSEEN_ROWS = (
+    ("log playback", "idm", "playback"),
+    ("constant velocity", "idm", "constant_velocity"),
+    ("IDM", "idm", ""),
+    ("BC", "bc", ""),
+    ("BC+TS+H without its search", "bc_h", ""),
+    ("BC+TS+H", "bc_ts_h", ""),
+    ("MGAIL+TS+H", "mgail_ts_h", ""),
 )
+BY_KIND = {
+    "collision_rate": ("collisions %", 1),
+    "collision_with_playback": ("with playback", 1),
+    "collision_into_leader": ("into a leader", 1),
+    "collision_rear_ended": ("rear-ended", 1),
+    "collision_crossing": ("crossing", 1),
+    "collision_oncoming": ("oncoming", 1),
+    "collision_sideswipe": ("sideswipe", 1),
+    "offroad_time": ("off-road %", 2),
+    "ade": ("ADE m", 2),
+    "min_sade": ("minSADE m", 2),
+}
+"""Collisions by kind beside the other figures: their headings, and the digits after their points."""
+WITH_ERROR = ("collision_rate", "ade", "min_sade")
 DRIVEN = {"town": "towns", "ngsim": "real roads"}
 INCLUDED = (
     ("log playback", "none", "playback"),
@@ -321,12 +356,29 @@ def included() -> Grid:
     return grid
 
 
-def by_place() -> Grid:
+def road_rows(count: int) -> list[tuple[str, str, Record]]:
+    """What was learned from, agent and record on the NGSIM test part, as far as there are records, for a number of
+    interactive agents.
+    """
+    names = [("", label, name) for label, name in ROAD_BASELINES]
+    for data, source in LEARNED_FROM.items():
+        names += [(source, label, f"{data}-{method}") for method, label in ROAD_AGENTS.items()]
+    found = []
+    for source, label, name in names:
+        path = RECORDS / f"roads/{count}-{name}.json"
+        if not path.is_file() and f"{count}-{name}" in ELSEWHERE:
+            path = RECORDS / f"{ELSEWHERE[f'{count}-{name}']}.json"
+        if path.is_file():
+            found.append((source, label, json.loads(path.read_text())))
+    return found
+
+
+def by_place(count: int) -> Grid:
     """Each place of the NGSIM test part: collisions (in brackets those with playback vehicles) and ADE."""
-    grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
-    for label, name in REAL_ROWS:
-        (record,) = records(f"driving/{name}")
-        line = [label]
+    head = [f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m")]
+    grid = [["", "learned from", *head]]
+    for source, label, record in road_rows(count):
+        line = [label, source]
         for place in REAL:
             rows = [row for row in record["per_segment"] if place in row["group"]]
             groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
@@ -338,6 +390,32 @@ def by_place() -> Grid:
                 line.append(f"{mean:.{digits}f} ± {error:.{digits}f}{aside}")
         grid.append(line)
     return grid
+
+
+def by_kind(count: int) -> Grid:
+    """The NGSIM test part as a whole: collisions by kind."""
+    grid = [["", "learned from", *(heading for heading, _ in BY_KIND.values())]]
+    return grid + [[label, source, *kinds_of(record)] for source, label, record in road_rows(count)]
+
+
+def unseen() -> Grid:
+    """Real roads that no agent has learned from, one set after the other."""
+    grid = [["", "", *(heading for heading, _ in BY_KIND.values())]]
+    for data, title in UNSEEN.items():
+        for label, name, part in UNSEEN_ROWS:
+            (record,) = records(f"roads/{data}-{name}")
+            size = f"{title} ({record['segments']} segments, {record['groups']} recordings)"
+            row = record[part] if part else record
+            grid.append([size if label == UNSEEN_ROWS[0][0] else "", label, *kinds_of(row)])
+    return grid
+
+
+def kinds_of(row: Record) -> list[str]:
+    """Cells of :data:`BY_KIND`, some with their errors."""
+    return [
+        f"{row[key]:.{digits}f}" + (f" ± {row[f'{key}_se']:.{digits}f}" if key in WITH_ERROR else "")
+        for key, (_, digits) in BY_KIND.items()
+    ]
 
 
 def wosac(data: str) -> Grid:
@@ -437,7 +515,11 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "search-ngsim": lambda: searched("search", "ngsim"),
     "driving-town": lambda: searched("driving", "town"),
     "driving-ngsim": lambda: searched("driving", "ngsim"),
-    "driving-places": by_place,
+    "driving-places": lambda: by_place(2),
+    "roads-places-many": lambda: by_place(8),
+    "roads": lambda: by_kind(2),
+    "roads-many": lambda: by_kind(8),
+    "roads-unseen": unseen,
     "included": included,
     "labels": lambda: means(LABELS),
     "wosac-log": wosac_log,

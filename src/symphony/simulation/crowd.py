@@ -188,7 +188,7 @@ def crowd_dataset(
         Crowd.of(config, agent.interactive if default is None else default),
         agent.dynamics,
         indices,
-        routes=agent.goals is not None or routes,
+        routes=agent.routed or routes,
         duration=config.duration or agent.duration,
         keep=config.batch,
     )

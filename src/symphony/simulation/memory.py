@@ -8,6 +8,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
+from symphony.errors import DataWarning
+
 T = TypeVar("T")
 
 SHARE = 0.125
@@ -80,6 +82,7 @@ class ItemCache(Generic[T]):
                 warnings.warn(
                     f"{self.name} take more than {self.limit / 2**30:.2g} GiB of memory: {len(self._kept)} are kept, "
                     "others are prepared anew each time they are drawn",
+                    DataWarning,
                     stacklevel=2,
                 )
             self._forget()

@@ -191,7 +191,7 @@ def _driven(
     log: RunSegment | None = None,
 ) -> Doubles:
     """[R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
-    graph = LaneGraph(start.road) if agent.goals is not None else None
+    graph = LaneGraph(start.road) if agent.routed else None
     scenes = scene(start, vehicles.tolist(), graph)
     if graph is not None and log is not None:
         # The first state is the same, so the routes are; which of them was taken is for the log to say.
