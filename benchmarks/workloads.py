@@ -63,6 +63,8 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
         "agent_type": np.zeros(agents),
         "interactive": np.arange(agents),
         "interactive_valid": np.ones(agents),
+        "enter": np.zeros(agents),
+        "background": np.zeros(agents),
         "last_step": steps - 1,
         "point": start,
         "point_direction": direction,

@@ -172,6 +172,8 @@ WOSAC = (
 )
 """Rows of the WOSAC score, as far as there are records: label, end of the record's name."""
 WOSAC_LOGS = (("sumo", "playback"), ("ngsim", "playback"), ("ngsim", "playback_thinned"))
+OFFICIAL = (79.0, 139.0, 2.5)
+"""Of the official code on the reference scenario: seconds on two cores, CPU seconds, GB."""
 NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
 
 
@@ -426,12 +428,44 @@ def wosac(data: str) -> Grid:
 
 def wosac_log() -> Grid:
     """What the log itself scores in every component."""
-    columns = [records(f"wosac/{data}-bc_h")[0]["agents"][name] for data, name in WOSAC_LOGS]
+    columns = [records(f"wosac/{data}-bc")[0]["agents"][name] for data, name in WOSAC_LOGS]
     names = [name for name in columns[0] if name.endswith("_likelihood")]
-    grid = [["", "town-small, 5 Hz", "NGSIM, 10 Hz", "NGSIM, at 5 Hz and back"]]
+    grid = [["", "town-small, 5 Hz", "NGSIM, 10 Hz, 5 s", "NGSIM, at 5 Hz and back, 5 s"]]
     for name in ("metametric", *names):
         label = name.removesuffix("_likelihood").replace("_", " ")
         grid.append([label, *(f"{numbers[name]:.4f}" for numbers in columns)])
+    return grid
+
+
+def wosac_parity() -> Grid:
+    """Differences from the official scores, the largest of all sets of rollouts and of each."""
+    grid = [
+        ["rollouts", "metametric 2024, 2025", "its difference", "of a component", "of a feature, m", "flags"]
+    ]
+    for name, case in records("wosac/parity")[0].items():
+        years = [case[year] for year in ("2024", "2025")]
+        apart = [max(year[f"{key}_difference"] for year in years) for key in ("metametric", "component")]
+        numbers = [value for key, value in case["features"].items() if not key.endswith("_per_step")]
+        flags = sum(value for key, value in case["features"].items() if key.endswith("_per_step"))
+        grid.append([
+            name.partition("_")[2].replace("_", " "),
+            ", ".join(f"{year['metametric']:.6f}" for year in years),
+            *(f"{value:.0e}" for value in (*apart, max(numbers))),
+            f"{flags:.0f}",
+        ])  # fmt: skip
+    return grid
+
+
+def wosac_speed() -> Grid:
+    """Time and memory of one scenario beside those of the official code."""
+    record = records("wosac/speed")[0]["measured"]
+    grid = [["", "s", "CPU s", "memory GB", "times faster", "CPU time"]]
+    grid.append(["official code", *(f"{value:g}" for value in OFFICIAL), "", ""])
+    for name, found in record.items():
+        wall, cpu = zip(*found["times"][1:], strict=True)
+        cells = [f"{min(values):.2f} (median {np.median(values):.2f})" for values in (wall, cpu)]
+        ratios = [f"{other / min(own):.0f}" for other, own in zip(OFFICIAL[:2], (wall, cpu), strict=True)]
+        grid.append([name, *cells, f"{found['peak'] / 1e9:.2f}", *ratios])
     return grid
 
 
@@ -490,6 +524,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "included": included,
     "labels": lambda: means(LABELS),
     "wosac-log": wosac_log,
+    "wosac-parity": wosac_parity,
+    "wosac-speed": wosac_speed,
     "wosac-sumo": lambda: wosac("sumo"),
     "wosac-ngsim": lambda: wosac("ngsim"),
     "planners": lambda: planner_grid(records("planners/*")),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -42,7 +43,7 @@ class Agent:
         goals: draws routes from first states; None for agents that follow none.
         discriminator: scores states; None for agents trained without.
         rule: name of what drives in place of the policy, along the routes of the log (see
-            ``symphony.simulation.driving.RULES``); empty for none.
+            ``symphony.simulation.driving.RULES``); None for none.
     """
 
     name: str
@@ -50,7 +51,7 @@ class Agent:
     spec: AgentSpec | None = None
     goals: TensorDictModuleBase | None = None
     discriminator: TensorDictModuleBase | None = None
-    rule: str = ""
+    rule: Literal["constant_velocity", "idm"] | None = None
 
     @property
     def dynamics(self) -> Bicycle | Displacement:
@@ -138,7 +139,7 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     if name == "constant_velocity":
         return Agent(name, ConstantVelocity(Bicycle()))
     if name == "idm":
-        return Agent(name, ConstantVelocity(Bicycle()), rule=name)
+        return Agent(name, ConstantVelocity(Bicycle()), rule="idm")
     if name == "random":
         return Agent(name, RandomActions(Bicycle()))
     folder, which = split_name(name)

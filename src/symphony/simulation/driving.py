@@ -194,7 +194,7 @@ def _ruled(
     ruled.background = scenes.interactive_valid
     if given is not None:
         ruled.route_logged = torch.where(given >= 0, given, scenes.route_logged)
-    return ruled, dataclasses.replace(config, others=agent.rule)
+    return ruled, dataclasses.replace(config, others=agent.rule or config.others)
 
 
 def _with_fixed_goals(
