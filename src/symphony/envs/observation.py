@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
+from torchrl.data import Binary, Composite, Unbounded
 
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
-from symphony.envs.routes import along_route, route_ahead
+from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, along_route, route_ahead
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners, box_gap
@@ -55,9 +56,10 @@ class ObservationConfig:
         route: whether it observes the route that is its goal.
         along: whether it observes where the objects are along that route.
         gaps: whether it observes how far its box is from others.
+        road: whether it observes how far its box is from the edge of the road, and how far its centre would be ahead.
         clearance: whether it observes how far its box is from others and from the edge of the road.
         foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
-            speed and course; with ``gaps`` or ``clearance`` only.
+            speed and course; with ``gaps`` or ``clearance`` only, and with ``road`` likewise from the edge.
         own: whether it observes its own speed and size.
     """
 
@@ -70,6 +72,7 @@ class ObservationConfig:
     route: bool = False
     along: bool = False
     gaps: bool = False
+    road: bool = False
     clearance: bool = False
     foresight: tuple[float, ...] = ()
     own: bool = True
@@ -115,6 +118,7 @@ class Observation(NamedTuple):
         gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked.
         gap_ahead: [M, N, O, H] likewise at H times ahead.
         road: [M, N, 5] metres of centre and corners off the road, negative on it.
+        road_ahead: [M, N, H] likewise of the centre at H times ahead.
         route: [M, N, Fr], see :func:`symphony.envs.routes.route_ahead`.
         along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
     """
@@ -129,8 +133,40 @@ class Observation(NamedTuple):
     gap: Tensor | None = None
     gap_ahead: Tensor | None = None
     road: Tensor | None = None
+    road_ahead: Tensor | None = None
     route: Tensor | None = None
     along: Tensor | None = None
+
+
+def observation_spec(config: ObservationConfig, agents: int, device: torch.device | None = None) -> Composite:
+    """Shapes of what each of N agents observes, under the names of :class:`Observation`."""
+    widths: dict[str, tuple[int, ...]] = {}
+    if config.own:
+        widths["own"] = (SELF_FEATURES,)
+    if config.num_objects:
+        widths["objects"] = (config.num_objects, OBJECT_FEATURES)
+    if config.num_points:
+        widths["points"] = (config.num_points, POINT_FEATURES)
+    if config.num_lights:
+        widths["lights"] = (config.num_lights, POINT_FEATURES)
+    masks = {f"{name}_mask": width[:1] for name, width in widths.items() if len(width) > 1}
+    if config.route:
+        widths["route"] = (ROUTE_FEATURES,)
+    if config.clearance or config.road:
+        widths["road"] = (5,)
+    if config.road and config.foresight:
+        widths["road_ahead"] = (len(config.foresight),)
+    if config.num_objects and (config.clearance or config.gaps):
+        widths["gap"] = (config.num_objects,)
+        if config.foresight:
+            widths["gap_ahead"] = (config.num_objects, len(config.foresight))
+    if config.num_objects and config.along:
+        widths["along"] = (config.num_objects, ALONG_FEATURES)
+    numbers = {name: Unbounded(shape=(agents, *width), device=device) for name, width in widths.items()}
+    flags = {
+        name: Binary(shape=(agents, *width), dtype=torch.bool, device=device) for name, width in masks.items()
+    }
+    return Composite({**numbers, **flags}, shape=(agents,))
 
 
 def objects_at(
@@ -205,7 +241,7 @@ def observe(
     origin, heading = own[..., :2], own[..., 2]
     speed = rotate(own[..., 3:], -heading)[..., 0]
     features, points, points_mask, road, route = None, None, None, None, None
-    lights, lights_mask = None, None
+    lights, lights_mask, road_ahead = None, None, None
     if config.own:
         ends = (step >= scenes.last_step[scene]).to(own.dtype)
         features = torch.cat(
@@ -226,9 +262,15 @@ def observe(
     if config.route and routes is not None:
         pose = torch.cat([own[..., :3], speed[..., None]], -1)
         route = route_ahead(pose, *routes, config.distance_scale)
-    if config.clearance:
-        corners = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
-        road = road_distance(scenes, scene, corners.flatten(1, 2), tables).unflatten(1, corners.shape[1:3])
+    if config.clearance or config.road:
+        places = [origin[..., None, :], box_corners(origin, heading, own_size)]
+        if config.road and config.foresight:
+            times = constant(config.foresight, own.dtype, own.device)[:, None]
+            places.append(origin[..., None, :] + times * own[..., None, 3:])
+        queried = torch.cat(places, -2)
+        away = road_distance(scenes, scene, queried.flatten(1, 2), tables).unflatten(1, queried.shape[1:3])
+        road, ahead = away[..., :5], away[..., 5:]
+        road_ahead = ahead if config.road and config.foresight else None
     return Observation(
         own=features,
         objects=seen.features,
@@ -240,6 +282,7 @@ def observe(
         gap=seen.gap,
         gap_ahead=seen.gap_ahead,
         road=road,
+        road_ahead=road_ahead,
         route=route,
         along=seen.along,
     )
