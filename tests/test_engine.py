@@ -126,8 +126,9 @@ def who_imported(_: int) -> tuple[int, int]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
-def test_workers_share_what_was_imported_for_them() -> None:
+def test_workers_share_what_was_imported_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
     forkserver._forkserver._stop()  # type: ignore[attr-defined]  # one of earlier tests
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     found = list(ordered_map(who_imported, range(8), workers=2))
     servers, workers = {importer for importer, _ in found}, {worker for _, worker in found}
     assert len(servers) == 1

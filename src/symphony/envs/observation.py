@@ -80,7 +80,8 @@ class ObservationConfig:
     @property
     def blind(self) -> bool:
         """Whether nothing is asked for, a route aside."""
-        return not (self.own or self.num_objects or self.num_points or self.num_lights or self.clearance)
+        counts = self.num_objects, self.num_points, self.num_lights
+        return not (any(counts) or self.own or self.road or self.clearance)
 
     @classmethod
     def nothing(cls) -> ObservationConfig:
@@ -233,7 +234,7 @@ def observe(
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
         routes: points of the agents' routes and how many of them exist; without, nothing of routes is observed.
     """
-    if config.blind and (routes is None or not config.route):
+    if config.blind and not config.route:
         return Observation()
     tables = Tables(scenes, config) if tables is None else tables
     own = _take(objects.state, index)
