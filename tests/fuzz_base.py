@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+import zlib
 from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +30,18 @@ class Target:
     good: Callable[[], Files]
     mutate: Callable[[Rng, Files], Files]
     run: Callable[[Path, str], tuple[str, str]]
+
+
+every = ContextVar("every", default=False)
+"""Whether more is done with all files."""
+
+
+def one_in(many: int, folder: Path) -> bool:
+    """Whether the files of a folder are among the one in so many that more is done with; the same ones always."""
+    return (
+        every.get()
+        or zlib.crc32(b"".join(each.read_bytes() for each in sorted(folder.rglob("*.*")))) % many == 0
+    )
 
 
 def written(write: Callable[[Path], Path]) -> Callable[[], Files]:

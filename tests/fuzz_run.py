@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import gc
 import json
 import os
 import resource
@@ -21,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fuzz_base import FOREIGN, Files, Target
+from fuzz_base import FOREIGN, Files, Target, every
 from fuzz_targets import TARGETS
 from kills_run import spent_alone as spent
 
@@ -29,8 +30,9 @@ SECONDS, MEMORY = 10, 1 << 30
 """What one input may take; CPU time, as the machine may be busy."""
 WAIT = 20
 """So many times longer may an input take that does nothing, or is not let."""
-BATCH = 200
+BATCH = 500
 """Inputs per process."""
+PLACE = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108 - memory, as millions of files come and go
 OUTCOMES = ("accepted", "refused", "foreign", "hang", "memory", "crash", "absurd")
 BAD = OUTCOMES[2:]
 KEPT = 20
@@ -106,8 +108,11 @@ def fuzz(
     tell: Callable[[], None] | None = None,
 ) -> None:
     """Go on with a target until so many inputs are counted, or a moment of :func:`time.monotonic` has come."""
-    with tempfile.TemporaryDirectory() as folder:  # here, lest each process import everything anew
+    with tempfile.TemporaryDirectory(dir=PLACE) as folder:  # here, lest each process import everything anew
+        token = every.set(True)
         attempt(TARGETS[name], dict(TARGETS[name].good()), Path(folder))
+        every.reset(token)
+    gc.freeze()  # lest each process go through, and so copy, all that was there before it
     while counts.inputs < total and time.monotonic() < until:
         _batch(name, counts, min(total, counts.inputs + BATCH), seed, until)
         if tell is not None:
@@ -116,7 +121,7 @@ def fuzz(
 
 def _batch(name: str, counts: Counts, stop: int, seed: int, until: float) -> None:
     """Inputs in one process; ends early after one that it did not survive."""
-    folder = Path(tempfile.mkdtemp(prefix="symphony-fuzz-"))
+    folder = Path(tempfile.mkdtemp(prefix="symphony-fuzz-", dir=PLACE))
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
@@ -137,9 +142,10 @@ def _batch(name: str, counts: Counts, stop: int, seed: int, until: float) -> Non
                     counts.add(counts.inputs, *lost)
                     return
                 *lines, data = (data + chunk).split(b"\n")
-                began, told = time.monotonic(), spent(child)
+                began = time.monotonic()
                 for line in lines:
-                    counts.add(counts.inputs, *json.loads(line))
+                    outcome, detail, told = json.loads(line)
+                    counts.add(counts.inputs, outcome, detail)
                 if time.monotonic() > until:
                     return
     finally:
@@ -154,6 +160,7 @@ def _work(name: str, numbers: range, seed: int, pipe: int, folder: Path) -> None
     try:
         faulthandler.disable()
         os.fsync = lambda _: None  # nothing here is to last
+        tempfile.tempdir = str(folder)
         null = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(null, stream)
@@ -165,7 +172,7 @@ def _work(name: str, numbers: range, seed: int, pipe: int, folder: Path) -> None
             place.mkdir()
             result = attempt(TARGETS[name], inputs(name, seed, number), place)
             shutil.rmtree(place, ignore_errors=True)
-            os.write(pipe, json.dumps(result).encode() + b"\n")
+            os.write(pipe, json.dumps((*result, time.process_time())).encode() + b"\n")
     finally:
         os._exit(0)
 

@@ -5,12 +5,12 @@ A reader is one entry of :data:`TARGETS`: :func:`reader` with its good files; th
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import io
 import json
 import tempfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,13 @@ import numpy as np
 
 import fuzz_mutations as change
 import fuzz_results
-from fuzz_base import ABSURD, ACCEPTED, FOREIGN, REFUSED, Files, Rng, Target, written
+from fuzz_base import ABSURD, ACCEPTED, FOREIGN, REFUSED, Files, Rng, Target, one_in, written
 from symphony.data.segment import RunSegment
+
+USED = 12
+"""One in so many good segments is used, which takes far more time than reading it."""
+SHORT = range(30)
+"""Steps of the recordings that are changed."""
 
 
 def reader(name: str, good: Callable[[], Files], **mutations: Callable[[Rng, bytes], bytes]) -> Target:
@@ -57,7 +62,7 @@ def _read(name: str, folder: Path, file: str) -> tuple[str, str]:
                 return ABSURD, absurd(item)
         else:
             refused = True
-    if good:
+    if good and one_in(USED, folder):
         _use(good[0], folder)
     return (REFUSED if refused else ACCEPTED), ""
 
@@ -92,8 +97,6 @@ def _use(segment: RunSegment, folder: Path) -> None:
     from symphony.errors import DataError
     from symphony.simulation.demonstrations import SceneDataset
 
-    if zlib.crc32(segment.position.tobytes()) % 3:  # it takes the most time: one in three will do
-        return
     recipe = Preparation(get_reader("commonroad"), 0.2, 0.3, 1)
     prepared = recipe._prepared(segment, "a")
     if not isinstance(prepared, RunSegment):
@@ -128,14 +131,13 @@ def _womd() -> Files:
 def _records(rng: Rng, data: bytes) -> bytes:
     """A message changed, or its bytes; the checksums are right again, but for one time in ten."""
     from symphony.data.sources import womd_pb2 as pb
-    from symphony.data.sources.tfrecord import read_records, write_records
+    from symphony.data.sources.tfrecord import write_records
 
     if rng.random() < 0.1:
         return change.bytes_(rng, data)
+    payloads = list(_payloads(data))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a"
-        path.write_bytes(data)
-        payloads = [each for each in read_records(path) if isinstance(each, bytes)]
         which = int(rng.integers(len(payloads)))
         if rng.random() < 0.25:
             payloads[which] = change.bytes_(rng, payloads[which])
@@ -143,8 +145,20 @@ def _records(rng: Rng, data: bytes) -> bytes:
             record = pb.Scenario.FromString(payloads[which])
             change.message(rng, record)
             payloads[which] = record.SerializeToString()
+        if rng.random() < 0.75:  # alone, which takes half of the time
+            payloads = payloads[which : which + 1]
         write_records(path, payloads)
         return path.read_bytes()
+
+
+@functools.cache
+def _payloads(data: bytes) -> tuple[bytes, ...]:
+    from symphony.data.sources.tfrecord import read_records
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        path.write_bytes(data)
+        return tuple(each for each in read_records(path) if isinstance(each, bytes))
 
 
 def _commonroad() -> Files:
@@ -172,15 +186,27 @@ def _argoverse2() -> Files:
 
 
 def _interaction(folder: Path) -> Path:
-    from helpers_interaction import public, walker
+    from helpers_interaction import public, walker, with_area
 
-    return public(folder, walkers=walker("P1"))
+    path = public(folder, _cars(), walkers=walker("P1", steps=SHORT))
+    next(folder.glob("maps/*")).write_text(with_area())
+    return path
 
 
 def _test_area(folder: Path) -> Path:
     from helpers_interaction import taf
 
-    return taf(folder)
+    return taf(folder, rows=_cars())
+
+
+def _cars() -> list[str]:
+    from helpers_interaction import track
+
+    return [
+        *track(3, steps=SHORT),
+        *track(5, x=-10, y=6, speed=9, steps=SHORT),
+        *track(9, x=20, speed=0)[:20],
+    ]
 
 
 def _scenarionet(folder: Path) -> Path:
@@ -196,7 +222,7 @@ def _parquet(rng: Rng, data: bytes) -> bytes:
 
     if rng.random() < 0.2:
         return change.bytes_(rng, data)
-    columns = parquet.read_table(pa.BufferReader(data)).to_pydict()
+    columns = dict(_columns(data))
     for _ in range(int(rng.integers(1, 4))):
         name = change.pick(rng, list(columns))
         values = list(columns[name])
@@ -222,6 +248,14 @@ def _parquet(rng: Rng, data: bytes) -> bytes:
     except (pa.ArrowException, ValueError, TypeError, OverflowError, AttributeError):
         return change.bytes_(rng, data)  # nobody could write that
     return buffer.getvalue()
+
+
+@functools.cache
+def _columns(data: bytes) -> dict[str, list[Any]]:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    return parquet.read_table(pa.BufferReader(data)).to_pydict()
 
 
 BY_SUFFIX: Mapping[str, Callable[[Rng, bytes], bytes]] = {
@@ -281,7 +315,8 @@ def _read_store(folder: Path, _: str) -> tuple[str, str]:
         info(place)
         choices(store, 2)
         store.verify()
-        _use(store[0], folder)
+        if one_in(USED // 4, folder):
+            _use(store[0], folder)
     except DataError:
         return REFUSED, ""
     return ACCEPTED, ""
@@ -309,6 +344,22 @@ def _networks() -> dict[str, Any]:
     module(torch.ones(4, 3)).sum().backward()
     optimizer.step()
     return {"modules": {"policy": module}, "optimizers": {"policy": optimizer}}
+
+
+@functools.cache
+def _kept() -> tuple[dict[str, Any], dict[str, Any]]:
+    own = _networks()
+    states = {name: each["policy"].state_dict() for name, each in own.items()}
+    return own, copy.deepcopy(states)
+
+
+def _networks_as_new() -> dict[str, Any]:
+    """The same ones each time, in the state of new ones: making them takes longer than reading a file."""
+    own, states = _kept()
+    for name, state in states.items():
+        own[name]["policy"].load_state_dict(copy.deepcopy(state))
+    own["optimizers"]["policy"].zero_grad()
+    return own
 
 
 def _checkpoint() -> Files:
@@ -344,7 +395,7 @@ def _load_checkpoint(folder: Path, _: str) -> tuple[str, str]:
     from symphony.errors import DataError
     from symphony.training.alarms import Skips
 
-    own = _networks()
+    own = _networks_as_new()
     try:
         for place in checkpoints(folder):
             loaded = load_checkpoint(place, **own)

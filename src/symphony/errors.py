@@ -55,5 +55,9 @@ class DataError(SymphonyError):
         return error
 
 
+class DataWarning(UserWarning):
+    """Data that can be used, but may not be what was meant; the command line prints it in one line."""
+
+
 class ConfigError(SymphonyError):
     """An argument or a saved configuration that can't be used."""

@@ -11,7 +11,9 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
+from typing import TextIO
 
 import tyro
 
@@ -34,7 +36,7 @@ from symphony.cli import (
     view,
     wosac,
 )
-from symphony.errors import ConfigError, SymphonyError, printable
+from symphony.errors import ConfigError, DataWarning, SymphonyError, printable
 
 __all__ = ["main"]
 
@@ -126,7 +128,8 @@ def _ended_politely() -> Iterator[None]:
 def _guarded(action: Callable[[], object]) -> int:
     """Run something; errors that a user can meet become one line and an exit status."""
     try:
-        with _ended_politely():
+        with _ended_politely(), warnings.catch_warnings():
+            warnings.showwarning = _warn
             action()
             sys.stdout.flush()
     except BrokenPipeError:
@@ -140,6 +143,21 @@ def _guarded(action: Callable[[], object]) -> int:
     except (SymphonyError, OSError) as error:
         return _complain(error, FAILED)
     return 0
+
+
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Ours in one line; those of libraries as they are."""
+    if issubclass(category, DataWarning):
+        sys.stderr.write(f"symphony: warning: {printable(str(message))}\n")
+    else:
+        (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
 def _complain(error: object, status: int) -> int:

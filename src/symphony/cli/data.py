@@ -323,6 +323,7 @@ def _print_info(found: dict[str, Any]) -> None:
         *(("odd: " + what, str(count)) for what, count in found["odd"].items()),
         *([("boxes overlap in the log of", str(found["overlaps"]))] if found["overlaps"] else []),
         *_unfinished_row(found["unfinished"]),
+        *([("unfinished", found["unfinished_generation"])] if found["unfinished_generation"] else []),
     ]
     table = Table(
         show_header=False, box=None, pad_edge=False, title=_shown(found["path"]), title_style="bold"

@@ -31,7 +31,7 @@ class Evaluate:
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="playback|RUN")]
     """Folder of a run (see `symphony train`), `pretrained:NAME` (an agent that comes with the package), `playback`
-    (the log itself) or `constant_velocity`."""
+    (the log itself), `constant_velocity` or `idm` (the intelligent driver model, along the route of the log)."""
     data: Path
     """Store of run segments to simulate."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()

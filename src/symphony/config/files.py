@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import json
 import types
+from collections.abc import Hashable
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 from symphony.errors import ConfigError
 
@@ -60,7 +62,7 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
         ConfigError: for an unknown name (with the nearest known one), a missing one, another type or a value out of
             range.
     """
-    hints = get_type_hints(kind)
+    hints = _hints(cast("Hashable", kind))
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:
         if name not in fields:
@@ -76,6 +78,11 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
         return kind(**built)
     except ConfigError as error:
         raise ConfigError(f"{where}{error}") from error
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind)  # compiles every annotation anew
 
 
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:

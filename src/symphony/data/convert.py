@@ -290,7 +290,8 @@ def info(path: str | Path) -> dict[str, Any]:
         ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
         many of these under each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is
         unusual about how many of the segments), ``groups`` (recordings the segments are of), ``overlaps`` (segments
-        in whose log boxes overlap) and ``unfinished`` (None, or how far a conversion is that will add to the store).
+        in whose log boxes overlap), ``unfinished`` (None, or how far a conversion is that will add to the store) and
+        ``unfinished_generation`` (None, or how many segments are there, of how many).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -314,6 +315,7 @@ def info(path: str | Path) -> dict[str, Any]:
         "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),
+        "unfinished_generation": store.unfinished,
     }
 
 

@@ -365,21 +365,27 @@ class SegmentStore(Sequence[RunSegment]):
             name = f"number {row}" if column == "segment_id" else self._name(row)
             raise error.at(file=self.path, segment=name) from error
 
+    @property
+    def unfinished(self) -> str | None:
+        """That its generation is still under way, or was interrupted: how many segments there are, of how many."""
+        made = self.report.get("generation")
+        if not isinstance(made, dict) or made.get("complete") is not False:
+            return None
+        settings = self.report.get("settings")
+        wanted = settings.get("segments", "more") if isinstance(settings, dict) else "more"
+        return (
+            f"holds {len(self)} of {wanted} segments: its generation is not finished; give the same "
+            "`symphony data generate` again"
+        )
+
     def check_complete(self) -> None:
         """Refuse a store that is still being generated, or whose generation was interrupted.
 
         Raises:
             DataError: says how many segments there are, of how many.
         """
-        made = self.report.get("generation")
-        if isinstance(made, dict) and made.get("complete") is False:
-            settings = self.report.get("settings")
-            wanted = settings.get("segments", "more") if isinstance(settings, dict) else "more"
-            raise DataError(
-                f"holds {len(self)} of {wanted} segments: its generation is not finished; give the same "
-                "`symphony data generate` again",
-                file=self.path,
-            )
+        if self.unfinished is not None:
+            raise DataError(self.unfinished, file=self.path)
 
     def checksum(self) -> str:
         """SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.

@@ -5,6 +5,7 @@ Legend: A agents of a segment, N driven ones.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,9 +24,9 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import beyond, map_edge
 from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, scene
-from symphony.errors import DataError
+from symphony.errors import DataError, DataWarning
 from symphony.roadgraph import LaneGraph, lane_of
-from symphony.simulation.demonstrations import KEEP, SceneDataset
+from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.experts import IN_LANE
 
 Indices = NDArray[np.int64]
@@ -134,7 +135,7 @@ class CrowdDataset(SceneDataset):
         *,
         routes: bool = False,
         duration: float = 0,
-        keep: int = KEEP,
+        keep: int | None = None,
     ) -> None:
         routes = routes or crowd.along_routes
         super().__init__(store, crowd.count, dynamics, indices, routes=routes, duration=duration, keep=keep)
@@ -176,13 +177,18 @@ def crowd_dataset(
         default: interactive agents where the configuration leaves that open; by default as many as it was trained
             with.
         routes: whether scenes come with routes even if the agent follows none.
+
+    Warns:
+        DataWarning: if the store's generation is not finished.
     """
+    if store.unfinished is not None:
+        warnings.warn(f"{store.path} {store.unfinished}", DataWarning, stacklevel=2)
     return CrowdDataset(
         store,
         Crowd.of(config, agent.interactive if default is None else default),
         agent.dynamics,
         indices,
-        routes=agent.goals is not None or routes,
+        routes=agent.routed or routes,
         duration=config.duration or agent.duration,
         keep=config.batch,
     )
