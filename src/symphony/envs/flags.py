@@ -52,9 +52,9 @@ def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[n
     radius = np.where(there, 0.5 * np.hypot(*size.numpy().T).reshape(there.shape), 0.0)
     squared = np.square(place).sum(-1)
     own_squared, own_radius = (value.take(who).reshape(index.shape) for value in (squared, radius))
-    own = place.reshape(-1, 2).take(who, axis=0).reshape(rows, subjects, 2)
+    centre = place.reshape(-1, 2).take(who, axis=0).reshape(rows, subjects, 2)
     # |a - b|^2 - |a|^2 of all pairs, by one product.
-    apart = np.matmul(-2.0 * own, place.swapaxes(1, 2))
+    apart = np.matmul(-2.0 * centre, place.swapaxes(1, 2))
     apart += np.where(there, squared, np.inf)[:, None]
     reach = np.square(own_radius + radius.max(1, keepdims=True) + _SLACK) - own_squared
     reach += _ROUNDING * (own_squared + squared.max(1, keepdims=True))
