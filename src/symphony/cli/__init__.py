@@ -13,7 +13,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TextIO
 
 import tyro
 
@@ -145,12 +145,19 @@ def _guarded(action: Callable[[], object]) -> int:
     return 0
 
 
-def _warn(message: Warning | str, category: type[Warning], *where: Any) -> None:
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     """Ours in one line; those of libraries as they are."""
     if issubclass(category, DataWarning):
         sys.stderr.write(f"symphony: warning: {printable(str(message))}\n")
     else:
-        sys.stderr.write(warnings.formatwarning(message, category, where[0], where[1]))
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
 def _complain(error: object, status: int) -> int:

@@ -136,8 +136,8 @@ class Trainer:
             except CheckpointError as error:
                 raise error.at(file=self.done / MANIFEST) from error
         self.alarms = Alarms()
-        for dataset in (self.data, self.validator and self.validator.dataset):
-            if dataset is not None and dataset.store.unfinished is not None:
+        for dataset in (self.data, self.data if self.validator is None else self.validator.dataset):
+            if dataset.store.unfinished is not None:
                 self._warn(str(dataset.store.path), f"{dataset.store.path} {dataset.store.unfinished}")
         if self.world.leads:
             # The process before may have died between a checkpoint and the removal of old ones.
