@@ -97,12 +97,46 @@ SEARCH = (
 )
 """Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
 REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
-REAL_ROWS = (
-    ("constant velocity", "ngsim-constant-velocity"),
-    ("BC", "ngsim-bc"),
-    ("BC+TS+H without its search", "ngsim-none"),
-    ("BC+TS+H", "ngsim-replace-branch"),
+ROAD_BASELINES = (("log playback", "playback"), ("constant velocity", "constant_velocity"), ("IDM", "idm"))
+ROAD_AGENTS = {
+    "bc": "BC",
+    "bc_h": "BC+H",
+    "bc_ts": "BC+TS",
+    "none": "BC+TS+H without its search",
+    "bc_ts_h": "BC+TS+H",
+    "mgail_ts_h": "MGAIL+TS+H",
+}
+LEARNED_FROM = {"sumo": "SUMO", "ngsim": "NGSIM", "both": "SUMO, NGSIM"}
+ELSEWHERE = {
+    "2-constant_velocity": "driving/ngsim-constant-velocity",
+    "2-both-bc": "driving/ngsim-bc",
+    "2-both-none": "driving/ngsim-none",
+    "2-both-bc_ts_h": "driving/ngsim-replace-branch",
+}
+"""Records of the table on real roads that other tables have, too."""
+UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
+UNSEEN_ROWS = (
+    ("log playback", "idm", "playback"),
+    ("constant velocity", "idm", "constant_velocity"),
+    ("IDM", "idm", ""),
+    ("BC", "bc", ""),
+    ("BC+TS+H without its search", "bc_h", ""),
+    ("BC+TS+H", "bc_ts_h", ""),
+    ("MGAIL+TS+H", "mgail_ts_h", ""),
 )
+KINDS = {
+    "collision_rate": ("collisions %", 1),
+    "collision_with_playback": ("with playback", 1),
+    "collision_into_leader": ("into a leader", 1),
+    "collision_rear_ended": ("rear-ended", 1),
+    "collision_crossing": ("crossing", 1),
+    "collision_oncoming": ("oncoming", 1),
+    "collision_sideswipe": ("sideswipe", 1),
+}
+"""Collisions by kind: their headings, and the digits after their points."""
+NO_CARS = {"collision_pedestrian": ("into a pedestrian", 1), "collision_cyclist": ("into a cyclist", 1)}
+OTHERWISE = {name: COLUMNS[name] for name in ("offroad_time", "ade", "min_sade")}
+WITH_ERROR = ("collision_rate", "ade", "min_sade")
 DRIVEN = {"town": "towns", "ngsim": "real roads"}
 INCLUDED = (
     ("log playback", "none", "playback"),
@@ -138,6 +172,8 @@ WOSAC = (
 )
 """Rows of the WOSAC score, as far as there are records: label, end of the record's name."""
 WOSAC_LOGS = (("sumo", "playback"), ("ngsim", "playback"), ("ngsim", "playback_thinned"))
+OFFICIAL = (79.0, 139.0, 2.5)
+"""Of the official code on the reference scenario: seconds on two cores, CPU seconds, GB."""
 NAMES = {"mgail_h": "MGAIL+H", "mgail": "MGAIL"}
 
 
@@ -319,12 +355,29 @@ def included() -> Grid:
     return grid
 
 
-def by_place() -> Grid:
+def road_rows(count: int) -> list[tuple[str, str, Record]]:
+    """What was learned from, agent and record on the NGSIM test part, as far as there are records, for a number of
+    interactive agents.
+    """
+    names = [("", label, name) for label, name in ROAD_BASELINES]
+    for data, source in LEARNED_FROM.items():
+        names += [(source, label, f"{data}-{method}") for method, label in ROAD_AGENTS.items()]
+    found = []
+    for source, label, name in names:
+        path = RECORDS / f"roads/{count}-{name}.json"
+        if not path.is_file() and f"{count}-{name}" in ELSEWHERE:
+            path = RECORDS / f"{ELSEWHERE[f'{count}-{name}']}.json"
+        if path.is_file():
+            found.append((source, label, json.loads(path.read_text())))
+    return found
+
+
+def by_place(count: int) -> Grid:
     """Each place of the NGSIM test part: collisions (in brackets those with playback vehicles) and ADE."""
-    grid = [["", *(f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m"))]]
-    for label, name in REAL_ROWS:
-        (record,) = records(f"driving/{name}")
-        line = [label]
+    head = [f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m")]
+    grid = [["", "learned from", *head]]
+    for source, label, record in road_rows(count):
+        line = [label, source]
         for place in REAL:
             rows = [row for row in record["per_segment"] if place in row["group"]]
             groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
@@ -338,6 +391,34 @@ def by_place() -> Grid:
     return grid
 
 
+def by_kind(count: int) -> Grid:
+    """The NGSIM test part as a whole: collisions by kind."""
+    columns = KINDS | OTHERWISE
+    grid = [["", "learned from", *(heading for heading, _ in columns.values())]]
+    return grid + [[label, source, *figures(record, columns)] for source, label, record in road_rows(count)]
+
+
+def unseen() -> Grid:
+    """Real roads that no agent has learned from, one set after the other."""
+    columns = KINDS | NO_CARS | OTHERWISE
+    grid = [["", "", *(heading for heading, _ in columns.values())]]
+    for data, title in UNSEEN.items():
+        for label, name, part in UNSEEN_ROWS:
+            (record,) = records(f"roads/{data}-{name}")
+            size = f"{title} ({record['segments']} segments, {record['groups']} recordings)"
+            row = record[part] if part else record
+            grid.append([size if label == PLAYBACK else "", label, *figures(row, columns)])
+    return grid
+
+
+def figures(row: Record, columns: dict[str, tuple[str, int]]) -> list[str]:
+    """Figures of a row, some with their errors."""
+    return [
+        f"{row[key]:.{digits}f}" + (f" ± {row[f'{key}_se']:.{digits}f}" if key in WITH_ERROR else "")
+        for key, (_, digits) in columns.items()
+    ]
+
+
 def wosac(data: str) -> Grid:
     """The WOSAC score of agents, beside the baselines."""
     files = [(label, RECORDS / "wosac" / f"{data}-{name}.json") for label, name in WOSAC]
@@ -347,12 +428,45 @@ def wosac(data: str) -> Grid:
 
 def wosac_log() -> Grid:
     """What the log itself scores in every component."""
-    columns = [records(f"wosac/{data}-bc_h")[0]["agents"][name] for data, name in WOSAC_LOGS]
+    columns = [records(f"wosac/{data}-bc")[0]["agents"][name] for data, name in WOSAC_LOGS]
     names = [name for name in columns[0] if name.endswith("_likelihood")]
-    grid = [["", "town-small, 5 Hz", "NGSIM, 10 Hz", "NGSIM, at 5 Hz and back"]]
+    grid = [["", "town-small, 5 Hz", "NGSIM, 10 Hz, 5 s", "NGSIM, at 5 Hz and back, 5 s"]]
     for name in ("metametric", *names):
         label = name.removesuffix("_likelihood").replace("_", " ")
         grid.append([label, *(f"{numbers[name]:.4f}" for numbers in columns)])
+    return grid
+
+
+def wosac_parity() -> Grid:
+    """Differences from the official scores, the largest of all sets of rollouts and of each."""
+    grid = [
+        ["rollouts", "metametric 2024, 2025", "its difference", "of a component", "of a feature, m", "flags"]
+    ]
+    for name, case in records("wosac/parity")[0].items():
+        years = [case[year] for year in ("2024", "2025")]
+        apart = [max(year[f"{key}_difference"] for year in years) for key in ("metametric", "component")]
+        numbers = [value for key, value in case["features"].items() if not key.endswith("_per_step")]
+        flags = sum(value for key, value in case["features"].items() if key.endswith("_per_step"))
+        grid.append([
+            name.partition("_")[2].replace("_", " "),
+            ", ".join(f"{year['metametric']:.6f}" for year in years),
+            *(f"{value:.0e}" for value in (*apart, max(numbers))),
+            f"{flags:.0f}",
+        ])  # fmt: skip
+    return grid
+
+
+def wosac_speed() -> Grid:
+    """Time and memory of one scenario beside those of the official code."""
+    record = records("wosac/speed")[0]
+    heads = (f"s (load {record['load']:.0f})", "CPU s", "peak GB", "times less s", "times less CPU s")
+    grid = [["", *heads]]
+    grid.append(["official code", *(f"{value:g}" for value in OFFICIAL), "", ""])
+    for name, found in record["measured"].items():
+        wall, cpu = zip(*found["times"][1:], strict=True)
+        cells = [f"{min(values):.2f} (median {np.median(values):.2f})" for values in (wall, cpu)]
+        ratios = [f"{other / min(own):.0f}" for other, own in zip(OFFICIAL[:2], (wall, cpu), strict=True)]
+        grid.append([name, *cells, f"{found['peak'] / 1e9:.2f}", *ratios])
     return grid
 
 
@@ -403,10 +517,16 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "search-ngsim": lambda: searched("search", "ngsim"),
     "driving-town": lambda: searched("driving", "town"),
     "driving-ngsim": lambda: searched("driving", "ngsim"),
-    "driving-places": by_place,
+    "driving-places": lambda: by_place(2),
+    "roads-places-many": lambda: by_place(8),
+    "roads": lambda: by_kind(2),
+    "roads-many": lambda: by_kind(8),
+    "roads-unseen": unseen,
     "included": included,
     "labels": lambda: means(LABELS),
     "wosac-log": wosac_log,
+    "wosac-parity": wosac_parity,
+    "wosac-speed": wosac_speed,
     "wosac-sumo": lambda: wosac("sumo"),
     "wosac-ngsim": lambda: wosac("ngsim"),
     "planners": lambda: planner_grid(records("planners/*")),

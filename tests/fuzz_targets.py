@@ -186,9 +186,11 @@ def _argoverse2() -> Files:
 
 
 def _interaction(folder: Path) -> Path:
-    from helpers_interaction import public, walker
+    from helpers_interaction import public, walker, with_area
 
-    return public(folder, _cars(), walkers=walker("P1", steps=SHORT))
+    path = public(folder, _cars(), walkers=walker("P1", steps=SHORT))
+    next(folder.glob("maps/*")).write_text(with_area())
+    return path
 
 
 def _test_area(folder: Path) -> Path:

@@ -99,6 +99,30 @@ def osm(
     return f"<?xml version='1.0' encoding='UTF-8'?>\n<osm version='0.6'>{''.join(parts)}</osm>\n"
 
 
+LOT = {41: (50, 8), 42: (50, 28), 43: (80, 28), 44: (80, 8), 51: (60, 15), 52: (70, 15), 53: (65, 25)}
+"""Nodes of a parking lot beside the road, and of a house in it."""
+FENCES = {61: (41, 42, 43), 62: (43, 44), 63: (44, 41), 64: (51, 52), 65: (52, 53, 51)}
+
+PARKING = {"subtype": "parking"}
+
+
+def with_area(
+    tags: Mapping[str, str] = PARKING,
+    turned: tuple[bool, ...] = (False,) * 5,
+    members: str = "61o 62o 63o 64i 65i",
+) -> str:
+    """The default map with a relation of type multipolygon, whose ways are drawn in either direction."""
+    ways = {
+        name: (refs[::-1] if turn else refs, {"type": "fence"})
+        for (name, refs), turn in zip(FENCES.items(), turned, strict=True)
+    }
+    roles = {"o": "outer", "i": "inner"}
+    inner = "".join(f"<member type='way' ref='{m[:-1]}' role='{roles[m[-1]]}'/>" for m in members.split())
+    every = tag({"type": "multipolygon", **tags})
+    content = osm(nodes=NODES | LOT, ways=WAYS | ways)
+    return content.replace("</osm>", f"<relation id='301'>{inner}{every}</relation></osm>")
+
+
 COLUMNS = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width"
 WALKERS = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy"
 

@@ -28,6 +28,11 @@ FLAGS = {
     "offroad_indication": "offroad_per_step",
     "traffic_light_violation": "traffic_light_violation_per_step",
 }
+BUCKETS = {
+    "kinematic": ("linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration"),
+    "interactive": ("distance_to_nearest_object", "collision_indication", "time_to_collision"),
+    "map_based": ("distance_to_road_edge", "offroad_indication", "traffic_light_violation"),
+}
 WEIGHTS = {
     "2024": (0.05, 0.05, 0.05, 0.05, 0.1, 0.1, 0.1, 0.25, 0.25, 0.0),
     "2025": (0.05, 0.05, 0.05, 0.05, 0.1, 0.1, 0.05, 0.25, 0.25, 0.05),
@@ -301,13 +306,21 @@ def oracle_scores(
         truth, ever = (log[flag] & there).any(-1), (simulated[flag] & there).any(-1)
         share = ((ever == truth).sum(0) + 0.001) / (len(ever) + 0.002)
         found[name] = float(np.exp(np.log(share).mean()))
-    meta = sum(w * v for w, v in zip(WEIGHTS[year], found.values(), strict=True))
+    weight = dict(zip(found, WEIGHTS[year], strict=True))
+    meta = sum(weight[name] * value for name, value in found.items())
     ade = simulated["ade"]
     return {
         "metametric": meta,
         **{f"{name}_likelihood": value for name, value in found.items()},
+        **{
+            f"{bucket}_metrics": sum(weight[n] * found[n] for n in names) / sum(weight[n] for n in names)
+            for bucket, names in BUCKETS.items()
+        },
         "average_displacement_error": float(ade.mean()),
         "min_ade": float(ade.mean(-1).min()),
         "simulated_collision_rate": float((simulated["collision_per_step"] & valid).any(-1).mean()),
         "simulated_offroad_rate": float((simulated["offroad_per_step"] & valid).any(-1).mean()),
+        "simulated_traffic_light_violation_rate": float(
+            (simulated["traffic_light_violation_per_step"] & valid).any(-1).mean()
+        ),
     }

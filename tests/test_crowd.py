@@ -312,6 +312,37 @@ def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
     assert (one - many).abs().max() < 0.05
 
 
+def test_the_baseline_is_the_planner_for_everyone(store: SegmentStore) -> None:
+    config = EvaluateConfig(rollouts=1, interactive=2)
+    found = evaluate("idm", store, config, baselines=True)
+    assert [found.metrics.segments[name].single.agents for name in store.ids] == [2] * 4
+    assert {other.agent for other in found.baselines} == {"playback", "constant_velocity"}
+    # Whoever is driven follows the route of the log by the rule, the ego and others alike.
+    scenes = crowd_dataset(store, load_agent("idm"), config).scenes([2])
+    driven = simulation(load_agent("idm"), scenes, config).rollouts.state
+    scenes.background = scenes.interactive_valid
+    ruled = simulation(load_agent("constant_velocity"), scenes, replace(config, others="idm")).rollouts.state
+    assert torch.equal(driven, ruled)
+
+
+def test_the_baseline_takes_a_given_route_and_no_other_rule() -> None:
+    segment = crossing(4, seed=1)
+    scenes = scene(segment, [0, 1], LaneGraph(segment.road))
+    routes = [int(n) for n in scenes.route_count[0, 0].gt(1).nonzero()[:, 0]]
+    ends = [
+        simulation(
+            load_agent("idm"), scenes, EvaluateConfig(rollouts=1), given=torch.tensor([[route, -1]])
+        ).rollouts.state[0, 0, -1, :, :2]
+        for route in routes
+    ]
+    logged = simulation(load_agent("idm"), scenes, EvaluateConfig(rollouts=1)).rollouts.state[0, 0, -1, :, :2]
+    assert len(routes) > 1
+    assert torch.equal(ends[routes.index(int(scenes.route_logged[0, 0]))], logged)
+    assert max(float((end[0] - logged[0]).norm()) for end in ends) > 1.0
+    with pytest.raises(ConfigError, match="among others that 'constant_velocity' drives"):
+        simulation(load_agent("idm"), scenes, EvaluateConfig(rollouts=1, others="constant_velocity"))
+
+
 def test_the_car_follower_hits_nobody_in_front() -> None:
     segment = row([(60, 14, 0), (90, 3, 0), (20, 14, 0), (110, 0, 1), (30, 14, 1), (80, 14, 2)], steps=41)
     config = EvaluateConfig(rollouts=1, interactive=1, others="idm")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from helpers_segments import crossing, hide, straight_road
 from symphony.data.builtin import builtin_store
@@ -15,7 +18,8 @@ from symphony.envs import Bicycle, Displacement, ObservationConfig
 from symphony.geometry import forward_speed
 from symphony.simulation import experts as module
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.experts import ExpertCache, Experts, experts, fit_experts
+from symphony.simulation.experts import Experts, experts, fit_experts
+from symphony.simulation.memory import ItemCache
 
 DYNAMICS = pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 
@@ -78,9 +82,12 @@ def test_the_cache_makes_what_is_missing_together_and_lets_the_oldest_go() -> No
 
     def make(items: Any) -> list[Experts]:
         asked.append(list(items))
-        return [Experts(torch.tensor([item]), *[torch.zeros(1)] * 4) for item in items]
+        return [
+            Experts(torch.tensor([item]), torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.zeros(1))
+            for item in items
+        ]
 
-    cache = ExpertCache(make, keep=3)
+    cache = ItemCache(make, lambda e: e.nbytes, keep=3)
     assert [int(e.agent) for e in cache.many([4, 2, 4])] == [4, 2, 4]
     assert int(cache(2).agent) == 2
     cache.many([4])
@@ -88,6 +95,24 @@ def test_the_cache_makes_what_is_missing_together_and_lets_the_oldest_go() -> No
     assert int(cache(8).agent) == 8
     cache(4)
     assert asked == [[4, 2], [5, 6, 7, 8], [4]]
+
+
+@settings(max_examples=50)
+@given(st.lists(st.lists(st.integers(0, 9), min_size=1, max_size=4), max_size=20), st.integers(1, 60))
+def test_the_cache_holds_no_more_bytes_than_it_may_and_gives_what_was_asked_for(
+    calls: list[list[int]], limit: int
+) -> None:
+    cache = ItemCache(lambda items: [bytes(3 * item) for item in items], len, limit=limit, name="bytes")
+    crowded = False
+    for items in calls:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            assert [len(value) for value in cache.many(items)] == [3 * item for item in items]
+        # One item is held however large it is.
+        assert cache.held <= limit or len(cache) == 1
+        # It is said once, when the first has to go.
+        assert len(told) <= (not crowded)
+        crowded = crowded or bool(told)
 
 
 def test_a_batch_of_expert_states_has_whole_actions() -> None:

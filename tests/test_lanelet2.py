@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, ROAD, WAYS, osm
+from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.geodesy import mercator, utm
@@ -178,6 +178,36 @@ def test_what_an_editor_deleted_is_not_there(tmp_path: Path) -> None:
     assert road_of(tmp_path, deleted(osm())).lane_id.tolist() == [101, 102, 103]
 
 
+@settings(max_examples=20)
+@given(turned=st.tuples(*[st.booleans()] * 5), first=st.integers(0, 2))
+def test_areas_belong_to_the_road_but_for_their_holes(turned: tuple[bool, ...], first: int) -> None:
+    outer = ["61o", "62o", "63o"]
+    members = " ".join(outer[first:] + outer[:first] + ["64i", "65i"])
+    with tempfile.TemporaryDirectory() as folder:
+        road = road_of(Path(folder), with_area(PARKING, turned, members))
+        plain = road_of(Path(folder), osm())
+    spots = np.array([(55, 20), (65, 9), (50, 4), (65, 18), (65, 30), (45, 10)])
+    assert (off_road(road, spots) < 0).tolist() == [True, True, True, False, False, False]
+    assert not (off_road(plain, spots[:2]) < 0).any()
+    assert road.lane_id.tolist() == plain.lane_id.tolist()
+
+
+@pytest.mark.parametrize(
+    ("tags", "drivable"),
+    [
+        ({"subtype": "freespace"}, True),
+        ({"subtype": "keepout"}, False),
+        ({"subtype": "building"}, False),
+        ({}, False),
+        ({"subtype": "walkway", "participant:vehicle:taxi": "yes"}, True),
+        ({"subtype": "parking", "participant:bicycle": "yes"}, False),
+    ],
+)
+def test_areas_that_vehicles_may_use(tags: dict[str, str], drivable: bool, tmp_path: Path) -> None:
+    road = road_of(tmp_path, with_area(tags))
+    assert (off_road(road, np.array([(55, 20)])) < 0).tolist() == [drivable]
+
+
 BROKEN: dict[str, tuple[str, str]] = {
     "no XML": ("this is no map", "not well-formed XML"),
     "empty": ("", "empty"),
@@ -197,6 +227,12 @@ BROKEN: dict[str, tuple[str, str]] = {
     "infinity": (osm().replace("x='50'", "x='inf'", 1), "not finite"),
     "no place": (osm().replace("x='50'", "", 1), "is not a number"),
     "a pole": (osm("degrees").replace("lat='49.", "lat='89.", 1), "outside latitudes"),
+    "an open area": (with_area(PARKING, members="61o 62o"), "is not closed"),
+    "an area in pieces": (with_area(PARKING, members="61o 64o"), "does not go on"),
+    "an area without an outline": (with_area(PARKING, members="64i 65i"), "0 outlines"),
+    "an area of two outlines": (with_area(PARKING, members="61o 62o 63o 64o 65o"), "2 outlines"),
+    "an area with a way missing": (with_area(PARKING, members="61o 99o"), "there is no way 99"),
+    "an area round one way twice": (with_area(PARKING, members="61o 61o"), "one way twice"),
     "two of one id": (
         osm().replace("<relation id='102'", "<relation id='101'"),
         "two lanelets of one id",

@@ -23,7 +23,7 @@ from symphony.keys import (
     VALID,
 )
 from symphony.modules import FORESIGHT, discriminator
-from symphony.modules.discriminator import gap_features, road_features
+from symphony.modules.encoder import gap_features, road_features
 from symphony.objectives import DiscriminatorLoss
 
 KINDS = ("paper", "clearance", "foresight")

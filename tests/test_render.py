@@ -265,6 +265,24 @@ def test_lanes_of_unknown_width_have_a_surface() -> None:
         assert high - low == pytest.approx(expected + 0.3, abs=1e-4)
 
 
+def test_lanes_of_one_point_are_drawn_as_nothing() -> None:
+    segment = straight_road(3)
+    road = segment.road
+    stub = Polylines.of([road.lanes[0][:1], *(road.lanes[k] for k in range(1, len(road.lanes)))])
+    stubbed = segment.replace(road=type(road)(**{**vars(road), "lanes": stub}))
+    axes = plot_segment(stubbed, blank(), view=(0.0, 60.0, -20.0, 20.0))
+    surface = shapely.Polygon(by_gid(axes, "surface").get_path().vertices)
+    assert road_ribbon(stubbed.road, 0).is_empty
+    assert (
+        surface.area
+        < shapely.Polygon(
+            by_gid(plot_segment(segment, blank(), view=(0.0, 60.0, -20.0, 20.0)), "surface")
+            .get_path()
+            .vertices
+        ).area
+    )
+
+
 def test_lights_stand_at_their_stop_points_in_their_state() -> None:
     segment = crossing()
     shown = set()

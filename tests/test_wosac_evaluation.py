@@ -23,7 +23,7 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import WOSAC, Entry, compare
 from symphony.evaluation.formats import as_markdown
 from symphony.evaluation.passing import order_of, passing_gaps, passing_pairs
-from symphony.evaluation.wosac import THINNED, _thinned, evaluate_wosac
+from symphony.evaluation.wosac import THINNED, _thinned, evaluate_wosac, simulated_how
 from symphony.evaluation.wosac_segments import log_playback, wosac_window
 from symphony.evaluation.wosac_table import COLUMNS, how_in_words, read_wosac, wosac_grid
 from symphony.roadgraph import LaneGraph
@@ -99,6 +99,11 @@ def test_settings_are_those_of_the_evaluation() -> None:
     made = settings.config(32, 9)
     assert (made.rollouts, made.trees, made.seed) == (32, 32, 9)
     assert (made.branches, made.rule, made.threshold, made.goals) == (3, "replace", 1.0, "branch")
+    # What is left open is the agent's own, and the record says what that is.
+    agent = load_agent(AGENT)
+    assert (agent.search.rule, agent.search.goals) == ("replace", "branch")
+    how = simulated_how(agent, WosacSettings.of(EvaluateConfig(action_temperature=0.5)))
+    assert {"rule": "replace", "goals": "branch", "action_temperature": 0.5}.items() <= how.items()
     with pytest.raises(ConfigError, match="search is one of"):
         WosacSettings.of(EvaluateConfig(search="oracle"))
 
@@ -252,7 +257,7 @@ def test_the_table_of_scores(
         assert float(cell.split(" ± ")[0]) == pytest.approx(
             column.scale * numbers[column.key], abs=0.51 * 10**-column.digits
         )
-    with pytest.raises(ConfigError, match="different run segments or years"):
+    with pytest.raises(ConfigError, match="different run segments, years or horizons"):
         wosac_grid([alone, alone | {"config": "2024"}])
     with pytest.raises(ConfigError, match="1 names for 2 records"):
         wosac_grid([alone, alone], ["x"])

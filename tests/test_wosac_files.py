@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 
 from helpers_wosac import record_rollouts, womd_record
 from symphony.cli import main
+from symphony.cli.wosac_files import score_files
 from symphony.data.rollouts import RolloutArrays, read_rollouts, write_rollouts
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.sources.wosac import scenario_arrays, simulated_ids
+from symphony.data.sources.wosac import read_scenario_payloads, scenario_arrays, simulated_ids
 from symphony.errors import DataError
 from symphony.metrics.wosac import CHALLENGE_2024, SimulatedRollouts, WosacScenario, score
 
@@ -91,6 +93,34 @@ def test_many_scenarios(many: tuple[Path, Path], tmp_path: Path) -> None:
         again = tmp_path / "again.json"
         assert run(scenario, many[1], "--json", str(again), *more) == 0
         assert again.read_text() == out.read_text()
+
+
+def test_scenarios_are_read_as_they_are_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"scenario{k:02d}" for k in range(12)]
+    write_records(tmp_path / "all.tfrecord", [womd_record(n, tracks=2).SerializeToString() for n in names])
+    (tmp_path / "rollouts").mkdir()
+    for seed, name in enumerate(names):
+        made = record_rollouts(womd_record(name, tracks=2), seed=seed % 3)
+        write_rollouts(tmp_path / "rollouts" / f"{name}.npz", made)
+    drawn = 0
+
+    def counted(files: list[Path]) -> Iterator[tuple[Path, int, bytes]]:
+        nonlocal drawn
+        for packed in read_scenario_payloads(files):
+            drawn += 1
+            yield packed
+
+    monkeypatch.setattr("symphony.data.sources.wosac.read_scenario_payloads", counted)
+    ahead = []
+    found = score_files(
+        tmp_path / "all.tfrecord",
+        tmp_path / "rollouts",
+        progress=lambda done, total: ahead.append((drawn - done, total)),
+    )
+    assert ahead == [(0, 12)] * 12
+    assert [one.scenario_id for one in found] == names
+    # What a scenario scores does not depend on those before it: the first three come again and again.
+    assert [one.scores for one in found] == [found[k % 3].scores for k in range(12)]
 
 
 def test_a_part_of_the_scenarios(
@@ -215,6 +245,10 @@ def cut_to_history(record: pb.Scenario) -> None:
         del track.states[11:]
 
 
+def at_times(record: pb.Scenario, every: float, jitter: float) -> None:
+    record.timestamps_seconds[:] = [every * k + jitter * (k % 2) for k in range(91)]
+
+
 @pytest.mark.parametrize(("change", "texts"), [
     (drop_edges, ("road_edge", "no road edge")),
     (hide_current, ("tracks_to_predict", "agent 100 to be scored, but not valid at step 10")),
@@ -226,6 +260,8 @@ def cut_to_history(record: pb.Scenario) -> None:
     (lambda r: r.tracks[1].states.pop(), ("tracks.states", "agent 101 has 90 states for 91 steps")),
     (lambda r: r.dynamic_map_states.pop(), ("dynamic_map_states", "90 entries for 91 steps")),
     (lambda r: r.timestamps_seconds.__setitem__(5, 0.7), ("timestamps_seconds", "steps are not of 0.1 s")),
+    (lambda r: at_times(r, 0.105, 0), ("timestamps_seconds", "steps are not of 0.1 s")),
+    (lambda r: at_times(r, 0.1, 0.06), ("timestamps_seconds", "steps are not of 0.1 s")),
     (lambda r: setattr(r.tracks[2], "id", 101), ("object_id", "agent 101 more than once")),
 ])  # fmt: skip
 def test_wrong_scenarios(
@@ -249,6 +285,12 @@ def test_damaged_scenario_files(
     refused(capsys, tmp_path / "flipped.tfrecord", one[1], "flipped.tfrecord", "record 0", "checksum")
     write_records(tmp_path / "other.tfrecord", [b"\xff\xff"])
     refused(capsys, tmp_path / "other.tfrecord", one[1], "other.tfrecord", "not a Scenario message")
+
+
+def test_recordings_jitter() -> None:
+    record = womd_record()
+    at_times(record, 0.1, 0.03)
+    assert len(scenario_arrays(record)["position"]) == 3
 
 
 def test_headings_and_positions_are_taken_as_they_are() -> None:

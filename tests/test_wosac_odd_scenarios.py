@@ -37,6 +37,7 @@ ODD = (
     "steep roads",
     "doubled points",
     "others than vehicles",
+    "closed edges, turned headings, no lights, late and lost",
 )
 
 
@@ -65,7 +66,7 @@ def odd_record(kind: str, seed: int = 0) -> pb.Scenario:
     for k, line in enumerate(odd_edges(kind, middle, rng)):
         add_line(record.map_features.add(id=k).road_edge.polyline, line)
     add_lanes(record, middle, rng)
-    if kind != "no lights":
+    if "no lights" not in kind:
         add_lights(record, kind, middle, rng)
     return record
 
@@ -79,7 +80,7 @@ def add_tracks(record: pb.Scenario, kind: str, middle: NDArray[Any], rng: np.ran
         # All come near the middle of the map in the middle of the log.
         path += middle + rng.normal(0, 12, 2) - path[45]
         z = rng.uniform(-0.2, 0.2) + 0.05 * time
-        if kind == "turned headings":
+        if "turned headings" in kind:
             heading = heading + 2 * np.pi * rng.integers(-2, 3) + 2 * np.pi * (time > 4) * rng.integers(0, 2)
         valid = odd_validity(kind, k, rng)
         types = (1, 2, 1, 3, 4, 1) if kind == "others than vehicles" else (1, 1, 1, 1, 2, 1)
@@ -88,7 +89,7 @@ def add_tracks(record: pb.Scenario, kind: str, middle: NDArray[Any], rng: np.ran
         for step in range(91):
             state = track.states.add(valid=bool(valid[step]), center_z=z[step] - 0.03)
             # Some of what is not valid has values all the same.
-            if valid[step] or (kind == "late and lost" and step % 3 == 0):
+            if valid[step] or ("late and lost" in kind and step % 3 == 0):
                 state.center_x, state.center_y = path[step]
                 state.heading, state.height = heading[step], 1.5
                 state.width, state.length = shape
@@ -97,7 +98,7 @@ def add_tracks(record: pb.Scenario, kind: str, middle: NDArray[Any], rng: np.ran
 def odd_validity(kind: str, k: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """[91] of object k; the recording vehicle, 2, is always there."""
     valid = np.ones(91, bool)
-    if kind == "late and lost" and k != 2:
+    if "late and lost" in kind and k != 2:
         valid[: rng.integers(0, 11)] = False
         valid[rng.integers(12, 91) :] = False
         valid[rng.integers(11, 91, 5)] = False
@@ -112,7 +113,7 @@ def odd_edges(kind: str, middle: NDArray[Any], rng: np.random.Generator) -> list
         np.stack([middle[0] + np.linspace(-60, 60, 9), middle[1] - 8 + rng.normal(0, 2, 9), np.zeros(9)], -1),
         np.stack([middle[0] + np.linspace(60, -60, 7), middle[1] + 9 + rng.normal(0, 2, 7), np.zeros(7)], -1),
     ]
-    if kind == "closed edges":
+    if "closed edges" in kind:
         # Only rings with the most points go on from their end to their start.
         edges += [ring(middle, 6, 14, -1), ring(middle + 20, 5, 11), ring(middle - 15, 4, 14)]
     if kind == "steep roads":

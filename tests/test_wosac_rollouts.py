@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -29,7 +31,8 @@ from symphony.data.submission_check import check_submission, required_agents
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.wosac import evaluate_wosac
 from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wosac_window
-from symphony.metrics.wosac import SimulatedRollouts, WosacScenario, score
+from symphony.evaluation.wosac_table import read_wosac, wosac_grid
+from symphony.metrics.wosac import SimulatedRollouts, StepFeatures, WosacScenario, compute_features, score
 from symphony.simulation.wosac import between_decisions, constant_velocity, history_only, wosac_rollouts
 
 AGENT = "pretrained:bc_ts_h"
@@ -271,6 +274,54 @@ def test_short_logs_have_a_shorter_history() -> None:
     assert scored(wosac_scenario(segment), constant_velocity(window))["min_ade"] < 0.01
     with pytest.raises(DataError, match=r"has 7\.8 s, the score needs 8"):
         wosac_window(straight_road(steps=40))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_shorter_horizon_is_the_beginning_of_the_whole(seed: int) -> None:
+    segment = resample(crossing(num_agents=4, seed=seed), 0.1)
+    agent, short = load_agent(AGENT), replace(PLAIN, horizon=3.5)
+    whole, part = (wosac_scenario(segment), wosac_scenario(segment, short.future))
+    window = wosac_window(segment, short.future)
+    assert (window.num_steps, part.steps, part.future) == (46, 46, 35)
+    long = wosac_rollouts(agent, wosac_window(segment), PLAIN)
+    cut = RolloutArrays(long.object_id, *(getattr(long, name)[..., :35] for name in STATES))
+    assert same(wosac_rollouts(agent, window, short), cut)
+    first, second = (
+        compute_features(scenario, SimulatedRollouts.of(**vars(rollouts)))
+        for scenario, rollouts in ((whole, long), (part, cut))
+    )
+    for name in StepFeatures.__dataclass_fields__:
+        if name != "average_displacement_error":
+            # The last two steps lack the neighbours that accelerations are made of.
+            pairs = (
+                (getattr(a, name)[..., :33], getattr(b, name)[..., :33])
+                for a, b in ((first.log, second.log), (first.simulated, second.simulated))
+            )
+            assert all(torch.equal(a, b) for a, b in pairs), name
+    with pytest.raises(DataError, match=r"field x: has shape \(32, 4, 80\), expected \(32, 4, 35\)"):
+        score(part, SimulatedRollouts.of(**vars(long)))
+
+
+def test_a_short_horizon_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fill(tmp_path / "store", [straight_road(steps=31)])  # 6 s
+    command = ["wosac", "evaluate", "random", "--data", str(tmp_path / "store")]
+    assert main(command) == 1
+    assert "has 6 s, the score needs 8" in capsys.readouterr().err
+    out = tmp_path / "short.json"
+    assert main([*command, "--horizon", "5", "--json", str(out)]) == 0
+    record = read_wosac(out)
+    assert record["how"]["horizon"] == 5
+    assert main(["wosac", "table", str(out)]) == 0
+    assert "WOSAC 2025 over 5 s (the challenge has 8): 1 run segments" in capsys.readouterr().out
+    other = record | {"how": {"search": "none"}}
+    with pytest.raises(ConfigError, match="years or horizons"):
+        wosac_grid([record, other])
+    submit = ["wosac", "submit", AGENT, "--data", "x", "--out", "y.tar.gz", *META, "--horizon", "5"]
+    assert main(submit) != 0
+    assert "a submission has 8 s" in capsys.readouterr().err
+    for wrong in (0.5, 8.1, 2.55, math.nan):
+        with pytest.raises(ConfigError, match="horizon is 1 to 8 s"):
+            WosacSettings(horizon=wrong)
 
 
 def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

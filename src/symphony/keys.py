@@ -76,10 +76,12 @@ ALONG: Key = ("agents", "observation", "along")
 LIGHTS: Key = ("agents", "observation", "lights")
 """[..., N, L, Fp] float: the nearest lights, as points."""
 LIGHTS_MASK: Key = ("agents", "observation", "lights_mask")
-SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE, GAP, GAP_AHEAD, ALONG, LIGHTS)
-"""What an agent observes and could react to."""
 ROAD: Key = ("agents", "observation", "road")
 """[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
+ROAD_AHEAD: Key = ("agents", "observation", "road_ahead")
+"""[..., N, H] float: that of the centre at some times ahead, were it to keep speed and course."""
+SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE, GAP, GAP_AHEAD, ALONG, LIGHTS, ROAD, ROAD_AHEAD)
+"""What an agent observes and could react to."""
 
 ROUTES: Key = ("agents", "routes")
 """[..., N, G, Fg] float: every feasible route, as the goal policy observes it."""

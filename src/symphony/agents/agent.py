@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -41,6 +42,8 @@ class Agent:
         spec: what its networks are and how it is simulated; None for baselines.
         goals: draws routes from first states; None for agents that follow none.
         discriminator: scores states; None for agents trained without.
+        rule: name of what drives in place of the policy, along the routes of the log (see
+            ``symphony.simulation.driving.RULES``); None for none.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Agent:
     spec: AgentSpec | None = None
     goals: TensorDictModuleBase | None = None
     discriminator: TensorDictModuleBase | None = None
+    rule: Literal["constant_velocity", "idm"] | None = None
 
     @property
     def dynamics(self) -> Bicycle | Displacement:
@@ -78,6 +82,11 @@ class Agent:
     def searches(self) -> bool:
         """Whether it is meant to be simulated with the search."""
         return self.spec is not None and self.spec.searches
+
+    @property
+    def routed(self) -> bool:
+        """Whether it needs scenes with routes."""
+        return self.goals is not None or bool(self.rule)
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -115,9 +124,10 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     """An agent by name.
 
     Args:
-        name: ``playback``, ``constant_velocity``, ``random``, ``pretrained:NAME`` (an agent that comes with the
-            package), or the folder of a run, of which the best checkpoint is taken if it was validated, else the
-            last; ``RUN@last``, ``RUN@best`` or ``RUN@3000`` (a step) names another.
+        name: ``playback``, ``constant_velocity``, ``idm`` (the intelligent driver model, along the route of the log),
+            ``random``, ``pretrained:NAME`` (an agent that comes with the package), or the folder of a run, of which
+            the best checkpoint is taken if it was validated, else the last; ``RUN@last``, ``RUN@best`` or
+            ``RUN@3000`` (a step) names another.
         device: where its weights go.
 
     Raises:
@@ -128,6 +138,8 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
         return Agent(name, None)
     if name == "constant_velocity":
         return Agent(name, ConstantVelocity(Bicycle()))
+    if name == "idm":
+        return Agent(name, ConstantVelocity(Bicycle()), rule="idm")
     if name == "random":
         return Agent(name, RandomActions(Bicycle()))
     folder, which = split_name(name)
@@ -147,7 +159,7 @@ def read_spec(folder: Path) -> AgentSpec:
     path = folder / FILE
     if not path.is_file():
         raise ConfigError(
-            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', 'random', '{PREFIX}NAME' or the "
-            f"folder of a run (one with an {FILE})"
+            f"{folder} is no agent: expected '{PLAYBACK}', 'constant_velocity', 'idm', 'random', '{PREFIX}NAME' or "
+            f"the folder of a run (one with an {FILE})"
         )
     return read_json(AgentSpec, path)

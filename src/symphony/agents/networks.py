@@ -41,7 +41,7 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         discriminator: whether the discriminator looks too; clearances are costly, and only it reads them.
     """
     features = spec.discriminator.features if discriminator and spec.discriminator is not None else "paper"
-    gaps = spec.agent.features != "paper"
+    gaps, road = spec.agent.features != "paper", spec.agent.features == "road"
     return ObservationConfig(
         num_objects=spec.agent.num_objects,
         num_points=spec.agent.num_points,
@@ -49,6 +49,7 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         route=spec.goals,
         along=gaps and spec.goals,
         gaps=gaps,
+        road=road,
         clearance=features != "paper",
         foresight=FORESIGHT if gaps or features == "foresight" else (),
     )
@@ -81,13 +82,16 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
         "hidden": spec.agent.hidden,
         "head": (spec.agent.head, spec.agent.head),
         "own_keys": _own_keys(spec),
+        "road_keys": (keys.ROAD, keys.ROAD_AHEAD) if spec.agent.features == "road" else (),
         "encoder": _encoder(spec),
     }
+    # Two of each distance: of the centre, of four corners, and of the centre at each time ahead.
+    own = _own_features(spec) + 2 * (5 + len(FORESIGHT)) * (spec.agent.features == "road")
     dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
-        return discrete_policy(_own_features(spec), groups, actions=dynamics.num_actions, **sizes)
+        return discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
     scale = observation_of(spec).size_scale
-    return displacement_policy(_own_features(spec), groups, dt=spec.dt, size_scale=scale, **sizes)
+    return displacement_policy(own, groups, dt=spec.dt, size_scale=scale, **sizes)
 
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:

@@ -157,7 +157,7 @@ def _warn(
     if issubclass(category, DataWarning):
         sys.stderr.write(f"symphony: warning: {printable(str(message))}\n")
     else:
-        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
+        (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
 def _complain(error: object, status: int) -> int:

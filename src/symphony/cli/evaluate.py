@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from symphony.agents import Agent
     from symphony.data.store import SegmentStore
     from symphony.evaluation import EvaluatedBatch, Evaluation
+    from symphony.evaluation.pictures import ClipKeeper
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Evaluate:
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="playback|RUN")]
     """Folder of a run (see `symphony train`), `pretrained:NAME` (an agent that comes with the package), `playback`
-    (the log itself) or `constant_velocity`."""
+    (the log itself), `constant_velocity` or `idm` (the intelligent driver model, along the route of the log)."""
     data: Path
     """Store of run segments to simulate."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
@@ -76,26 +77,38 @@ class Evaluate:
         if self.planner:
             self._evaluate_planner()
             return
+        if self.config.workers > 1 and self.config.engine == "local":
+            from symphony.data.engine import get_ready
+
+            get_ready(["symphony.simulation.workers", "symphony.evaluation.evaluator"])
         from symphony.agents import load_agent
         from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore
-        from symphony.evaluation.pictures import PANELS, ClipKeeper, RolloutKeeper, check_picture, draw_clips
         from symphony.evaluation.records import evaluation_record, keep_evaluation
         from symphony.simulation.demonstrations import evenly_spaced
         from symphony.simulation.saved_files import About, RolloutWriter
         from symphony.simulation.saving import plain_settings
 
         if self.figure is not None:
+            from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
+
             check_picture(self.figure)
         if self.metrics:
             WosacSettings.of(self.config)  # or complain now
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         chosen = [segment_index(store, name) for name in self.segments]
-        shown = evenly_spaced(len(chosen or store), PANELS if self.figure is not None else 0)
-        clips = ClipKeeper(shown, title=f"{short_name(agent.name)}: ")
-        keepers: list[Callable[[EvaluatedBatch], None]] = [] if self.figure is None else [clips]
+        clips: ClipKeeper | None = None
+        keepers: list[Callable[[EvaluatedBatch], None]] = []
+        if self.figure is not None:
+            from symphony.evaluation.pictures import PANELS, ClipKeeper
+
+            shown = evenly_spaced(len(chosen or store), PANELS)
+            clips = ClipKeeper(shown, title=f"{short_name(agent.name)}: ")
+            keepers.append(clips)
         if self.save_rollouts is not None:
+            from symphony.evaluation.pictures import RolloutKeeper
+
             plain = plain_settings(config, agent.interactive, agent.duration)
             about = About.of(agent.name, store, plain, seed=config.seed)
             keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
@@ -121,7 +134,9 @@ class Evaluate:
             keep_evaluation(agent.name, record)
         if self.json is not None:
             write_numbers(self.json, record)
-        if self.figure is not None:
+        if self.figure is not None and clips is not None:
+            from symphony.evaluation.pictures import draw_clips
+
             draw_clips(clips.clips, self.figure)
 
     def _calibrated(self, agent: Agent, folder: Path) -> EvaluateConfig:

@@ -62,7 +62,7 @@ class Rollouts:
     """
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
-    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback` or `constant_velocity`."""
+    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
     data: Path
     """Store of run segments."""
     out: Path

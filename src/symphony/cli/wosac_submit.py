@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.config import WosacSettings
+from symphony.config.wosac import FUTURE
 from symphony.data.submission_meta import SubmissionMeta
 from symphony.errors import ConfigError, DataError
 
@@ -48,6 +49,8 @@ class Submit:
             raise ConfigError(
                 "a submission must not know the routes of the log: --logged-goals is not for it"
             )
+        if self.settings.future != FUTURE:
+            raise ConfigError(f"a submission has 8 s: --horizon {self.settings.horizon:g} is not for it")
 
     def run(self) -> None:
         """Simulate, showing how far it is, and write."""

@@ -17,6 +17,7 @@ from symphony.config.training import (
     PerturbConfig,
     PreviewConfig,
     RunConfig,
+    SamplingConfig,
     TrainConfig,
     ValidationConfig,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "PreviewConfig",
     "Profile",
     "RunConfig",
+    "SamplingConfig",
     "Search",
     "SearchConfig",
     "Setting",

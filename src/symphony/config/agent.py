@@ -30,9 +30,10 @@ class AgentConfig:
     """Nearest map and light points it observes (the paper: 1 000)."""
     num_lights: int = 0
     """Nearest lights it sees beside the points, as a group of their own, however far they are (the paper: none)."""
-    features: Literal["paper", "gaps"] = "paper"
+    features: Literal["paper", "gaps", "road"] = "paper"
     """`paper`: objects and points around; `gaps`: also how far it is from the boxes of objects, now and within the
-    next 2 s, were everyone to keep speed and course, and with goals where they are along its route."""
+    next 2 s, were everyone to keep speed and course, and with goals where they are along its route; `road`: also how
+    far its box is from the edge of the road, and its centre within the next 2 s."""
     accelerations: int = 7
     """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
     hidden: int = 64
@@ -48,7 +49,7 @@ class AgentConfig:
     def __post_init__(self) -> None:
         positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
         not_negative(self, "num_lights")
-        one_of(self, "features", ["paper", "gaps"])
+        one_of(self, "features", ["paper", "gaps", "road"])
         if self.accelerations < 3 or self.accelerations % 2 == 0:
             raise ConfigError(f"accelerations must be odd and at least 3, is {self.accelerations}")
         one_of(self, "encoder", ["paper"], path=True)

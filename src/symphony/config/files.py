@@ -7,8 +7,9 @@ import difflib
 import functools
 import json
 import types
+from collections.abc import Hashable
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 from symphony.errors import ConfigError
 
@@ -61,7 +62,7 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
         ConfigError: for an unknown name (with the nearest known one), a missing one, another type or a value out of
             range.
     """
-    hints = _hints(kind)
+    hints = _hints(cast("Hashable", kind))
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:
         if name not in fields:
@@ -79,7 +80,9 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
         raise ConfigError(f"{where}{error}") from error
 
 
-_hints = functools.cache(get_type_hints)  # it compiles every annotation anew
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind)  # compiles every annotation anew
 
 
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:

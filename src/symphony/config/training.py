@@ -110,6 +110,32 @@ class PerturbConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SamplingConfig:
+    """What is learned from more often than the rest; all is drawn alike by default."""
+
+    interactive: float = 1.0
+    """How much more often states of interactive agents are drawn than those of other vehicles."""
+    standing: float = 1.0
+    """How often states below 0.5 m/s are drawn, relative to others."""
+    hard: Path | None = None
+    """Record of an evaluation on the store that is learned from (`symphony evaluate RUN --data STORE --json FILE`):
+    run segments are drawn in proportion to the collision rate plus off-road time there."""
+    share: float = 0.5
+    """Of an update's run segments that are drawn so, if there is a record; the others are drawn evenly."""
+
+    def __post_init__(self) -> None:
+        positive(self, "interactive")
+        not_negative(self, "standing", "share")
+        if self.share > 1:
+            raise ConfigError(f"share must not exceed 1, is {self.share}")
+
+    @property
+    def even(self) -> bool:
+        """Whether all states count alike."""
+        return self.interactive == self.standing == 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class PreviewConfig:
     """What a run lets see of its agent while it trains: animated rollouts, and distributions of what it does."""
 
@@ -188,6 +214,8 @@ class TrainConfig(RunConfig):
     """Expert states per update, drawn from those segments."""
     perturb: PerturbConfig = field(default_factory=PerturbConfig)
     """Displaced expert states."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    """Run segments and expert states drawn more often than others."""
     goals: int = 128
     """Expert routes per update of the goal policy (methods with H)."""
     learning_rate: float = 1e-3
@@ -233,6 +261,15 @@ class TrainConfig(RunConfig):
             searches=searches,
             search=self.search,
         )
+
+    @property
+    def scenes(self) -> dict[str, Any]:
+        """Which run segments are learned from and how they are drawn, as :class:`SceneDataset` takes it."""
+        return {
+            "interactive": self.agent.interactive,
+            "duration": self.duration,
+            "sampling": self.sampling,
+        }
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
         """Learning rates by network, before they fall."""

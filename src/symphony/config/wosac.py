@@ -8,10 +8,12 @@ from typing import Literal, Self, get_args
 
 from symphony.config.checks import not_negative, one_of, positive
 from symphony.config.evaluation import EvaluateConfig, Goals
+from symphony.errors import ConfigError
 
 WosacSearch = Literal["agent", "none", "tree", "best"]
 """Without the search by true flags: what is simulated must not know them beforehand."""
-WosacYear = Literal["2024", "2025"]
+FUTURE, DT = 80, 0.1
+"""Steps that the challenge asks for, and the seconds between them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +33,8 @@ class WosacSettings:
     """Of rule `systematic`; 0: as the agent was trained."""
     threshold: float | None = None
     """Of rule `replace`; by default as the agent was trained."""
-    goals: Goals = "tree"
-    """Who draws goals together: all branches of a `tree`, or each `branch` alone."""
+    goals: Goals = "agent"
+    """Who draws goals together: all branches of a `tree`, or each `branch` alone; `agent`: as it is meant."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the
     future."""
@@ -41,6 +43,11 @@ class WosacSettings:
     `retry-above`."""
     retry_above: float = 0.0
     """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
+    action_temperature: float = 1.0
+    """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
+    horizon: float = 8.0
+    """Seconds that are simulated and scored: the challenge's 8, or less for logs that are shorter. Scores of another
+    horizon are those of an easier task; a submission has 8."""
     seed: int = 0
     """Of everything drawn at random."""
     device: str = "cpu"
@@ -52,7 +59,14 @@ class WosacSettings:
         one_of(self, "search", get_args(WosacSearch))
         not_negative(self, "branches", "seed")
         positive(self, "workers")
+        if not 1.0 <= self.horizon <= FUTURE * DT or abs(self.horizon / DT - self.future) > 1e-6:
+            raise ConfigError(f"horizon is 1 to 8 s, in steps of {DT:g} s, is {self.horizon:g}")
         self.config(1, self.seed)  # or complain now
+
+    @property
+    def future(self) -> int:
+        """Steps that are simulated and scored."""
+        return round(self.horizon / DT)
 
     @classmethod
     def of(cls, config: EvaluateConfig) -> Self:
@@ -61,10 +75,15 @@ class WosacSettings:
         Raises:
             ConfigError: it searches by the true flags.
         """
-        return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(cls)})
+        return cls(**{name: getattr(config, name) for name in _shared()})
 
     def config(self, rollouts: int, seed: int) -> EvaluateConfig:
         """Of some rollouts, each from a tree of its own where there is a search."""
-        return EvaluateConfig(
-            **dataclasses.asdict(self) | {"rollouts": rollouts, "trees": rollouts, "seed": seed}
-        )
+        same = {name: getattr(self, name) for name in _shared()}
+        return EvaluateConfig(**same | {"rollouts": rollouts, "trees": rollouts, "seed": seed})
+
+
+def _shared() -> list[str]:
+    """Settings that evaluations have, too."""
+    names = {field.name for field in dataclasses.fields(EvaluateConfig)}
+    return [field.name for field in dataclasses.fields(WosacSettings) if field.name in names]

@@ -17,16 +17,14 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.observation import (
-    OBJECT_FEATURES,
-    POINT_FEATURES,
-    SELF_FEATURES,
     Objects,
     Observation,
     ObservationConfig,
     objects_at,
+    observation_spec,
     observe,
 )
-from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, pick_routes, route_choices
+from symphony.envs.routes import pick_routes, route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.tables import Tables
 from symphony.envs.traffic import entering, without
@@ -153,26 +151,7 @@ class DrivingEnv(EnvBase):
             return Unbounded(shape=(1,), dtype=torch.int64, device=device)
 
         self._tables: Tables | None = None
-        seen = Composite(shape=(n,))
-        if config.own:
-            seen["own"] = floats(n, SELF_FEATURES)
-        for name, count, width in (
-            ("objects", config.num_objects, OBJECT_FEATURES),
-            ("points", config.num_points, POINT_FEATURES),
-            ("lights", config.num_lights, POINT_FEATURES),
-        ):
-            if count:
-                seen[name], seen[f"{name}_mask"] = floats(n, count, width), flags(n, count)
-        if config.route:
-            seen["route"] = floats(n, ROUTE_FEATURES)
-        if config.clearance:
-            seen["road"] = floats(n, 5)
-        if config.num_objects and (config.clearance or config.gaps):
-            seen["gap"] = floats(n, config.num_objects)
-            if config.foresight:
-                seen["gap_ahead"] = floats(n, config.num_objects, len(config.foresight))
-        if config.num_objects and config.along:
-            seen["along"] = floats(n, config.num_objects, ALONG_FEATURES)
+        seen = observation_spec(config, n, device)
 
         def goals() -> Unbounded:
             return Unbounded(shape=(n,), dtype=torch.int64, device=device)

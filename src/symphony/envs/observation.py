@@ -12,16 +12,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
+from torchrl.data import Binary, Composite, Unbounded
 
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
-from symphony.envs.routes import along_route, route_ahead
+from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, along_route, route_ahead
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners, box_gap
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
-from symphony.geometry.nearest import nearest
+from symphony.geometry.nearest import nearest, on_host
 
 __all__ = [
     "OBJECT_FEATURES",
@@ -55,9 +56,10 @@ class ObservationConfig:
         route: whether it observes the route that is its goal.
         along: whether it observes where the objects are along that route.
         gaps: whether it observes how far its box is from others.
+        road: whether it observes how far its box is from the edge of the road, and how far its centre would be ahead.
         clearance: whether it observes how far its box is from others and from the edge of the road.
         foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
-            speed and course; with ``gaps`` or ``clearance`` only.
+            speed and course; with ``gaps`` or ``clearance`` only, and with ``road`` likewise from the edge.
         own: whether it observes its own speed and size.
     """
 
@@ -70,9 +72,16 @@ class ObservationConfig:
     route: bool = False
     along: bool = False
     gaps: bool = False
+    road: bool = False
     clearance: bool = False
     foresight: tuple[float, ...] = ()
     own: bool = True
+
+    @property
+    def blind(self) -> bool:
+        """Whether nothing is asked for, a route aside."""
+        counts = self.num_objects, self.num_points, self.num_lights
+        return not (any(counts) or self.own or self.road or self.clearance)
 
     @classmethod
     def nothing(cls) -> ObservationConfig:
@@ -110,6 +119,7 @@ class Observation(NamedTuple):
         gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked.
         gap_ahead: [M, N, O, H] likewise at H times ahead.
         road: [M, N, 5] metres of centre and corners off the road, negative on it.
+        road_ahead: [M, N, H] likewise of the centre at H times ahead.
         route: [M, N, Fr], see :func:`symphony.envs.routes.route_ahead`.
         along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
     """
@@ -124,8 +134,40 @@ class Observation(NamedTuple):
     gap: Tensor | None = None
     gap_ahead: Tensor | None = None
     road: Tensor | None = None
+    road_ahead: Tensor | None = None
     route: Tensor | None = None
     along: Tensor | None = None
+
+
+def observation_spec(config: ObservationConfig, agents: int, device: torch.device | None = None) -> Composite:
+    """Shapes of what each of N agents observes, under the names of :class:`Observation`."""
+    widths: dict[str, tuple[int, ...]] = {}
+    if config.own:
+        widths["own"] = (SELF_FEATURES,)
+    if config.num_objects:
+        widths["objects"] = (config.num_objects, OBJECT_FEATURES)
+    if config.num_points:
+        widths["points"] = (config.num_points, POINT_FEATURES)
+    if config.num_lights:
+        widths["lights"] = (config.num_lights, POINT_FEATURES)
+    masks = {f"{name}_mask": width[:1] for name, width in widths.items() if len(width) > 1}
+    if config.route:
+        widths["route"] = (ROUTE_FEATURES,)
+    if config.clearance or config.road:
+        widths["road"] = (5,)
+    if config.road and config.foresight:
+        widths["road_ahead"] = (len(config.foresight),)
+    if config.num_objects and (config.clearance or config.gaps):
+        widths["gap"] = (config.num_objects,)
+        if config.foresight:
+            widths["gap_ahead"] = (config.num_objects, len(config.foresight))
+    if config.num_objects and config.along:
+        widths["along"] = (config.num_objects, ALONG_FEATURES)
+    numbers = {name: Unbounded(shape=(agents, *width), device=device) for name, width in widths.items()}
+    flags = {
+        name: Binary(shape=(agents, *width), dtype=torch.bool, device=device) for name, width in masks.items()
+    }
+    return Composite({**numbers, **flags}, shape=(agents,))
 
 
 def objects_at(
@@ -152,15 +194,18 @@ def objects_at(
     valid = scenes.log_valid.flatten(0, 1).index_select(0, row)
     valid = valid & (step <= scenes.last_step[scene])[:, None]
     if state is not None and index is not None and index_valid is not None:
-        heading, speed = state[..., 2], state[..., 3:]
-        forward = torch.stack([heading.cos(), heading.sin()], -1)
-        simulated = torch.cat([state[..., :3], speed * forward], -1)
-        # Padded agents are written to a column past the last one, which is cut off again.
-        agents = logged.shape[1]
-        column = torch.where(index_valid, index, agents)
-        wide = column[..., None].expand(*column.shape, 5)
-        logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
-        valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
+        x, y, heading, speed = state.unbind(-1)
+        simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
+        wide = index[..., None].expand(*index.shape, 5)
+        if on_host(state) and bool(index_valid.all()):
+            logged, valid = logged.scatter(1, wide, simulated), valid.scatter(1, index, True)
+        else:
+            # Those not there are written to a column past the last one, which is cut off again.
+            agents = logged.shape[1]
+            column = torch.where(index_valid, index, agents)
+            wide = column[..., None].expand_as(wide)
+            logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
+            valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
     return Objects(logged, valid, scenes.box_size[scene], scenes.agent_type[scene])
 
 
@@ -189,13 +234,15 @@ def observe(
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
         routes: points of the agents' routes and how many of them exist; without, nothing of routes is observed.
     """
+    if config.blind and not config.route:
+        return Observation()
     tables = Tables(scenes, config) if tables is None else tables
     own = _take(objects.state, index)
     own_size = _take(objects.size, index)
     origin, heading = own[..., :2], own[..., 2]
     speed = rotate(own[..., 3:], -heading)[..., 0]
     features, points, points_mask, road, route = None, None, None, None, None
-    lights, lights_mask = None, None
+    lights, lights_mask, road_ahead = None, None, None
     if config.own:
         ends = (step >= scenes.last_step[scene]).to(own.dtype)
         features = torch.cat(
@@ -216,9 +263,15 @@ def observe(
     if config.route and routes is not None:
         pose = torch.cat([own[..., :3], speed[..., None]], -1)
         route = route_ahead(pose, *routes, config.distance_scale)
-    if config.clearance:
-        corners = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
-        road = road_distance(scenes, scene, corners.flatten(1, 2), tables).unflatten(1, corners.shape[1:3])
+    if config.clearance or config.road:
+        places = [origin[..., None, :], box_corners(origin, heading, own_size)]
+        if config.road and config.foresight:
+            times = constant(config.foresight, own.dtype, own.device)[:, None]
+            places.append(origin[..., None, :] + times * own[..., None, 3:])
+        queried = torch.cat(places, -2)
+        away = road_distance(scenes, scene, queried.flatten(1, 2), tables).unflatten(1, queried.shape[1:3])
+        road, ahead = away[..., :5], away[..., 5:]
+        road_ahead = ahead if config.road and config.foresight else None
     return Observation(
         own=features,
         objects=seen.features,
@@ -230,6 +283,7 @@ def observe(
         gap=seen.gap,
         gap_ahead=seen.gap_ahead,
         road=road,
+        road_ahead=road_ahead,
         route=route,
         along=seen.along,
     )
@@ -261,28 +315,34 @@ def _observed_objects(
         squared = (x.square() + y.square()).masked_fill(hidden, torch.inf)
         chosen, mask = nearest(squared, config.num_objects)
     shape, flat = chosen.shape, chosen.flatten(1)
-    state = _take(objects.state, flat).unflatten(1, shape[1:])
-    static = tables.agents.index_select(0, (flat + (scene * agents)[:, None]).flatten()).unflatten(0, shape)
-    angle = -heading[..., None]
-    relative = wrap(state[..., 2] + angle)
-    features = torch.cat(
-        [
-            rotate(state[..., :2] - origin[..., None, :], angle) / config.distance_scale,
-            relative.cos()[..., None],
-            relative.sin()[..., None],
-            rotate(state[..., 3:], angle) / config.speed_scale,
-            # Elements are encoded one by one, so each must tell how fast it is approached.
-            rotate(state[..., 3:] - own[..., None, 3:], angle) / config.speed_scale,
-            static,
-        ],
-        -1,
-    )
-    features = features * mask[..., None]
+    row = (flat + (scene * agents)[:, None]).flatten()
+    # Places among all agents there are now, and among those of all scenes.
+    now = (flat + torch.arange(0, objects.valid.numel(), agents, device=flat.device)[:, None]).flatten()
+    state = objects.state.flatten(0, 1).index_select(0, now).unflatten(0, shape)
+    static = tables.agents.index_select(0, row).unflatten(0, shape)
+    # Component by component: operations on a last dimension of 2 are slow.
+    angle, (_, _, _, own_x, own_y) = -heading[..., None], own[..., None, :].unbind(-1)
+    cos, sin = angle.cos(), angle.sin()
+
+    def turned(x: Float[Tensor, "M N O"], y: Float[Tensor, "M N O"], scale: float) -> list[Tensor]:
+        return [(cos * x - sin * y) / scale, (sin * x + cos * y) / scale]
+
+    x, y, course, speed_x, speed_y = state.unbind(-1)
+    relative = wrap(course + angle)
+    dynamic = [
+        *turned(x - origin[..., None, 0], y - origin[..., None, 1], config.distance_scale),
+        relative.cos(),
+        relative.sin(),
+        *turned(speed_x, speed_y, config.speed_scale),
+        # Elements are encoded one by one, so each must tell how fast it is approached.
+        *turned(speed_x - own_x, speed_y - own_y, config.speed_scale),
+    ]
+    features = torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(own.dtype)[..., None]
     follows = config.along and routes is not None
     measures = config.clearance or config.gaps
     if not follows and not measures:
         return _Seen(features, mask)
-    size = _take(objects.size, flat).unflatten(1, shape[1:])
+    size = objects.size.flatten(0, 1).index_select(0, now).unflatten(0, shape)
     along = None
     if follows and routes is not None:
         along = along_route(own, own_size, state, size, *routes) * mask[..., None]
@@ -301,17 +361,18 @@ def _gaps(
     size: Float[Tensor, "M N O 2"],
 ) -> Float[Tensor, "M N O H"]:
     """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
-    times = constant((0.0, *foresight), own.dtype, own.device)[:, None]
-    here = own[..., None, None, :2] + times * own[..., None, None, 3:]
-    there = state[..., None, :2] + times * state[..., None, 3:]
-    return box_gap(
-        here,
-        own[..., None, None, 2],
-        own_size[..., None, None, :],
-        there,
-        state[..., 2, None],
-        size[..., None, :],
+    # Times come first, so that operations run along everything else.
+    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None, None]
+    wide, wide_size = own[..., None, :].expand_as(state), own_size[..., None, :].expand_as(size)
+    gap = box_gap(
+        wide[..., :2] + times * wide[..., 3:],
+        wide[..., 2],
+        wide_size,
+        state[..., :2] + times * state[..., 3:],
+        state[..., 2],
+        size,
     )
+    return gap.movedim(0, -1).contiguous()
 
 
 def _take(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:

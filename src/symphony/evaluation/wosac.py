@@ -146,12 +146,15 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
     config = settings.config(ROLLOUTS, settings.seed)
     kind, pruning = search_kind(agent, config), config.pruning(agent.search)
     found: dict[str, Any] = {"search": kind, "seed": settings.seed}
+    found |= {"horizon": settings.horizon} if settings.future != FUTURE else {}
     if agent.goals is not None:
         found["logged_goals"] = settings.logged_goals
+    if settings.action_temperature != 1.0:
+        found["action_temperature"] = settings.action_temperature
     if kind != "none":
         found["branches"] = settings.branches or agent.search.test_branches
     if kind == "tree":
-        found |= {"rule": pruning.rule, "prune_every": pruning.prune_every, "goals": settings.goals}
+        found |= {"rule": pruning.rule, "prune_every": pruning.prune_every, "goals": pruning.goals}
         found |= {"temperature": pruning.temperature} if pruning.rule == "systematic" else {}
         found |= {"threshold": pruning.threshold} if pruning.rule == "replace" else {}
         found |= {"retries": settings.retries} if settings.retries else {}
@@ -194,7 +197,7 @@ def evaluate_wosac(
     how = simulated_how(agent, settings) if agent.policy is not None else {"search": "log"}
     others = [load_agent(name, settings.device) for name in WOSAC_BASELINES] if baselines else []
     everyone = [*(other for other in others if other.name != agent.name), agent]
-    thinned = _thinned(agent, store, items) if baselines else 1
+    thinned = _thinned(agent, store, items, settings.future) if baselines else 1
     names = [one.name for one in everyone] + [THINNED] * (thinned > 1)
     results = dict.fromkeys(sorted(names, key=_place), WosacResult())
     scorer, groups = _SegmentScorer(everyone, store, settings, config, thinned), []
@@ -219,14 +222,14 @@ def _place(name: str) -> int:
     return _FIRST.index(name) if name in _FIRST else len(_FIRST)
 
 
-def _thinned(agent: Agent, store: SegmentStore, items: Sequence[int]) -> int:
+def _thinned(agent: Agent, store: SegmentStore, items: Sequence[int], future: int = FUTURE) -> int:
     """Steps of 0.1 s to a decision of the agent, where the store has all of them and a rollout whole decisions; 1
     where not.
     """
     if agent.spec is None or (store.time_steps[list(items)] > DT + 1e-6).any():
         return 1
     every = round(agent.spec.dt / DT)
-    return every if abs(every * DT - agent.spec.dt) < 1e-6 and FUTURE % every == 0 else 1
+    return every if abs(every * DT - agent.spec.dt) < 1e-6 and future % every == 0 else 1
 
 
 @dataclass(frozen=True)
@@ -242,7 +245,8 @@ class _SegmentScorer:
     def __call__(self, items: list[int]) -> tuple[str, dict[str, WosacResult]]:
         """The recording, and what was found of each agent."""
         segment = self.store[items[0]]
-        window, scenario = wosac_window(segment), wosac_scenario(segment)
+        future = self.settings.future
+        window, scenario = wosac_window(segment, future), wosac_scenario(segment, future)
         pairs = passing_pairs(window)
         found = {}
         for name, make in self._makers(window).items():
@@ -259,7 +263,7 @@ class _SegmentScorer:
             if agent.policy is None:
                 makers[agent.name] = partial(log_playback, window)
             elif agent.name == BASELINES[1]:
-                makers[agent.name] = partial(constant_velocity, window)
+                makers[agent.name] = partial(constant_velocity, window, self.settings.future)
             else:
                 makers[agent.name] = partial(wosac_rollouts, agent, window, self.settings)
         if self.thinned > 1:

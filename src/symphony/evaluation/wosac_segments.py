@@ -9,7 +9,7 @@ import numpy as np
 from symphony.data.resample import resample
 from symphony.data.rollouts import RolloutArrays
 from symphony.data.segment import RunSegment, SignalState
-from symphony.data.sources.wosac import CURRENT, DT, STEPS
+from symphony.data.sources.wosac import CURRENT, DT
 from symphony.data.submission import FUTURE, ROLLOUTS
 from symphony.errors import DataError
 from symphony.metrics.wosac import WosacScenario
@@ -20,26 +20,31 @@ _AWAY, _APART = 1e5, 1e3
 _TIMED = ("position", "heading", "velocity", "valid", "signal_state")
 
 
-def wosac_window(segment: RunSegment) -> RunSegment:
+def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
     """The first 9 s of a segment as the challenge has them: 91 steps of 0.1 s, of which step 10 is the current one.
 
     Other time steps are brought to 0.1 s by :func:`symphony.data.resample.resample`. Of a segment between 8 and 9 s
     the future is kept whole and the history is shorter: its first steps are valid for nobody, and go back from the
     first logged one at its velocity, so that there is no jump in speed.
 
+    Args:
+        segment: of any time step.
+        future: steps of the future, 80 or fewer; with fewer all of the above is so much shorter.
+
     Raises:
         DataError: less than 8 s.
     """
     tenth = segment if abs(segment.dt - DT) < 1e-6 else resample(segment, DT)
-    steps = min(tenth.num_steps, STEPS)
-    if steps <= FUTURE:
+    whole = CURRENT + 1 + future
+    steps = min(tenth.num_steps, whole)
+    if steps <= future:
         raise DataError(
-            f"has {(tenth.num_steps - 1) * DT:g} s, the score needs {FUTURE * DT:g}",
+            f"has {(tenth.num_steps - 1) * DT:g} s, the score needs {future * DT:g}",
             file=segment.file or None,
             segment=segment.segment_id,
             field="valid",
         )
-    missing = STEPS - steps
+    missing = whole - steps
 
     def taken(values: Any) -> Any:
         return np.pad(values[:, :steps], [(0, 0), (missing, 0), *[(0, 0)] * (values.ndim - 2)])
@@ -52,7 +57,7 @@ def wosac_window(segment: RunSegment) -> RunSegment:
     return tenth.replace(dt=DT, current_step=CURRENT, **found)
 
 
-def wosac_scenario(segment: RunSegment) -> WosacScenario:
+def wosac_scenario(segment: RunSegment, future: int = FUTURE) -> WosacScenario:
     """What is scored of a run segment, see :func:`wosac_window`.
 
     Scored are the ego and the agents the source marks for prediction, as far as they are valid at step 10; where it
@@ -61,7 +66,7 @@ def wosac_scenario(segment: RunSegment) -> WosacScenario:
     Raises:
         DataError: it can't be scored; names the segment.
     """
-    window = wosac_window(segment)
+    window = wosac_window(segment, future)
     present = window.valid[:, CURRENT]
     chosen = np.zeros(len(present), bool)
     chosen[[window.ego, *window.predict.tolist()]] = True
@@ -70,6 +75,7 @@ def wosac_scenario(segment: RunSegment) -> WosacScenario:
     light, step = (window.signal_state != SignalState.UNKNOWN).nonzero()
     return WosacScenario.of(
         window.segment_id,
+        future=future,
         object_id=window.agent_id.astype(np.int64),
         object_type=window.agent_type.astype(np.int64),
         position=window.position + origin,
@@ -95,16 +101,17 @@ def log_playback(window: RunSegment, every: int = 1) -> RolloutArrays:
     Args:
         window: the log.
         every: take one in so many steps, and between valid ones interpolate as in
-            :func:`symphony.simulation.wosac.wosac_rollouts`; a divisor of 80.
+            :func:`symphony.simulation.wosac.wosac_rollouts`; a divisor of the number of future steps.
     """
     rows = np.flatnonzero(window.valid[:, CURRENT])
     valid = window.valid[rows, CURRENT:]
+    future = valid.shape[1] - 1
     place = (window.position[rows, CURRENT:] + window.origin).astype(np.float64)
     heading = window.heading[rows, CURRENT:].astype(np.float64)
     if every > 1:
         states = np.concatenate([place[..., :2], heading[..., None]], -1).swapaxes(0, 1)
-        between = between_decisions(states[None, ::every], every * DT)[0]
-        steps = np.arange(1, FUTURE + 1)
+        between = between_decisions(states[None, ::every], every * DT, future)[0]
+        steps = np.arange(1, future + 1)
         known = valid[:, steps // every * every] & valid[:, -(-steps // every) * every]
         place[:, 1:, :2] = np.where(known[..., None], between[..., :2], place[:, 1:, :2])
         heading[:, 1:] = np.where(known, between[..., 2], heading[:, 1:])

@@ -33,6 +33,8 @@ COLUMNS = (
     WosacColumn("simulated_offroad_rate", "off-road %", 1, 100.0),
     WosacColumn("min_ade", "minADE m", 2),
 )
+HORIZON = 8.0
+"""Seconds that the challenge has simulated; a record with others says so."""
 _WORDS = {
     "playback": "log playback",
     "playback_thinned": "log playback at the agent's rate",
@@ -70,7 +72,7 @@ def wosac_grid(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> 
         Cells of text; ± standard error over recordings.
 
     Raises:
-        ConfigError: of different run segments or years, or not a name for each.
+        ConfigError: of different run segments, years or horizons, or not a name for each.
     """
     if not records:
         raise ConfigError("no records")
@@ -80,7 +82,7 @@ def wosac_grid(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> 
     for record in records:
         if _what(record) != _what(first):
             raise ConfigError(
-                f"records of different run segments or years: {first['agent']}, {record['agent']}; "
+                f"records of different run segments, years or horizons: {first['agent']}, {record['agent']}; "
                 "a table is of the same ones"
             )
     order: dict[str, Any] = next((one["agents"] for one in records if len(one["agents"]) > 1), {})
@@ -113,8 +115,10 @@ def grid_note(records: Sequence[dict[str, Any]]) -> str:
     record = records[0]
     count = len(record["agents"][record["agent"]]["segments"])
     pairs = record["agents"][record["agent"]]["order"]["pairs"]
+    horizon = record["how"].get("horizon", HORIZON)
+    short = "" if horizon == HORIZON else f" over {horizon:g} s (the challenge has {HORIZON:g})"
     return (
-        f"WOSAC {record['config']}: {count} run segments of {record['recordings']} recordings in "
+        f"WOSAC {record['config']}{short}: {count} run segments of {record['recordings']} recordings in "
         f"{record['data']['name']} ({record['data']['checksum'][:12]}), 32 rollouts each; ± standard error over "
         f"recordings; order of {pairs} pairs that merge or cross in the log"
     )
@@ -122,7 +126,7 @@ def grid_note(records: Sequence[dict[str, Any]]) -> str:
 
 def _what(record: dict[str, Any]) -> tuple[Any, ...]:
     segments = list(record["agents"][record["agent"]]["segments"])
-    return record["config"], record["data"].get("checksum"), segments
+    return record["config"], record["data"].get("checksum"), segments, record["how"].get("horizon", HORIZON)
 
 
 def _cell(numbers: dict[str, Any], column: WosacColumn) -> str:

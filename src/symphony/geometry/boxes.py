@@ -6,6 +6,9 @@ A box is a centre [..., 2] in metres, a heading [...] in radians counter-clockwi
 
 from __future__ import annotations
 
+from functools import reduce
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -39,7 +42,8 @@ def boxes_overlap(
     reaches strictly inside that one; two coincident points do not overlap. The result is the same with the
     boxes swapped, and true exactly where :func:`box_gap` is negative.
     """
-    return _separations(center_a, heading_a, size_a, center_b, heading_b, size_b) < 0
+    pair = _relation(center_a, heading_a, center_b, heading_b)
+    return _separations(pair, size_a, size_b) < 0
 
 
 def box_gap(
@@ -55,11 +59,12 @@ def box_gap(
     Apart: the Euclidean gap. Overlapping: minus the penetration depth, the length of the shortest translation
     that separates them. Differentiable in every argument, with finite gradients everywhere.
     """
-    separation = _separations(center_a, heading_a, size_a, center_b, heading_b, size_b)
+    pair = _relation(center_a, heading_a, center_b, heading_b)
+    separation = _separations(pair, size_a, size_b)
     # Of two disjoint convex polygons the nearest points include a corner of one of them.
     apart = torch.minimum(
-        _corner_distance(center_a, heading_a, size_a, center_b, heading_b, size_b),
-        _corner_distance(center_b, heading_b, size_b, center_a, heading_a, size_a),
+        _corner_distance(pair.in_a, pair.turn, size_a, size_b),
+        _corner_distance(_opposite(pair.in_b), (pair.turn[0], -pair.turn[1]), size_b, size_a),
     )
     return torch.where(separation <= 0, separation, apart)
 
@@ -69,59 +74,75 @@ def _local_corners(size: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 4 2"]:
     return 0.5 * size[..., None, :] * signs
 
 
-def _separations(
+_Plane = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
+"""Two components that belong together, each a tensor of its own: operations on a last dimension of 2 are slow."""
+
+
+class _Pair(NamedTuple):
+    """Where box b is relative to box a, everything relative so that large coordinates cost no precision.
+
+    Attributes:
+        in_a: the way from a's centre to b's, along and across a.
+        in_b: the same way, along and across b.
+        turn: cosine and sine of b's heading relative to a's.
+    """
+
+    in_a: _Plane
+    in_b: _Plane
+    turn: _Plane
+
+
+def _relation(
     center_a: Float[Tensor, "*#b 2"],
     heading_a: Float[Tensor, "*#b"],
-    size_a: Float[Tensor, "*#b 2"],
     center_b: Float[Tensor, "*#b 2"],
     heading_b: Float[Tensor, "*#b"],
-    size_b: Float[Tensor, "*#b 2"],
-) -> Float[Tensor, "*b"]:
-    """Largest separation along the four face normals: negative where the boxes overlap."""
-    # Everything is relative (centre difference, heading difference), so large coordinates cost no precision,
-    # and each box's axes are treated alike, so that swapping the boxes gives the same bits.
-    delta = center_b - center_a
+) -> _Pair:
+    x, y = (center_b[..., k] - center_a[..., k] for k in (0, 1))
     turn = heading_b - heading_a
-    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
-    along_a, across_a = _projections(delta, heading_a)
-    along_b, across_b = _projections(delta, heading_b)
+    return _Pair(_turned(x, y, heading_a), _turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
+
+
+def _turned(x: Float[Tensor, "*#b"], y: Float[Tensor, "*#b"], heading: Float[Tensor, "*#b"]) -> _Plane:
+    """A vector along and across a heading."""
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    return cos * x + sin * y, cos * y - sin * x
+
+
+def _opposite(plane: _Plane) -> _Plane:
+    return -plane[0], -plane[1]
+
+
+def _separations(pair: _Pair, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tensor, "*#b 2"]) -> Tensor:
+    """Largest separation along the four face normals: negative where the boxes overlap."""
+    # Each box's axes are treated alike, so that swapping the boxes gives the same bits.
+    cos, sin = (part.abs() for part in pair.turn)
     length_a, width_a = 0.5 * size_a[..., 0], 0.5 * size_a[..., 1]
     length_b, width_b = 0.5 * size_b[..., 0], 0.5 * size_b[..., 1]
     front = torch.maximum(
-        along_a - (length_a + (length_b * cos + width_b * sin)),
-        along_b - (length_b + (length_a * cos + width_a * sin)),
+        pair.in_a[0].abs() - (length_a + (length_b * cos + width_b * sin)),
+        pair.in_b[0].abs() - (length_b + (length_a * cos + width_a * sin)),
     )
     side = torch.maximum(
-        across_a - (width_a + (length_b * sin + width_b * cos)),
-        across_b - (width_b + (length_a * sin + width_a * cos)),
+        pair.in_a[1].abs() - (width_a + (length_b * sin + width_b * cos)),
+        pair.in_b[1].abs() - (width_b + (length_a * sin + width_a * cos)),
     )
     return torch.maximum(front, side)
 
 
-def _projections(
-    delta: Float[Tensor, "*#b 2"], heading: Float[Tensor, "*#b"]
-) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
-    cos, sin = torch.cos(heading), torch.sin(heading)
-    x, y = delta[..., 0], delta[..., 1]
-    return (cos * x + sin * y).abs(), (cos * y - sin * x).abs()
-
-
 def _corner_distance(
-    center: Float[Tensor, "*#b 2"],
-    heading: Float[Tensor, "*#b"],
-    size: Float[Tensor, "*#b 2"],
-    other: Float[Tensor, "*#b 2"],
-    other_heading: Float[Tensor, "*#b"],
-    other_size: Float[Tensor, "*#b 2"],
-) -> Float[Tensor, "*b"]:
-    """Smallest distance of the other box's corners from this box (0 inside)."""
-    delta, turn = other - center, other_heading - heading
-    cos, sin = torch.cos(heading), torch.sin(heading)
-    x, y = delta[..., 0], delta[..., 1]
-    x, y = cos * x + sin * y, cos * y - sin * x
+    way: _Plane, turn: _Plane, size: Float[Tensor, "*#b 2"], other_size: Float[Tensor, "*#b 2"]
+) -> Tensor:
+    """Smallest distance of the other box's corners from this box (0 inside).
+
+    Args:
+        way: to the other's centre, along and across this one.
+        turn: cosine and sine of the other's heading relative to this one's.
+        size: of this box.
+        other_size: of the other.
+    """
+    (x, y), (cos, sin) = way, turn
     half_length, half_width = 0.5 * size[..., 0], 0.5 * size[..., 1]
-    # The corners in this box's frame, component by component: operations on last dimensions of 2 and 4 are slow.
-    cos, sin = torch.cos(turn), torch.sin(turn)
     length, width = 0.5 * other_size[..., 0], 0.5 * other_size[..., 1]
     x_of_length, x_of_width, y_of_length, y_of_width = cos * length, sin * width, sin * length, cos * width
     near_x, far_x = x_of_length - x_of_width, x_of_length + x_of_width
@@ -132,13 +153,11 @@ def _corner_distance(
         (x - near_x, y - far_y),
         (x + far_x, y + near_y),
     )
-    squared = torch.stack(
-        [
-            (along.abs() - half_length).clamp(min=0).square()
-            + (across.abs() - half_width).clamp(min=0).square()
-            for along, across in corners
-        ]
-    ).amin(0)
-    positive = squared > 0
+    squared = [
+        (along.abs() - half_length).clamp(min=0).square() + (across.abs() - half_width).clamp(min=0).square()
+        for along, across in corners
+    ]
+    nearest = reduce(torch.minimum, squared)
+    positive = nearest > 0
     # The square root of a stand-in keeps the gradient finite where the distance is 0.
-    return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
+    return torch.where(positive, torch.where(positive, nearest, 1.0).sqrt(), 0.0)

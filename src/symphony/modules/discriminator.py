@@ -12,18 +12,20 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from symphony.keys import GAP, GAP_AHEAD, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
-from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, gap_features, scene_module
+from symphony.modules.encoder import (
+    ElementGroup,
+    SceneEncoder,
+    SceneNetwork,
+    gap_features,
+    road_features,
+    scene_module,
+)
 from symphony.modules.pooling import PoolMode
 
 Features = Literal["paper", "clearance", "foresight"]
 FORESIGHT = (0.5, 1.0, 2.0)
 """Seconds ahead at which ``foresight`` looks."""
 _GAP, _ROAD = 3, 2 * 5
-
-
-def road_features(distance: Float[Tensor, "*b points"]) -> Float[Tensor, "*b features"]:
-    """Signed distances to the edge of the road in metres as numbers of order one, two for each."""
-    return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
 
 
 class Discriminator(nn.Module):
@@ -88,7 +90,9 @@ class Discriminator(nn.Module):
         return torch.where(valid, logits, 0.0)
 
     def _near(self, elements: Float[Tensor, "*e F"]) -> Bool[Tensor, "*e"]:
-        return elements[..., :2].detach().square().sum(-1) <= self.radius**2
+        # Component by component: sums over a last dimension of 2 are slow.
+        x, y = elements[..., :2].detach().unbind(-1)
+        return x.square() + y.square() <= self.radius**2
 
 
 def discriminator(

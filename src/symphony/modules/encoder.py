@@ -42,6 +42,11 @@ def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
     return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
+def road_features(distance: Float[Tensor, "*b points"]) -> Float[Tensor, "*b features"]:
+    """Signed distances to the edge of the road in metres as numbers of order one, two for each."""
+    return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
+
+
 EncoderClass = Callable[..., Any]
 """Called with the arguments of :class:`SceneEncoder`; gives a module that is called as that is, with its `width`."""
 
@@ -111,14 +116,16 @@ class SceneNetwork(nn.Module):
 class _Join(nn.Module):
     """Concatenates features that come under several keys: the agents' own, and those of each group's elements."""
 
-    def __init__(self, network: nn.Module, owns: int, groups: Sequence[ElementGroup]) -> None:
+    def __init__(self, network: nn.Module, owns: int, roads: int, groups: Sequence[ElementGroup]) -> None:
         super().__init__()
-        self.network, self.owns = network, owns
+        self.network, self.owns, self.roads = network, owns, roads
         self.parts = [(len(group.more_keys), len(group.gap_keys)) for group in groups]
 
     def forward(self, *inputs: Tensor) -> Tensor:
         waiting = iter(inputs)
-        joined = [torch.cat([next(waiting) for _ in range(self.owns)], -1), next(waiting)]
+        own = [next(waiting) for _ in range(self.owns)]
+        own += [road_features(next(waiting)) for _ in range(self.roads)]
+        joined = [torch.cat(own, -1), next(waiting)]
         for more, gaps in self.parts:
             elements, mask = next(waiting), next(waiting)
             parts = [elements, *(next(waiting) for _ in range(more))]
@@ -134,6 +141,7 @@ def scene_module(
     out_key: NestedKey,
     *,
     own_keys: Sequence[NestedKey] = (OWN,),
+    road_keys: Sequence[NestedKey] = (),
     valid_key: NestedKey = VALID,
     more_keys: Sequence[NestedKey] = (),
 ) -> TensorDictModule:
@@ -144,10 +152,13 @@ def scene_module(
         groups: types of elements.
         out_key: where its result goes.
         own_keys: features of the agent itself, concatenated.
+        road_keys: signed distances `[..., N, K]` to the edge of the road in metres, of each of which
+            :func:`road_features` makes two more.
         valid_key: mask of the agents.
         more_keys: further inputs.
     """
     read = [key for group in groups for key in (group.key, group.mask_key, *group.more_keys, *group.gap_keys)]
-    apart = len(own_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
-    joined = _Join(network, len(own_keys), groups) if apart else network
-    return TensorDictModule(joined, in_keys=[*own_keys, valid_key, *read, *more_keys], out_keys=[out_key])
+    apart = len(own_keys) + len(road_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
+    joined = _Join(network, len(own_keys), len(road_keys), groups) if apart else network
+    own = [*own_keys, *road_keys]
+    return TensorDictModule(joined, in_keys=[*own, valid_key, *read, *more_keys], out_keys=[out_key])

@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from symphony.geometry.nearest import on_host
+from symphony.modules.rows import reusing
+
 PoolMode = Literal["auto", "dense", "winner"]
 ROWS = 2048
 """Elements encoded at a time: their activations (512 KiB at width 64) stay in a core's L2 cache."""
@@ -102,27 +105,32 @@ def _in_chunks(
     *,
     index: bool,
 ) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"] | None]:
-    """Maxima `[n, H]`, and on request the element `[n, H]` of each; arbitrary for sets without elements."""
+    """Maxima `[n, H]`, and on request the element `[n, H]` of each; arbitrary for sets without valid elements."""
     n, count, features = sets.shape
     size = max(1, rows // count)
-    # A masked element repeats a valid one: cheaper than masking the H-wide outputs, and the maximum is the same.
-    first = _first_valid(valid)[:, None, None].expand(-1, 1, features)
-    substitute = torch.where(valid.any(1)[:, None, None], sets.gather(1, first), 0.0)
+    flat = sets.reshape(n * count, features)
+    order = None
+    if not (on_host(valid) and bool(valid.all())):
+        # A masked element repeats a valid one: cheaper than masking the H-wide outputs, and the maximum is the same.
+        place = torch.arange(n * count, device=sets.device).view(n, count)
+        order = torch.where(valid, place, place.gather(1, _first_valid(valid)[:, None])).view(-1)
+    # Elsewhere there is no cache to stay in, and layers may be anything.
+    function = reusing(function) if on_host(sets) else function
     maxima, winners = [], []
-    for start in range(0, n, size):
-        part = slice(start, start + size)
-        block = torch.where(valid[part, :, None], sets[part], substitute[part])
-        missing = size - block.shape[0]
+    for start in range(0, n * count, size * count):
+        stop = start + size * count
+        block = flat[start:stop] if order is None else flat.index_select(0, order[start:stop])
+        missing = size * count - block.shape[0]
         if missing:
             # A fixed number of rows fixes the kernel, hence the rounding, of every matrix product.
-            block = torch.cat([block, block.new_zeros(missing, count, features)])
-        encoded = function(block.reshape(-1, features)).reshape(size, count, -1)
+            block = torch.cat([block, block.new_zeros(missing, features)])
+        encoded = function(block).reshape(size, count, -1)[: size - missing // count]
         if index:
             best, where = encoded.max(1)
-            winners.append(where[: size - missing])
+            winners.append(where)
         else:
             best = encoded.amax(1)
-        maxima.append(best[: size - missing])
+        maxima.append(best)
     return torch.cat(maxima), torch.cat(winners) if index else None
 
 

@@ -19,7 +19,8 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
         raise ValueError(f"a network needs an input and an output width, got {tuple(sizes)}")
     layers: list[nn.Module] = []
     for width_in, width_out in pairwise(sizes):
-        layers += [nn.Linear(width_in, width_out), nn.ReLU()]
+        # In place: nothing reads what comes out of a linear layer, and fresh memory costs more than the maximum.
+        layers += [nn.Linear(width_in, width_out), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 
 
@@ -41,5 +42,37 @@ def in_blocks(
     else:
         missing = -flat.shape[0] % rows
         padded = torch.cat([flat, flat.new_zeros(missing, flat.shape[1])]) if missing else flat
-        out = torch.cat([function(block) for block in padded.split(rows)])[: flat.shape[0]]
+        apply = reusing(function)
+        first, *others = padded.split(rows)
+        begun = apply(first)
+        out = begun.new_empty(len(padded), begun.shape[1])
+        out[:rows] = begun
+        for k, block in enumerate(others, 1):
+            out[k * rows : (k + 1) * rows] = apply(block)
+        out = out[: flat.shape[0]]
     return out.reshape(*x.shape[:-1], out.shape[-1])
+
+
+def reusing(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """The same row-wise function, for a loop over blocks of one size without gradients on the CPU.
+
+    What it gives is only valid until it is called again: the layers of an :func:`mlp` write to the same memory each
+    time, which stays in the cache, where fresh memory would take almost as long as the products.
+    """
+    layers = list(function) if isinstance(function, nn.Sequential) else []
+    linear = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
+    if torch.compiler.is_compiling() or not linear or layers[::2] != linear or layers[-1] is not linear[-1]:
+        return function
+    if any(type(layer) is not nn.ReLU for layer in layers[1::2]):
+        return function
+    parts = [(layer.bias.detach(), layer.weight.detach().t()) for layer in linear]
+    kept: list[Tensor] = []
+
+    def apply(block: Float[Tensor, "n F"]) -> Float[Tensor, "n H"]:
+        if not kept or len(kept[0]) != len(block):
+            kept[:] = [weight.new_empty(len(block), weight.shape[1]) for _, weight in parts]
+        for k, ((bias, weight), out) in enumerate(zip(parts, kept, strict=True)):
+            block = torch.addmm(bias, block.relu_() if k else block, weight, out=out)
+        return block
+
+    return apply

@@ -13,8 +13,11 @@ def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> In
     The category is the one whose interval of the cumulative distribution holds the number; a category of
     probability zero is never drawn.
     """
-    cumulative = torch.softmax(logits, -1).cumsum(-1)
-    total = cumulative[..., -1:]
-    drawn = (cumulative <= noise[..., None] * total).sum(-1)
-    # Rounding may carry the product up to the total, past the last category that is possible at all.
-    return torch.minimum(drawn, (cumulative < total).sum(-1))
+    cumulative = torch.softmax(logits.detach(), -1).cumsum(-1)
+    total = cumulative[..., -1:].contiguous()
+    # It never falls, so a place in it is the number of elements at most, or less than, a value.
+    drawn = torch.searchsorted(cumulative, noise[..., None] * total, right=True)
+    # Rounding may carry the product up to the total, past the last category that is possible at all; where logits are
+    # not numbers no place is right, but one must be named.
+    last = torch.searchsorted(cumulative, total).clamp_max(logits.shape[-1] - 1)
+    return torch.minimum(drawn, last).squeeze(-1)

@@ -18,7 +18,7 @@ def bc(config: TrainConfig, processes: Processes) -> Trainer:
     torch.manual_seed(config.seed)
     rng, device = torch.Generator(), processes.device
     store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
+    data = SceneDataset(store, dynamics=dynamics, routes=False, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt)

@@ -18,7 +18,7 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
     torch.manual_seed(config.seed)
     rng, device = torch.Generator(), processes.device
     store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, config.agent.interactive, dynamics, routes=True, duration=config.duration)
+    data = SceneDataset(store, dynamics=dynamics, routes=True, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt, goals=True)

@@ -23,7 +23,7 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
     torch.manual_seed(config.seed)
     seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
     store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
+    data = SceneDataset(store, dynamics=dynamics, routes=False, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt, discriminator=True, searches=True)

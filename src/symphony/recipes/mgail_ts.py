@@ -23,7 +23,7 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
     torch.manual_seed(config.seed)
     seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
     store, dynamics = SegmentStore(config.data), Displacement()
-    data = SceneDataset(store, config.agent.interactive, dynamics, routes=False, duration=config.duration)
+    data = SceneDataset(store, dynamics=dynamics, routes=False, **config.scenes)
 
     # Networks.
     spec = config.spec("displacement", data.dt, discriminator=True, searches=True)

@@ -25,7 +25,7 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     torch.manual_seed(config.seed)
     seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
     store, dynamics = SegmentStore(config.data), Displacement()
-    data = SceneDataset(store, config.agent.interactive, dynamics, routes=True, duration=config.duration)
+    data = SceneDataset(store, dynamics=dynamics, routes=True, **config.scenes)
 
     # Networks.
     spec = config.spec("displacement", data.dt, goals=True, discriminator=True, searches=True)

@@ -129,7 +129,9 @@ def _draw_marks(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
 
 
 def road_ribbon(road: RoadMap, lane: int) -> Any:
-    """Area covered by one lane: its centre line widened to its width."""
+    """Area covered by one lane: its centre line widened to its width; none for a lane of a single point."""
+    if len(road.lanes[lane]) < 2:
+        return shapely.Polygon()
     width = road.lane_width[lane]
     if not np.isfinite(width):
         width = BIKE_WIDTH if road.lane_type[lane] == LaneType.BIKE_LANE else DEFAULT_WIDTH

@@ -26,7 +26,7 @@ from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, scene
 from symphony.errors import DataError, DataWarning
 from symphony.roadgraph import LaneGraph, lane_of
-from symphony.simulation.demonstrations import KEEP, SceneDataset
+from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.experts import IN_LANE
 
 Indices = NDArray[np.int64]
@@ -135,7 +135,7 @@ class CrowdDataset(SceneDataset):
         *,
         routes: bool = False,
         duration: float = 0,
-        keep: int = KEEP,
+        keep: int | None = None,
     ) -> None:
         routes = routes or crowd.along_routes
         super().__init__(store, crowd.count, dynamics, indices, routes=routes, duration=duration, keep=keep)
@@ -188,7 +188,7 @@ def crowd_dataset(
         Crowd.of(config, agent.interactive if default is None else default),
         agent.dynamics,
         indices,
-        routes=agent.goals is not None or routes,
+        routes=agent.routed or routes,
         duration=config.duration or agent.duration,
         keep=config.batch,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from symphony import keys
-from symphony.config import PerturbConfig
+from symphony.config import PerturbConfig, SamplingConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
@@ -23,12 +24,12 @@ from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
 from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.experts import ExpertCache, Experts, fit_experts
+from symphony.simulation.experts import Experts, fit_experts
 from symphony.simulation.kept import KeptExperts
+from symphony.simulation.memory import ItemCache
 from symphony.simulation.perturbation import perturbed
+from symphony.simulation.weights import infractions, some_of, state_weights
 
-KEEP = 5000
-"""Segments held in memory once they are prepared: 90 kB each, 170 with routes, in the built-in data."""
 GRAPHS = 64
 """Lane graphs held in memory."""
 
@@ -49,9 +50,12 @@ class SceneDataset:
         indices: rows of the store to use; all by default.
         routes: whether scenes and experts come with their routes.
         duration: seconds of each segment that are used; 0 for all.
-        keep: segments held in memory once they are prepared.
+        keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
+            machine's memory; 170 kB each in the built-in data, with routes).
+        sampling: what is drawn more often than the rest; nothing by default.
 
     Raises:
+        ConfigError, DataError: if its record is of another store or can't be read.
         DataError: on access, for a segment shorter than the duration.
     """
 
@@ -64,20 +68,28 @@ class SceneDataset:
         *,
         routes: bool = False,
         duration: float = 0,
-        keep: int = KEEP,
+        keep: int | None = None,
+        sampling: SamplingConfig | None = None,
     ) -> None:
         self.store = store
         self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep = routes, duration, keep
-        self.scene = lru_cache(keep)(self._scene)
-        self.experts = ExpertCache(self._experts, keep)
+        self.sampling = SamplingConfig() if sampling is None else sampling
+        hard = self.sampling.hard
+        self._hard = None if hard is None else infractions(hard, store, self.indices)
+        self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
+        self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
+        # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
+        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        build = partial(SceneDataset, routes=self.routes, duration=self.duration, keep=self.keep)
+        build = partial(
+            SceneDataset, routes=self.routes, duration=self.duration, keep=self.keep, sampling=self.sampling
+        )
         return build, (self.store, self.interactive, self.dynamics, self.indices)
 
     def __len__(self) -> int:
@@ -134,9 +146,13 @@ class SceneDataset:
         graph = self.graph(i) if self.routes else None
         return scene(self.segment(i), self.interactive, graph, number=i)
 
+    def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
+        return [self._scene(i) for i in items]
+
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""
-        return collate([self.scene(i) for i in items])
+        found: SceneBatch = self._batch(tuple(items))
+        return found
 
     def _experts(self, items: Sequence[int]) -> list[Experts]:
         """The demonstrations of several items: those kept with the store, the others fitted together and kept."""
@@ -152,6 +168,8 @@ class SceneDataset:
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Different items at random (all, if there are fewer)."""
+        if self._hard is not None:
+            return some_of(self._hard, count, self.sampling.share, rng)
         return torch.randperm(len(self), generator=rng)[:count].tolist()
 
     def sample_states(
@@ -163,7 +181,7 @@ class SceneDataset:
         device: torch.device | str = "cpu",
         perturb: PerturbConfig | None = None,
     ) -> TensorDict:
-        """A training batch: expert states drawn uniformly from some segments, some of them displaced.
+        """A training batch: expert states drawn from some segments (see ``sampling``), some of them displaced.
 
         Returns:
             TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
@@ -171,7 +189,8 @@ class SceneDataset:
         found = self.experts.many(items)
         places = [expert.valid.nonzero(as_tuple=True) for expert in found]
         sizes = torch.tensor([len(which) for which, _ in places])
-        pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
+        scenes = self.scenes(items)
+        pick = self._pick(found, places, scenes, states, rng)
         item = torch.repeat_interleave(torch.arange(len(items)), sizes)[pick]
         which, when = (torch.cat(parts)[pick] for parts in zip(*places, strict=True))
         ends = torch.tensor([len(expert.agent) for expert in found]).cumsum(0)
@@ -184,7 +203,6 @@ class SceneDataset:
         action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
-        scenes = self.scenes(items)
         if perturb is not None:
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
             size = scenes.box_size[item, agent]
@@ -201,6 +219,27 @@ class SceneDataset:
             action=action.to(device),
             routes=None if taken is None else (taken[0].to(device), taken[1].to(device)),
         )
+
+    def _pick(
+        self,
+        experts: Sequence[Experts],
+        places: Sequence[tuple[Tensor, ...]],
+        scenes: SceneBatch,
+        count: int,
+        rng: torch.Generator,
+    ) -> Int[Tensor, " count"]:
+        """Numbers of some of all valid expert states."""
+        if self.sampling.even:
+            return torch.randint(sum(len(which) for which, _ in places), (count,), generator=rng)
+        acts = [
+            torch.isin(expert.agent[which], chosen[real])
+            for expert, (which, _), chosen, real in zip(
+                experts, places, scenes.interactive, scenes.interactive_valid, strict=True
+            )
+        ]
+        speed = [expert.states[place][:, 3] for expert, place in zip(experts, places, strict=True)]
+        weights = state_weights(torch.cat(acts), torch.cat(speed), self.sampling)
+        return torch.multinomial(weights, count, replacement=True, generator=rng)
 
     def sample_goals(
         self,
@@ -270,6 +309,10 @@ class SceneDataset:
             which, place = hit.nonzero(as_tuple=True)
             state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
         return state, valid
+
+
+def _nbytes(scene: SceneBatch) -> int:
+    return sum(getattr(scene, name).nbytes for name in SceneBatch.__annotations__)
 
 
 def logged_routes(

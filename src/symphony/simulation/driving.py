@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
     "idm": CarFollower,
 }
-"""What can drive background agents in place of the agent."""
+"""What can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
 
 
 class Simulation(NamedTuple):
@@ -85,10 +86,12 @@ def simulation(
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
-            step, or a planner can't be copied for a search.
+            step, a planner can't be copied for a search, or another rule drives the others than the agent.
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
     policy = agent.policy
+    if agent.rule:
+        scenes, config = _ruled(agent, scenes, config, given)
     if policy is None:
         if egos is None:
             raise ValueError("log playback has nothing to simulate")
@@ -179,6 +182,19 @@ def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig
     if config.others in RULES:
         found = TensorDictSequential(found, RULES[config.others](env))
     return found
+
+
+def _ruled(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
+) -> tuple[SceneBatch, EvaluateConfig]:
+    """Scenes and settings in which the agent's rule drives everyone, along the routes of the log unless given."""
+    if config.others not in ("log", "learned", agent.rule):
+        raise ConfigError(f"{agent.name} can't be simulated among others that '{config.others}' drives")
+    ruled = scenes.clone(recurse=False)
+    ruled.background = scenes.interactive_valid
+    if given is not None:
+        ruled.route_logged = torch.where(given >= 0, given, scenes.route_logged)
+    return ruled, dataclasses.replace(config, others=agent.rule or config.others)
 
 
 def _with_fixed_goals(

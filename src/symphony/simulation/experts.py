@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +43,13 @@ class Experts:
     valid: Tensor
     error: Tensor
     routes: tuple[RouteTable, ...] = ()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes it takes in memory."""
+        tensors = (self.agent, self.states, self.actions, self.valid, self.error)
+        tables = (part for table in self.routes for part in (table.points, table.count, table.right))
+        return sum(part.nbytes for part in (*tensors, *tables))
 
 
 def experts(
@@ -157,32 +163,3 @@ def _fit_together(
         # Copies, so that a segment kept in memory doesn't keep the whole group.
         found[k] = action[:, : length - 1].clone(), state[:, :length].clone()
     return found
-
-
-class ExpertCache:
-    """The demonstrations of items, made when first asked for, several at a time; those used longest ago go first.
-
-    Args:
-        make: the demonstrations of some items.
-        keep: items held in memory.
-    """
-
-    def __init__(self, make: Callable[[Sequence[int]], list[Experts]], keep: int) -> None:
-        self.make, self.keep = make, keep
-        self._kept: OrderedDict[int, Experts] = OrderedDict()
-
-    def __call__(self, item: int) -> Experts:
-        """Those of one item."""
-        return self.many([item])[0]
-
-    def many(self, items: Sequence[int]) -> list[Experts]:
-        """Those of several items, in their order."""
-        missing = [item for item in dict.fromkeys(items) if item not in self._kept]
-        made = dict(zip(missing, self.make(missing), strict=True)) if missing else {}
-        found = [made[item] if item in made else self._kept[item] for item in items]
-        self._kept.update(made)
-        for item in items:
-            self._kept.move_to_end(item)
-        while len(self._kept) > self.keep:
-            self._kept.popitem(last=False)
-        return found

@@ -1,10 +1,11 @@
-"""Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of everyone, 8 s at 10 Hz.
+"""Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of everyone, 8 s (or less) at 10 Hz.
 
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
 latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive; everyone
 else goes on at the velocity of the current step.
 
-Legend: n agents valid at the current step, N vehicles among them, R rollouts, U decisions and the first state.
+Legend: n agents valid at the current step, N vehicles among them, R rollouts, F future steps (80), U decisions and
+the first state.
 """
 
 from __future__ import annotations
@@ -60,39 +61,45 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings | 
         raise ConfigError("log playback knows the future and can't be simulated")
     rows = _present(segment)
     dt = DT if agent.spec is None else agent.spec.dt
-    start = history_only(segment, dt)
+    future = settings.future
+    start = history_only(segment, dt, future)
     vehicles = np.flatnonzero(start.agent_type == AgentType.VEHICLE)
-    states = np.broadcast_to(_extrapolated(segment, rows), (ROLLOUTS, len(rows), FUTURE, 3)).copy()
+    states = _repeated(_extrapolated(segment, rows, future))
     if len(vehicles):
         try:
             log = future_log(segment) if settings.logged_goals else None
-            states[:, vehicles] = between_decisions(_driven(agent, start, vehicles, settings, log), dt)
+            driven = _driven(agent, start, vehicles, settings, log)
+            states[:, vehicles] = between_decisions(driven, dt, future)
         except NotFiniteError as error:
             raise error.named(segment.segment_id) from error
     return _arrays(segment, rows, states)
 
 
-def constant_velocity(segment: RunSegment) -> RolloutArrays:
+def constant_velocity(segment: RunSegment, future: int = FUTURE) -> RolloutArrays:
     """32 equal rollouts of everyone at the velocity and heading of the current step.
 
     Raises:
         DataError: as :func:`wosac_rollouts`.
     """
     rows = _present(segment)
-    states = np.broadcast_to(_extrapolated(segment, rows), (ROLLOUTS, len(rows), FUTURE, 3)).copy()
-    return _arrays(segment, rows, states)
+    return _arrays(segment, rows, _repeated(_extrapolated(segment, rows, future)))
 
 
-def history_only(segment: RunSegment, dt: float) -> RunSegment:
+def _repeated(states: Doubles) -> Doubles:
+    return np.repeat(states[None], ROLLOUTS, 0)
+
+
+def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
     """What a simulator may know, as a segment to drive in: it begins with the current step, all agents that are
-    valid then go on at constant velocity for 8 s, and lights keep their latest state.
+    valid then go on at constant velocity, and lights keep their latest state.
 
     Args:
         segment: see :func:`wosac_rollouts`.
         dt: seconds between its steps.
+        future: steps of 0.1 s that it lasts.
     """
     rows, now = _present(segment), segment.current_step
-    steps = math.ceil(FUTURE * DT / dt - 1e-6) + 1
+    steps = math.ceil(future * DT / dt - 1e-6) + 1
     velocity = segment.velocity[rows, now].astype(np.float64)
     path = np.repeat(segment.position[rows, now, None].astype(np.float64), steps, 1)
     path[..., :2] += velocity[:, None] * (np.arange(steps) * dt)[:, None]
@@ -132,9 +139,9 @@ def future_log(segment: RunSegment) -> RunSegment:
     )
 
 
-def between_decisions(states: Doubles, dt: float) -> Doubles:
-    """[R, N, 80, 3] x, y, heading at 10 Hz from states [R, U, N, 3] every ``dt`` s, the first at the current step."""
-    where = np.arange(1, FUTURE + 1) * DT / dt
+def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubles:
+    """[R, N, F, 3] x, y, heading at 10 Hz from states [R, U, N, 3] every ``dt`` s, the first at the current step."""
+    where = np.arange(1, future + 1) * DT / dt
     before = np.floor(where + 1e-6).astype(np.int64)
     share = np.where(where - before < 1e-6, 0.0, where - before)[:, None]
     after = np.where(share[:, 0] > 0, before + 1, before)
@@ -167,12 +174,12 @@ def _latest_lights(segment: RunSegment) -> NDArray[Any]:
     return seen[np.arange(len(seen)), latest]
 
 
-def _extrapolated(segment: RunSegment, rows: NDArray[np.int64]) -> Doubles:
-    """[n, 80, 3] x, y, heading at constant velocity."""
+def _extrapolated(segment: RunSegment, rows: NDArray[np.int64], future: int) -> Doubles:
+    """[n, F, 3] x, y, heading at constant velocity."""
     now = segment.current_step
     place = segment.position[rows, now, None, :2].astype(np.float64)
-    path = place + segment.velocity[rows, now, None] * (np.arange(1, FUTURE + 1) * DT)[:, None]
-    heading = np.repeat(wrap(segment.heading[rows, now, None].astype(np.float64)), FUTURE, 1)
+    path = place + segment.velocity[rows, now, None] * (np.arange(1, future + 1) * DT)[:, None]
+    heading = np.repeat(wrap(segment.heading[rows, now, None].astype(np.float64)), future, 1)
     return np.concatenate([path, heading[..., None]], -1)
 
 
@@ -184,7 +191,7 @@ def _driven(
     log: RunSegment | None = None,
 ) -> Doubles:
     """[R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
-    graph = LaneGraph(start.road) if agent.goals is not None else None
+    graph = LaneGraph(start.road) if agent.routed else None
     scenes = scene(start, vehicles.tolist(), graph)
     if graph is not None and log is not None:
         # The first state is the same, so the routes are; which of them was taken is for the log to say.
@@ -206,7 +213,7 @@ def _driven(
 
 
 def _arrays(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> RolloutArrays:
-    """States [32, n, 80, 3] of the segment's frame in that of the log."""
+    """States [32, n, F, 3] of the segment's frame in that of the log."""
     z = segment.position[rows, segment.current_step, 2].astype(np.float64) + segment.origin[2]
     return RolloutArrays(
         object_id=segment.agent_id[rows],

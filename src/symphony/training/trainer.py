@@ -136,9 +136,10 @@ class Trainer:
             except CheckpointError as error:
                 raise error.at(file=self.done / MANIFEST) from error
         self.alarms = Alarms()
-        for dataset in (self.data, self.data if self.validator is None else self.validator.dataset):
-            if dataset.store.unfinished is not None:
-                self._warn(str(dataset.store.path), f"{dataset.store.path} {dataset.store.unfinished}")
+        others = [] if self.validator is None else [self.validator.dataset]
+        for store in (dataset.store for dataset in (self.data, *others)):
+            if store.unfinished is not None:
+                self._warn(str(store.path), f"{store.path} {store.unfinished}")
         if self.world.leads:
             # The process before may have died between a checkpoint and the removal of old ones.
             self._prune()

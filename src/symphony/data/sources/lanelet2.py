@@ -2,9 +2,9 @@
 
 What is read, and what is not:
 
-- Every relation of type ``lanelet`` with one way on its left and one on its right, and every relation of type
-  ``regulatory_element`` with its lines. Areas (``multipolygon``) are not read. Elements that an editor marked as
-  deleted do not count.
+- Every relation of type ``lanelet`` with one way on its left and one on its right, every relation of type
+  ``regulatory_element`` with its lines, and areas (``multipolygon``) that vehicles may use. Other areas are not read.
+  Elements that an editor marked as deleted do not count.
 - Ways may be drawn in either direction: here both bounds of a lanelet run in its direction of travel, the left one
   on its left.
 - A node lies where its file says in metres (attributes ``x``, ``y`` as in INTERACTION's ``.osm_xy`` files, else tags
@@ -26,6 +26,11 @@ from symphony.errors import DataError
 
 MAX_NODES = 2_000_000
 """More than any map of a city district."""
+
+_DRIVABLE = frozenset(
+    {"road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"}
+)
+"""Subtypes of areas on which vehicles may be."""
 
 Projection = Callable[[Doubles], Doubles]
 """[N, 2] latitude and longitude in degrees to metres."""
@@ -93,12 +98,30 @@ class Rule:
 
 
 @dataclass(frozen=True)
+class Area:
+    """A place for vehicles that has no direction, such as a parking lot.
+
+    Attributes:
+        area_id: of the relation.
+        outer: [P, 2] closed outline.
+        inner: likewise of each hole.
+        tags: of the relation.
+    """
+
+    area_id: int
+    outer: Doubles
+    inner: tuple[Doubles, ...]
+    tags: dict[str, str]
+
+
+@dataclass(frozen=True)
 class LaneletMap:
-    """Everything read from a file, in metres; lanelets and ways in file order."""
+    """Everything read from a file, in metres; lanelets, ways and areas in file order."""
 
     lanelets: tuple[Lanelet, ...]
     ways: dict[int, Way]
     rules: dict[int, Rule]
+    areas: tuple[Area, ...] = ()
 
 
 def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
@@ -122,7 +145,12 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
         lanelets = tuple(_lanelet(n, tags, ways) for n, tags in relations if tags.get("type") == "lanelet")
         if not lanelets:
             raise DataError("has no lanelets", field="relation")
-        return LaneletMap(lanelets, ways, {rule.rule_id: rule for rule in rules})
+        areas = tuple(
+            _area(n, tags, ways)
+            for n, tags in relations
+            if tags.get("type") in ("multipolygon", "area") and _for_vehicles(tags)
+        )
+        return LaneletMap(lanelets, ways, {rule.rule_id: rule for rule in rules}, areas)
     except DataError as error:
         raise error.at(file=path) from error
     except OSError as error:
@@ -220,6 +248,54 @@ def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
     if backwards:
         return left.turned(), along.turned(), (True, not twist)
     return left, along, (False, twist)
+
+
+def _for_vehicles(tags: dict[str, str]) -> bool:
+    """Whether vehicles may be on an area: as its participants say, else by its subtype."""
+    named = {name: value for name, value in tags.items() if name.startswith("participant:")}
+    if named:
+        return any(name.startswith("participant:vehicle") and value == "yes" for name, value in named.items())
+    return tags.get("subtype") in _DRIVABLE
+
+
+def _area(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Area:
+    area_id = integer(node.get("id"), "relation id")
+    field = f"area {area_id}"
+    members = _members(node, "way", field)
+    found = {role: _closed(members.get(role, []), ways, f"{field}: {role}") for role in ("outer", "inner")}
+    if len(found["outer"]) != 1:
+        raise DataError(f"{len(found['outer'])} outlines, expected one", field=f"{field}: outer")
+    return Area(area_id, found["outer"][0], tuple(found["inner"]), tags)
+
+
+def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[Doubles]:
+    """Rings [P, 2] of ways that follow one another, drawn in either direction."""
+    absent = [ref for ref in refs if ref not in ways or len(ways[ref].line) < 2]
+    if absent:
+        raise DataError(f"there is no way {absent[0]} of two points or more", field=field)
+    if len(set(refs)) < len(refs):
+        raise DataError("one way twice", field=field)
+    rings: list[Doubles] = []
+    ring: list[Way] = []
+    for k, way in enumerate(ways[ref] for ref in refs):
+        # What a way must begin with; the first of a ring may turn to where the next one is.
+        onward = ways[refs[k + 1]].nodes if k + 1 < len(refs) else ()
+        turns = (
+            ring[-1].nodes[-1] != way.nodes[0] if ring else way.nodes[-1] not in (onward[:1] + onward[-1:])
+        )
+        closed = not ring and way.nodes[0] == way.nodes[-1]
+        ring.append(way.turned() if turns and not closed else way)
+        if len(ring) > 1 and ring[-2].nodes[-1] != ring[-1].nodes[0]:
+            raise DataError(f"way {way.way_id} does not go on where the one before it ends", field=field)
+        if ring[0].nodes[0] == ring[-1].nodes[-1]:
+            line = np.concatenate([part.line[:-1] for part in ring] + [ring[0].line[:1]])
+            if len(line) < 4:
+                raise DataError("a ring of fewer than 3 points", field=field)
+            rings.append(line)
+            ring = []
+    if ring:
+        raise DataError("is not closed", field=field)
+    return rings
 
 
 def _rule(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Rule:

@@ -4,7 +4,8 @@
   centre line is halfway between points at equal shares of the bounds' lengths.
 - A lane's successors begin with the two nodes its bounds end with. Its neighbour shares the whole bound between them,
   in the same direction, unless the bound may not be crossed there (a solid line, a kerb, the tag ``lane_change``).
-- The boundary encloses the union of these lanelets, and is open where no lane goes on (see :func:`.lines.cut_ends`).
+- The boundary encloses the union of these lanelets and of the areas for vehicles (parking lots, exits, free space),
+  and is open where no lane goes on (see :func:`.lines.cut_ends`).
 - A stop sign that the map has, as a sign or as a stop line of a rule with one, is a mark; so are painted lines.
 - A lanelet that is open in both directions counts in the one it is drawn in.
 """
@@ -15,11 +16,12 @@ import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.base import pairs, to_float32
-from symphony.data.sources.lanelet2 import Lanelet, LaneletMap, Rule, Way
+from symphony.data.sources.lanelet2 import Area, Lanelet, LaneletMap, Rule, Way
 from symphony.data.sources.lines import Doubles, cut_ends, drivable_rings, evenly, opened, polylines
 from symphony.errors import DataError
 
@@ -84,7 +86,7 @@ def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
     links = successors(lanes)
     widths = [np.median(np.hypot(*(left - right).T)) for left, right in map(_matched, lanes)]
     rings = opened(
-        drivable_rings([lane.ring for lane in lanes], field="lanelet"),
+        drivable_rings([*(lane.ring for lane in lanes), *map(_polygon, source.areas)], field="lanelet, area"),
         cut_ends([(lane.left.line, lane.right.line) for lane in lanes], links),
     )
     marks = list(_marks(source))
@@ -101,6 +103,10 @@ def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
         marks=polylines([line for line, _ in marks], origin),
         mark_type=np.array([kind for _, kind in marks], np.uint8),
     )
+
+
+def _polygon(area: Area) -> shapely.Polygon:
+    return shapely.Polygon(area.outer, area.inner)
 
 
 def successors(lanes: Sequence[Lanelet]) -> NDArray[np.int32]:

@@ -135,8 +135,9 @@ def _check_steps(scenario: pb.Scenario) -> None:
             else ""
         )
         raise DataError(f"{len(times)} steps, needs {STEPS}{hint}", segment=name, field="timestamps_seconds")
+    # The score takes every step for 0.1 s. Recordings jitter; a step left out or another rate is something else.
     gaps = np.diff(times)
-    if not (np.abs(gaps - DT) <= 0.1 * DT).all():
+    if not ((np.abs(gaps - DT) <= 0.5 * DT).all() and abs(gaps.mean() - DT) <= 0.02 * DT):
         raise DataError(f"steps are not of {DT} s", segment=name, field="timestamps_seconds")
     for track in scenario.tracks:
         if len(track.states) != STEPS:

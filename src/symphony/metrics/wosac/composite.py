@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.metrics.wosac.config import CURRENT, STEPS
+from symphony.metrics.wosac.config import CURRENT
 from symphony.metrics.wosac.scenario import SimulatedRollouts, WosacScenario
 
 
@@ -71,7 +71,7 @@ class Composite:
 
 def joined_valid(valid: Bool[Tensor, "n 91"], future: Bool[Tensor, "R n 80"]) -> Bool[Tensor, "R+1 n 91"]:
     """The log's validity, and that of each rollout."""
-    history = valid[None, :, : STEPS - future.shape[-1]].expand(len(future), -1, -1)
+    history = valid[None, :, : CURRENT + 1].expand(len(future), -1, -1)
     return torch.cat([valid[None], torch.cat([history, future], dim=-1)])
 
 

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 from symphony.errors import ConfigError
 
-STEPS, CURRENT, FUTURE = 91, 10, 80
-"""Steps of a scenario, index of the last one that is known to the simulator, steps that are simulated."""
+CURRENT, FUTURE = 10, 80
+"""Index of the last step that is known to the simulator, number of steps that are simulated."""
 DT = 0.1
 """Seconds per step."""
 ROLLOUTS = 32

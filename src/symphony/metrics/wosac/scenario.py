@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.errors import DataError
-from symphony.metrics.wosac.config import CURRENT, FUTURE, STEPS
+from symphony.metrics.wosac.config import CURRENT, FUTURE
 
 VEHICLE = 1
 """Object type of vehicles."""
@@ -74,6 +74,8 @@ class WosacScenario:
         signal_lane: [M] id of the lane it is for.
         signal_state: [M] 1 and 4 are red (arrow stop, stop).
         signal_point: [M, 2] where to stop, metres.
+        future: steps after step 10, all of which are simulated and scored; the challenge's 80, or fewer for logs that
+            are shorter. "91" above and in what is made of a scenario is 11 more than this.
     """
 
     scenario_id: str
@@ -92,22 +94,33 @@ class WosacScenario:
     signal_lane: Int[Tensor, " M"]
     signal_state: Int[Tensor, " M"]
     signal_point: Float[Tensor, "M 2"]
+    future: int = FUTURE
 
     @classmethod
-    def of(cls, scenario_id: str, *, road_edges: Sequence[Any], lanes: Sequence[Any], **arrays: Any) -> Self:
+    def of(
+        cls,
+        scenario_id: str,
+        *,
+        road_edges: Sequence[Any],
+        lanes: Sequence[Any],
+        future: int = FUTURE,
+        **arrays: Any,
+    ) -> Self:
         """From anything numpy understands, checked.
 
         Args:
             scenario_id: its id.
             road_edges: arrays [P_k, 3].
             lanes: likewise.
+            future: steps that are simulated and scored.
             arrays: the other attributes.
 
         Raises:
             DataError: naming scenario, field and agent.
         """
         tensors = {name: torch.as_tensor(np.asarray(array)) for name, array in arrays.items()}
-        scenario = cls(scenario_id, road_edges=Lines.of(road_edges), lanes=Lines.of(lanes), **tensors)
+        edges, centres = Lines.of(road_edges), Lines.of(lanes)
+        scenario = cls(scenario_id, road_edges=edges, lanes=centres, future=future, **tensors)
         scenario.check()
         return scenario
 
@@ -116,11 +129,20 @@ class WosacScenario:
         """Ids of the objects that a rollout must hold: all that are valid at step 10."""
         return self.object_id[self.valid[:, CURRENT]]
 
+    @property
+    def steps(self) -> int:
+        """All there are: the history's and the future's."""
+        return CURRENT + 1 + self.future
+
     def to(self, device: torch.device | str) -> Self:
         """On another device."""
         return replace(
             self,
-            **{f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "scenario_id"},
+            **{
+                f.name: getattr(self, f.name).to(device)
+                for f in fields(self)
+                if f.name not in {"scenario_id", "future"}
+            },
         )
 
     def check(self) -> None:
@@ -130,10 +152,10 @@ class WosacScenario:
         expected = {
             "object_id": (agents,),
             "object_type": (agents,),
-            "position": (agents, STEPS, 3),
-            "heading": (agents, STEPS),
+            "position": (agents, self.steps, 3),
+            "heading": (agents, self.steps),
             "size": (agents, 3),
-            "valid": (agents, STEPS),
+            "valid": (agents, self.steps),
             "lane_id": self.lanes.counts.shape,
             "lane_type": self.lanes.counts.shape,
             "signal_lane": (signals,),
@@ -163,8 +185,8 @@ class WosacScenario:
                 "no road edge of two or more points, without which nothing is off-road", "road_edge"
             )
         steps = self.signal_step
-        if ((steps < 0) | (steps >= STEPS)).any():
-            raise self._error(f"outside the {STEPS} steps", "signal_step")
+        if ((steps < 0) | (steps >= self.steps)).any():
+            raise self._error(f"outside the {self.steps} steps", "signal_step")
 
     def _check_numbers(self) -> None:
         agents = self.valid[:, CURRENT]
@@ -250,10 +272,11 @@ class SimulatedRollouts:
         rollouts = (len(self.x) if self.x.ndim else 0) if count is None else count
         if rollouts == 0:
             raise error("no rollouts", "x")
+        shape = rollouts, len(ids), scenario.future
         for name in ("x", "y", "z", "heading"):
             values: Tensor = getattr(self, name)
-            if tuple(values.shape) != (rollouts, len(ids), FUTURE):
-                wanted = f"{(rollouts, len(ids), FUTURE)} (rollouts, agents, steps)"
+            if tuple(values.shape) != shape:
+                wanted = f"{shape} (rollouts, agents, steps)"
                 raise error(f"has shape {tuple(values.shape)}, expected {wanted}", name)
             if not values.is_floating_point():
                 raise error(f"must hold floating-point numbers, not {values.dtype}", name)
