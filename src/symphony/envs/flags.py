@@ -65,16 +65,16 @@ def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[n
     if len(pair):
         # Of a place in [M, N, A] the one in [M, N], and that of the other agent in [M, A] of the same row.
         subject = pair // agents
-        other = torch.from_numpy(subject // subjects * agents + pair % agents)
-        own = torch.from_numpy(who[subject])
-        one, two = state.index_select(0, own), state.index_select(0, other)
+        first = torch.from_numpy(who[subject])
+        second = torch.from_numpy(subject // subjects * agents + pair % agents)
+        one, two = state.index_select(0, first), state.index_select(0, second)
         hit = boxes_overlap(
             one[:, :2],
             one[:, 2],
-            size.index_select(0, own),
+            size.index_select(0, first),
             two[:, :2],
             two[:, 2],
-            size.index_select(0, other),
+            size.index_select(0, second),
         )
         result[subject[hit.numpy()]] = True
     return result.reshape(index.shape)
