@@ -73,9 +73,11 @@ lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, f
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/lint_length.py
 
-bench: $(DEV)  ## speed of simulation and search, in CPU time of one thread
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks/test_simulation_benchmark.py --benchmark-timer=time.process_time \
-		--benchmark-columns=median,iqr,rounds --benchmark-sort=name --benchmark-disable-gc
+BENCH_ARGS ?=
+
+bench: $(DEV)  ## speed of everything, by part and as it grows, in CPU time of one thread; some minutes
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/measure.py --out out/bench.json $(BENCH_ARGS)
+	$(BIN)/python benchmarks/tables.py out/bench.json
 
 docs: $(DEV)  ## build the pages of docs/ into out/site; broken links are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

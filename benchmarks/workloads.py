@@ -9,9 +9,11 @@ As a program it prepares one workload and answers each line of its input with a 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,16 +28,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from helpers_segments import straight_road
 from symphony import keys
+from symphony.agents import load_agent
 from symphony.collectors import KeepBest, KeyScore, beam_search
+from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv, ObservationConfig, SceneBatch, collate, scene
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES
+from symphony.evaluation import evaluate
 from symphony.geometry import boxes_overlap
 from symphony.modules import ElementGroup, discrete_policy, discriminator
+from symphony.recipes import RECIPES
+from symphony.simulation import SceneDataset
+from symphony.training import Processes
 
 Work = tuple[Callable[[], Any], int]
-"""A round of work and its agent-steps."""
+"""A round of work, and how many agent-steps (updates, segments, operations) it is."""
 
 SCENES, AGENTS, POINTS = 64, 32, 2000
 
@@ -99,16 +107,16 @@ def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor) -> Work
     return lambda: env.step(start.copy()), rows.numel() * env.num_agents
 
 
-def rings(objects: int, points: int) -> Work:
-    """All agents of 64 ring roads."""
-    scenes = collate([ring(seed) for seed in range(SCENES)])
+def rings(objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS) -> Work:
+    """All agents of some ring roads."""
+    scenes = collate([ring(seed, agents) for seed in range(count)])
     if objects or points:
         config = ObservationConfig(num_objects=objects, num_points=points)
     else:
         nothing = getattr(ObservationConfig, "nothing", None)
         # The least that could be asked for before.
         config = ObservationConfig(1, 1) if nothing is None else nothing()
-    return step_of(scenes, config, torch.arange(SCENES))
+    return step_of(scenes, config, torch.arange(count))
 
 
 def builtin(count: int, agents: int = 2) -> SceneBatch:
@@ -118,14 +126,22 @@ def builtin(count: int, agents: int = 2) -> SceneBatch:
 
 
 def search(
-    points: int = 128, features: Any = "foresight", *, branches: int = 16, noise: bool = False
+    points: int = 128,
+    features: Any = "foresight",
+    *,
+    branches: int = 16,
+    steps: int = 50,
+    segments: int = 16,
+    noise: bool = False,
 ) -> Work:
-    """A beam search on 16 built-in segments, 50 steps, untrained networks.
+    """A beam search on built-in segments with untrained networks.
 
     Args:
         points: nearest points that are seen.
         features: of the discriminator.
         branches: S.
+        steps: T; the segments last 50.
+        segments: how many.
         noise: let actions be decided by numbers of their own, so that another version draws the same.
     """
     ahead = (0.5, 1.0, 2.0) if features == "foresight" else ()
@@ -137,8 +153,8 @@ def search(
     torch.manual_seed(0)
     policy = discrete_policy(SELF_FEATURES, groups)
     realism = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features=features)
-    env = DrivingEnv(builtin(16), Bicycle(), config)
-    rows = torch.arange(16)[:, None].expand(-1, branches)
+    env = DrivingEnv(builtin(segments), Bicycle(), config)
+    rows = torch.arange(segments)[:, None].expand(-1, branches)
     start = env.start(rows, torch.arange(branches).expand(rows.shape))
     score = KeyScore(keys.SCORE, realism, valid_key=keys.VALID)
 
@@ -156,7 +172,7 @@ def search(
             act if noise else policy,
             score,
             start,
-            steps=50,
+            steps=steps,
             prune_every=10,
             rule=KeepBest(0.5),
             keep=kept,
@@ -164,7 +180,47 @@ def search(
             exploration_type=ExplorationType.RANDOM,
         )
 
-    return once, 16 * branches * env.num_agents * 50
+    return once, segments * branches * env.num_agents * steps
+
+
+def update(method: str, *, states: int = 1024, points: int = 200, count: int = 1) -> Work:
+    """So many updates of a recipe on the built-in segments; one of every ten searches where there are searches."""
+    config = TrainConfig(
+        method=method,
+        data=builtin_store("train"),
+        out=Path(tempfile.gettempdir()) / "not written",
+        states=states,
+        agent=AgentConfig(num_points=points),
+        wandb="disabled",
+    )
+    trainer = RECIPES[method](config, Processes(torch.device("cpu")))
+    steps = itertools.count()
+
+    def once() -> None:
+        with torch.enable_grad():
+            for step in itertools.islice(steps, count):
+                trainer._update(step)
+
+    return once, count
+
+
+def preparation(segments: int = 64) -> Work:
+    """Scenes, routes and experts of built-in segments, from the store on; none is kept with that store."""
+    store = SegmentStore(builtin_store("train"))
+
+    def once() -> None:
+        data, items = SceneDataset(store, 2, routes=True), list(range(segments))
+        data.scenes(items)
+        data.experts.many(items)
+
+    return once, segments
+
+
+def evaluation(segments: int = 8, rollouts: int = 16) -> Work:
+    """An agent that comes with the package on built-in test segments, with its search."""
+    agent, store = load_agent("pretrained:bc_ts_h"), SegmentStore(builtin_store("test"))
+    config = EvaluateConfig(rollouts=rollouts)
+    return lambda: evaluate(agent, store, config, items=range(segments)), segments
 
 
 def brute_force() -> Work:
@@ -207,6 +263,11 @@ WORKLOADS: dict[str, Callable[[], Work]] = {
     "16 objects, 1000 points": lambda: rings(16, 1000),
     "smallest step": lambda: step_of(builtin(1), ObservationConfig(16, 128), torch.arange(1)),
     "search 16 x 16 x 50": search,
+    "bc update": lambda: update("bc"),
+    "bc update, paper size": lambda: update("bc", states=1600, points=1000),
+    "bc_ts_h update": lambda: update("bc_ts_h", count=10),
+    "segment prepared": preparation,
+    "segment evaluated": evaluation,
     "brute force": brute_force,
     "matmul": matmul,
 }

@@ -11,41 +11,40 @@ from torchrl.envs import PendulumEnv
 
 from symphony.collectors import KeepAll, KeepBest, KeyScore, Systematic, beam_search, branch, mean_then_sum
 
-ROWS, STEPS, PRUNE_EVERY = 32, 100, 5
+PRUNE_EVERY = 5
 
 
-def main() -> None:
+def main(starts: int = 32, steps: int = 100, sizes: tuple[int, ...] = (4, 16, 64)) -> None:
     """Print the mean cost per step of all leaves, and of the best leaf of each start."""
     env = PendulumEnv(seed=0)
-    rows = env.reset(env.gen_params(batch_size=[ROWS]), set_state=False)
+    rows = env.reset(env.gen_params(batch_size=[starts]), set_state=False)
     rules = {
         "independent rollouts": KeepAll(),
         "keep the better half": KeepBest(0.5),
         "keep the best quarter": KeepBest(0.25),
         "systematic resampling": Systematic(temperature=1.0),
     }
-    print(f"{'cost per step':<24}{'S = 4':>8}{'S = 16':>8}{'S = 64':>8}{'best of 64':>12}")
+    head = "".join(f"{f'S = {size}':>8}" for size in sizes)
+    print(f"{'cost per step':<24}{head}{f'best of {sizes[-1]}':>12}")
     for name, rule in rules.items():
         costs = []
-        for branches in (4, 16, 64):
+        for branches in sizes:
             generator = torch.Generator().manual_seed(0)
             found = beam_search(
                 env,
                 lambda td, rng=generator: td.set("action", 4 * torch.rand(*td.shape, 1, generator=rng) - 2),
                 KeyScore("reward", negate=True),
                 branch(rows, branches),
-                steps=STEPS,
+                steps=steps,
                 prune_every=PRUNE_EVERY,
                 rule=rule,
                 aggregate=mean_then_sum,
-                noise=torch.rand(ROWS, STEPS // PRUNE_EVERY, generator=generator),
+                noise=torch.rand(starts, steps // PRUNE_EVERY, generator=generator),
                 keep=["action"],
             )
             costs.append(found.scores.mean((-1, -2)))
-        means = [float(cost.mean()) for cost in costs]
-        print(
-            f"{name:<24}{means[0]:>8.2f}{means[1]:>8.2f}{means[2]:>8.2f}{float(costs[-1].amin(-1).mean()):>12.2f}"
-        )
+        means = "".join(f"{float(cost.mean()):>8.2f}" for cost in costs)
+        print(f"{name:<24}{means}{float(costs[-1].amin(-1).mean()):>12.2f}")
 
 
 if __name__ == "__main__":

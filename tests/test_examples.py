@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
@@ -85,3 +87,22 @@ def test_several_processes(example: Any) -> None:
     costs = example("several_processes").main(iterations=2, branches=2, workers=2, updates=1)
     assert len(costs) == 3
     assert all(0 < cost < math.pi**2 + 7 for cost in costs)
+
+
+@pytest.mark.slow
+def test_many_machines(example: Any) -> None:
+    """Two workers; Ray gives them the folders where modules are."""
+    ray = pytest.importorskip("ray")
+    machines = example("many_machines")
+    path = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}
+    ray.init(num_cpus=2, include_dashboard=False, runtime_env=path)
+    try:
+        first, second = machines.collected(2, batches=2, rows=3, branches=2, steps=4)
+    finally:
+        ray.shutdown()
+    for batch in (first, second):
+        assert batch.numel() == 2 * 3 * 4
+        starts = batch[keys.STATE].reshape(6, 4, -1)[:, 0]
+        assert len(starts.unique(dim=0)) == 6  # each worker has segments of its own
+        assert starts.isfinite().all()
+    assert set(first.keys(True, True)) >= {keys.ACTION, ("collector", "beam_score")}

@@ -52,9 +52,9 @@ def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[n
     radius = np.where(there, 0.5 * np.hypot(*size.numpy().T).reshape(there.shape), 0.0)
     squared = np.square(place).sum(-1)
     own_squared, own_radius = (value.take(who).reshape(index.shape) for value in (squared, radius))
-    own = place.reshape(-1, 2).take(who, axis=0).reshape(rows, subjects, 2)
+    centre = place.reshape(-1, 2).take(who, axis=0).reshape(rows, subjects, 2)
     # |a - b|^2 - |a|^2 of all pairs, by one product.
-    apart = np.matmul(-2.0 * own, place.swapaxes(1, 2))
+    apart = np.matmul(-2.0 * centre, place.swapaxes(1, 2))
     apart += np.where(there, squared, np.inf)[:, None]
     reach = np.square(own_radius + radius.max(1, keepdims=True) + _SLACK) - own_squared
     reach += _ROUNDING * (own_squared + squared.max(1, keepdims=True))
@@ -65,16 +65,16 @@ def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[n
     if len(pair):
         # Of a place in [M, N, A] the one in [M, N], and that of the other agent in [M, A] of the same row.
         subject = pair // agents
-        first = torch.from_numpy(who[subject])
-        second = torch.from_numpy(subject // subjects * agents + pair % agents)
-        one, two = state.index_select(0, first), state.index_select(0, second)
+        other = torch.from_numpy(subject // subjects * agents + pair % agents)
+        own = torch.from_numpy(who[subject])
+        one, two = state.index_select(0, own), state.index_select(0, other)
         hit = boxes_overlap(
             one[:, :2],
             one[:, 2],
-            size.index_select(0, first),
+            size.index_select(0, own),
             two[:, :2],
             two[:, 2],
-            size.index_select(0, second),
+            size.index_select(0, other),
         )
         result[subject[hit.numpy()]] = True
     return result.reshape(index.shape)

@@ -174,6 +174,6 @@ class Edges(NamedTuple):
         length = np.hypot(along[:, 0], along[:, 1])
         unit = along / np.where(length > 0, length, 1)[:, None]
         parts = (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
-        x, y, unit_x, unit_y, half = columns = [np.ascontiguousarray(p, dtype=start.dtype) for p in parts]
+        x, y, unit_x, unit_y, half = (np.ascontiguousarray(part, dtype=start.dtype) for part in parts)
         before, after = (np.where((link >= 0) & valid[link], link, -1) for link in (previous, following))
-        return cls(np.stack(columns, -1), x, y, unit_x, unit_y, half, before, after)
+        return cls(np.stack([x, y, unit_x, unit_y, half], -1), x, y, unit_x, unit_y, half, before, after)

@@ -1,0 +1,71 @@
+"""The programs of benchmarks/ fit the package, and their tables say what was measured. Nothing is timed here."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture(name="program")
+def _program(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return importlib.import_module
+
+
+def test_parts_are_functions_that_exist(program: Any) -> None:
+    measure = program("measure")
+    paths = {path for row in measure.rows().values() for path in row.parts}
+    assert len(paths) > 10
+    for path in paths:
+        owner, name = measure.located(path)
+        assert callable(getattr(owner, name)), path
+
+
+def test_all_agents_of_a_ring_step(program: Any) -> None:
+    work, steps = program("workloads").rings(2, 4, count=2, agents=3)
+    assert steps == 2 * 3
+    after = work()["next", "agents"]
+    assert after["valid"].all()
+    assert after["state"].isfinite().all()
+
+
+def row(seconds: float, **changes: Any) -> dict[str, Any]:
+    numbers = {"operators": 12, "flops": 0, "faults": 34, "mebibytes": 5.6, "matmul": 2e9, "parts": {}}
+    timed = {"units": 100, "unit": "agent-steps", "seconds": seconds, "quartiles": [seconds, 2 * seconds]}
+    return {"tuned": True, **numbers, **timed, **changes}
+
+
+def test_tables_hold_the_ratios(program: Any) -> None:
+    rows = {
+        "simulator": [row(0.5, tuned=False), row(0.25, parts={"dynamics": 0.75, "the rest": 0.25})],
+        "update": [row(2.0, units=1, unit="updates", flops=10**9)],
+        "brute force": [row(1.0)],
+        "points P = 16": [row(0.001)],
+        "points P = 64": [row(0.002)],
+    }
+    machine = {"processor": "one", "cores": 2, "python": "3", "torch": "2", "symphony": "1"}
+    report = {
+        "date": "2000-01-01",
+        "minutes": 1.0,
+        "machine": machine,
+        "rows": rows,
+        "start": {"a": 2.0, "b": 3.0},
+    }
+    before = {"rows": {"simulator": [row(1.0, matmul=4e9)]}}
+    text = program("tables").text(report, before)
+    cells = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"
+    ]
+    found = {(line[0], line[1]): line for line in cells}
+    # Twice the speed of the plain simulator as it comes, four times with memory kept: eight times what it was.
+    assert [found["simulator", how][5] for how in ("as it comes", "kept")] == ["2.00", "4.00"]
+    assert found["simulator", "kept"][-1] == "8.00"
+    assert found["update", "kept"][3:7] == ["2,000", "50 %", "", "25 %"]
+    assert ["simulator", "dynamics 75 %, the rest 25 %"] in cells
+    assert ["points P", "16: 1 ms, 6 MiB; 64: 2 ms, 6 MiB"] in cells
+    assert ["b", "3.0", "1.50"] in cells
