@@ -103,7 +103,8 @@ def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor) -> Work
     env = DrivingEnv(scenes, Bicycle(), config)
     start = env.start(rows)
     start.set(keys.ACTION, torch.full((*rows.shape, env.num_agents), env.dynamics.num_actions // 2))
-    return lambda: env.step(start), rows.numel() * env.num_agents
+    # A step writes what comes next into what it is given; in a rollout that is new each time.
+    return lambda: env.step(start.copy()), rows.numel() * env.num_agents
 
 
 def rings(objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS) -> Work:

@@ -124,7 +124,7 @@ UNSEEN_ROWS = (
     ("BC+TS+H", "bc_ts_h", ""),
     ("MGAIL+TS+H", "mgail_ts_h", ""),
 )
-BY_KIND = {
+KINDS = {
     "collision_rate": ("collisions %", 1),
     "collision_with_playback": ("with playback", 1),
     "collision_into_leader": ("into a leader", 1),
@@ -132,11 +132,10 @@ BY_KIND = {
     "collision_crossing": ("crossing", 1),
     "collision_oncoming": ("oncoming", 1),
     "collision_sideswipe": ("sideswipe", 1),
-    "offroad_time": ("off-road %", 2),
-    "ade": ("ADE m", 2),
-    "min_sade": ("minSADE m", 2),
 }
-"""Collisions by kind beside the other figures: their headings, and the digits after their points."""
+"""Collisions by kind: their headings, and the digits after their points."""
+NO_CARS = {"collision_pedestrian": ("into a pedestrian", 1), "collision_cyclist": ("into a cyclist", 1)}
+OTHERWISE = {name: COLUMNS[name] for name in ("offroad_time", "ade", "min_sade")}
 WITH_ERROR = ("collision_rate", "ade", "min_sade")
 DRIVEN = {"town": "towns", "ngsim": "real roads"}
 INCLUDED = (
@@ -394,27 +393,29 @@ def by_place(count: int) -> Grid:
 
 def by_kind(count: int) -> Grid:
     """The NGSIM test part as a whole: collisions by kind."""
-    grid = [["", "learned from", *(heading for heading, _ in BY_KIND.values())]]
-    return grid + [[label, source, *kinds_of(record)] for source, label, record in road_rows(count)]
+    columns = KINDS | OTHERWISE
+    grid = [["", "learned from", *(heading for heading, _ in columns.values())]]
+    return grid + [[label, source, *figures(record, columns)] for source, label, record in road_rows(count)]
 
 
 def unseen() -> Grid:
     """Real roads that no agent has learned from, one set after the other."""
-    grid = [["", "", *(heading for heading, _ in BY_KIND.values())]]
+    columns = KINDS | NO_CARS | OTHERWISE
+    grid = [["", "", *(heading for heading, _ in columns.values())]]
     for data, title in UNSEEN.items():
         for label, name, part in UNSEEN_ROWS:
             (record,) = records(f"roads/{data}-{name}")
             size = f"{title} ({record['segments']} segments, {record['groups']} recordings)"
             row = record[part] if part else record
-            grid.append([size if label == UNSEEN_ROWS[0][0] else "", label, *kinds_of(row)])
+            grid.append([size if label == PLAYBACK else "", label, *figures(row, columns)])
     return grid
 
 
-def kinds_of(row: Record) -> list[str]:
-    """Cells of :data:`BY_KIND`, some with their errors."""
+def figures(row: Record, columns: dict[str, tuple[str, int]]) -> list[str]:
+    """Figures of a row, some with their errors."""
     return [
         f"{row[key]:.{digits}f}" + (f" ± {row[f'{key}_se']:.{digits}f}" if key in WITH_ERROR else "")
-        for key, (_, digits) in BY_KIND.items()
+        for key, (_, digits) in columns.items()
     ]
 
 
@@ -457,10 +458,11 @@ def wosac_parity() -> Grid:
 
 def wosac_speed() -> Grid:
     """Time and memory of one scenario beside those of the official code."""
-    record = records("wosac/speed")[0]["measured"]
-    grid = [["", "s", "CPU s", "memory GB", "times faster", "CPU time"]]
+    record = records("wosac/speed")[0]
+    heads = (f"s (load {record['load']:.0f})", "CPU s", "peak GB", "times less s", "times less CPU s")
+    grid = [["", *heads]]
     grid.append(["official code", *(f"{value:g}" for value in OFFICIAL), "", ""])
-    for name, found in record.items():
+    for name, found in record["measured"].items():
         wall, cpu = zip(*found["times"][1:], strict=True)
         cells = [f"{min(values):.2f} (median {np.median(values):.2f})" for values in (wall, cpu)]
         ratios = [f"{other / min(own):.0f}" for other, own in zip(OFFICIAL[:2], (wall, cpu), strict=True)]

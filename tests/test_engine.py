@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,23 @@ def test_a_worker_that_is_killed_is_told() -> None:
     assert 3 in died.value.tasks
     assert len(died.value.tasks) <= 2
     assert not multiprocessing.active_children()
+
+
+IMPORTED_BY = os.getpid()
+
+
+def who_imported(_: int) -> tuple[int, int]:
+    return IMPORTED_BY, os.getpid()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
+def test_workers_share_what_was_imported_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # one of earlier tests
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+    found = list(ordered_map(who_imported, range(8), workers=2))
+    servers, workers = {importer for importer, _ in found}, {worker for _, worker in found}
+    assert len(servers) == 1
+    assert not servers & {*workers, os.getpid()}
 
 
 def mark_unless_stopped(path: Path) -> Path:

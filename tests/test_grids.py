@@ -205,6 +205,12 @@ def test_collisions_are_those_of_all_pairs() -> None:
     found, expected = collision_flags(objects, index), oracle.collisions(objects, index)
     assert torch.equal(found, expected)
     assert 0.1 < expected.float().mean() < 0.9
+    # Far from the origin, and whatever those hold who are not there.
+    moved = objects._replace(state=objects.state + torch.tensor([3e4, -2e4, 0.0, 0.0, 0.0]))
+    expected = oracle.collisions(moved, index)
+    gone = moved._replace(state=moved.state.masked_fill(~moved.valid[..., None], torch.nan))
+    there = moved.valid.gather(1, index)
+    assert torch.equal(collision_flags(gone, index) & there, expected & there)
 
 
 @settings(max_examples=60)

@@ -154,6 +154,25 @@ def test_blocks_of_rows_do_not_depend_on_the_batch(n):
     assert in_blocks(network, x[:0]).shape == (0, 147)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("wrap", [lambda network: network, lambda network: network.forward])
+def test_memory_that_is_reused_is_never_handed_out(wrap) -> None:
+    network = mlp((5, 7, 3))
+    function, x, sets = wrap(network), torch.randn(130, 5), torch.randn(70, 60, 5)
+    mask = torch.rand(70, 60) < 0.9
+    given, before = x.clone(), in_blocks(function, x)
+    pooled = pool_elements(function, sets, mask)
+    kept = before.clone(), pooled.clone()
+    in_blocks(function, torch.randn(130, 5))
+    pool_elements(function, torch.randn(70, 60, 5), mask)
+    assert torch.equal(before, kept[0])
+    assert torch.equal(pooled, kept[1])
+    assert torch.equal(x, given)
+    torch.testing.assert_close(before, network(x))
+    expected = network(sets).masked_fill(~mask[..., None], -torch.inf).amax(1)
+    torch.testing.assert_close(pooled, expected)
+
+
 def test_leading_dimensions_and_empty_inputs():
     network, elements, mask = make(n=6)
     pooled = pool_elements(network, elements.view(2, 3, 60, 5), mask.view(2, 3, 60))

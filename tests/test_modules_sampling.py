@@ -155,6 +155,12 @@ def test_impossible_categories_are_never_drawn(noise):
     assert allowed.gather(1, drawn[:, None]).all()
 
 
+def test_a_draw_from_what_is_no_number_still_names_a_category():
+    logits = torch.full((3, 5), torch.nan)
+    drawn = inverse_cdf(logits, torch.tensor([0.0, 0.5, 1.0]))
+    assert ((drawn >= 0) & (drawn < 5)).all()
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cuda_gives_the_same_bits():

@@ -77,6 +77,10 @@ class Evaluate:
         if self.planner:
             self._evaluate_planner()
             return
+        if self.config.workers > 1 and self.config.engine == "local":
+            from symphony.data.engine import get_ready
+
+            get_ready(["symphony.simulation.workers", "symphony.evaluation.evaluator"])
         from symphony.agents import load_agent
         from symphony.cli.plot import segment_index
         from symphony.data.store import SegmentStore

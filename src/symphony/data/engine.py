@@ -9,11 +9,13 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from typing import Any, Literal, TypeVar
 
@@ -28,6 +30,8 @@ IN_FLIGHT = 2
 """Tasks per worker that are submitted and not yet collected."""
 # A worker has one core: OpenMP threads of several workers would only take the cores from each other.
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+# A fork of this very process would inherit torch's threads without their state; a server that only imports has none.
+_START: Literal["forkserver", "spawn"] = "forkserver" if sys.platform == "linux" else "spawn"
 
 
 class WorkerError(SymphonyError):
@@ -46,7 +50,12 @@ class WorkerError(SymphonyError):
 
 
 def ordered_map(
-    function: Callable[[T], R], tasks: Iterable[T], *, workers: int = 1, engine: Engine = "local"
+    function: Callable[[T], R],
+    tasks: Iterable[T],
+    *,
+    workers: int = 1,
+    engine: Engine = "local",
+    imports: Sequence[str] = (),
 ) -> Generator[R, None, None]:
     """Apply a function to every task; results come in the order of the tasks, whoever is done first.
 
@@ -60,6 +69,7 @@ def ordered_map(
         workers: processes; with Ray, tasks at a time are between this and ``2 * workers``, as CPUs are free.
         engine: ``local`` for processes of this machine, ``ray`` for Ray: the cluster at ``RAY_ADDRESS`` or the
             one ``ray.init`` was called for, else one on this machine.
+        imports: modules that the tasks need beside the function's own, see :func:`get_ready`.
 
     Returns:
         An iterator over the results; its ``close`` abandons the rest.
@@ -75,7 +85,22 @@ def ordered_map(
         return _ray_map(_ray(workers), function, iter(tasks), IN_FLIGHT * workers)
     if engine != "local":
         raise ConfigError(f"unknown engine {engine!r} (known: local, ray)")
-    return (function(task) for task in tasks) if workers == 1 else _local_map(function, iter(tasks), workers)
+    if workers == 1:
+        return (function(task) for task in tasks)
+    return _local_map(function, iter(tasks), workers, [function.__module__, *imports])
+
+
+def get_ready(imports: Sequence[str]) -> None:
+    """Begin to import what local workers need, in a process of its own from which all of them are forked (Linux).
+
+    Modules are imported once instead of once a worker; a program that calls this before its own imports has both done
+    at the same time. Workers that come after find the modules of the first call imported, whatever they ask for.
+    """
+    if _START == "forkserver":
+        context = multiprocessing.get_context(_START)
+        context.set_forkserver_preload([name for name in imports if name != "__main__"])
+        with _environment(WORKER_ENVIRONMENT), _no_interrupts():
+            forkserver.ensure_running()
 
 
 def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterator[deque[Any]]:
@@ -87,10 +112,15 @@ def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterat
         pending.extend(map(submit, itertools.islice(tasks, 1)))
 
 
-def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Generator[R, None, None]:
-    spawn = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads without their state
-    lifeline, stop = spawn.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, spawn, _begin_worker, (lifeline,))
+def _local_map(
+    function: Callable[[T], R], tasks: Iterator[T], workers: int, imports: Sequence[str]
+) -> Generator[R, None, None]:
+    context = multiprocessing.get_context(_START)
+    get_ready(imports)
+    lifeline, stop = context.Pipe(duplex=False)
+    # A server keeps the environment that it was started with.
+    environment = {**os.environ, **WORKER_ENVIRONMENT}
+    pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
 
     def submit(task: T) -> Any:
         with (
@@ -121,8 +151,9 @@ class _Worker:
     stopped = False  # the parent wants no more results
 
 
-def _begin_worker(lifeline: Connection) -> None:
+def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
     """Stop when the parent closes its end of the pipe, and end when it ends, in whatever way."""
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, _interrupt)
     _mask(signal.SIG_UNBLOCK)
     threading.Thread(target=_watch, args=(lifeline,), daemon=True).start()

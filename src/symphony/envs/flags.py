@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.envs.observation import Objects
@@ -16,16 +17,18 @@ from symphony.geometry.nearest import on_host
 
 _SLACK = 1e-2
 """Metres by which circles reach farther than the boxes inside them, far above the rounding of float32."""
+_ROUNDING = 4e-6
+"""Share of squared positions by which a squared distance may be wrong that is made of them."""
 
 
 def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
     """Whether the oriented box of each agent ``index`` overlaps any other valid box (touching does not count)."""
+    if on_host(objects.state):
+        return torch.from_numpy(_where_circles_meet(objects, index.numpy()))
     wide = index[..., None]
     state = objects.state.gather(1, wide.expand(*index.shape, 5))
     size = objects.size.gather(1, wide.expand(*index.shape, 2))
     other = objects.valid[:, None] & (torch.arange(objects.valid.shape[1], device=index.device) != wide)
-    if on_host(state):
-        return _where_circles_meet(objects, state, size, other)
     hit = boxes_overlap(
         state[:, :, None, :2],
         state[:, :, None, 2],
@@ -37,34 +40,44 @@ def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor,
     return (hit & other).any(-1)
 
 
-def _where_circles_meet(
-    objects: Objects,
-    state: Float[Tensor, "M N 5"],
-    size: Float[Tensor, "M N 2"],
-    other: Bool[Tensor, "M N A"],
-) -> Bool[Tensor, "M N"]:
+def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Boxes can only overlap where the circles around them do: of all pairs few are left to look at closely."""
-    reach = 0.5 * size.norm(dim=-1)[..., None] + (0.5 * objects.size.norm(dim=-1) + _SLACK)[:, None]
-    x, y = (state[..., k, None] - objects.state[:, None, :, k] for k in (0, 1))
-    near = x.square_().add_(y.square_()) <= reach.square_()
-    # One flat index, because finding all coordinates of each pair would cost more than the test.
-    pair = (near & other).view(-1).nonzero().squeeze(-1)
-    subjects, agents = state.shape[1], objects.state.shape[1]
-    # Of a place in [M, N, A] the one in [M, N], and that of the agent in [M, A] of the same row.
-    who = torch.div(pair, agents, rounding_mode="floor")
-    whom = torch.div(who, subjects, rounding_mode="floor") * agents + pair % agents
-    one, two = state.view(-1, 5)[who], objects.state.reshape(-1, 5)[whom]
-    hit = boxes_overlap(
-        one[:, :2],
-        one[:, 2],
-        size.view(-1, 2)[who],
-        two[:, :2],
-        two[:, 2],
-        objects.size.reshape(-1, 2)[whom],
-    )
-    result = torch.zeros(state.shape[:2], dtype=torch.bool)
-    result.view(-1)[who[hit]] = True
-    return result
+    state, size = objects.state.detach().flatten(0, 1), objects.size.flatten(0, 1)
+    (rows, subjects), agents = index.shape, objects.valid.shape[1]
+    who = (index + np.arange(0, rows * agents, agents)[:, None]).ravel()
+    there, states = objects.valid.numpy(), state.numpy().reshape(rows, agents, 5)
+    # Whoever is not there may hold anything. Relative to the first agent, rounding matters little.
+    origin = np.where(there[:, :1, None], states[:, :1, :2], 0.0)
+    place = np.where(there[..., None], states[..., :2] - origin, 0.0)
+    radius = np.where(there, 0.5 * np.hypot(*size.numpy().T).reshape(there.shape), 0.0)
+    squared = np.square(place).sum(-1)
+    own_squared, own_radius = (value.take(who).reshape(index.shape) for value in (squared, radius))
+    centre = place.reshape(-1, 2).take(who, axis=0).reshape(rows, subjects, 2)
+    # |a - b|^2 - |a|^2 of all pairs, by one product.
+    apart = np.matmul(-2.0 * centre, place.swapaxes(1, 2))
+    apart += np.where(there, squared, np.inf)[:, None]
+    reach = np.square(own_radius + radius.max(1, keepdims=True) + _SLACK) - own_squared
+    reach += _ROUNDING * (own_squared + squared.max(1, keepdims=True))
+    near = apart <= reach[..., None]
+    near.reshape(-1, agents)[np.arange(len(who)), index.ravel()] = False
+    result = np.zeros(len(who), np.bool_)
+    pair = np.flatnonzero(near)
+    if len(pair):
+        # Of a place in [M, N, A] the one in [M, N], and that of the other agent in [M, A] of the same row.
+        subject = pair // agents
+        other = torch.from_numpy(subject // subjects * agents + pair % agents)
+        own = torch.from_numpy(who[subject])
+        one, two = state.index_select(0, own), state.index_select(0, other)
+        hit = boxes_overlap(
+            one[:, :2],
+            one[:, 2],
+            size.index_select(0, own),
+            two[:, :2],
+            two[:, 2],
+            size.index_select(0, other),
+        )
+        result[subject[hit.numpy()]] = True
+    return result.reshape(index.shape)
 
 
 def offroad_flags(
@@ -83,17 +96,20 @@ def offroad_flags(
     cells = tables.edge_grids(position.shape[0] * position.shape[1])
     if cells is None:
         return road_distance(scenes, scene, position) > 0
-    flat, row = position.reshape(-1, 2), scene.repeat_interleave(position.shape[1])
-    x, y = (np.ascontiguousarray(flat[:, k].numpy()) for k in (0, 1))
-    owner = row.numpy()
-    cell = cells.locate(owner, x, y)
-    sign = np.where(cell >= 0, cells.sign[cell], 0) if len(cells.sign) else np.zeros(len(cell), np.int8)
-    off, near = sign > 0, np.flatnonzero((sign == 0) & (cell >= 0))
-    if len(near):
-        place, edges = (cell[near], x[near], y[near]), tables.segments
-        off[near] = edges.right_of(cells.nearest_edge(owner[near], *place, edges), *place[1:])
-    far = np.flatnonzero(cell < 0)
-    if len(far):
-        outside = road_distance(scenes, row[far], flat[far][:, None])
-        off[far] = (outside[:, 0] > 0).numpy()
+    where, row = position.detach().numpy(), scene.numpy()[:, None]
+    cell = cells.locate(row, where[..., 0], where[..., 1]).ravel()
+    sign = cells.sign.take(cell, mode="clip") if len(cells.sign) else np.zeros(len(cell), np.int8)
+    off = sign > 0
+    asked = np.flatnonzero((sign == 0) | (cell < 0))
+    if len(asked):
+        inside = cell[asked] >= 0
+        near, far = asked[inside], asked[~inside]
+        if len(near):
+            x, y = np.ascontiguousarray(where.reshape(-1, 2).take(near, axis=0).T)
+            owner, edges = row[near // position.shape[1], 0], tables.segments
+            off[near] = edges.right_of(cells.nearest_edge(owner, cell[near], x, y, edges), x, y)
+        if len(far):
+            rows, places = torch.from_numpy(far // position.shape[1]), torch.from_numpy(far)
+            outside = road_distance(scenes, scene[rows], position.reshape(-1, 1, 2)[places])
+            off[far] = (outside[:, 0] > 0).numpy()
     return torch.from_numpy(off).view(position.shape[:2])

@@ -24,6 +24,8 @@ POINT_QUERIES = 1000
 """Queries of nearest points on one map that cost about as much as its grid."""
 EDGE_QUERIES = 500
 """Queries of distances to the edge of the road likewise."""
+CALL = 25
+"""Queries that cost as much as it costs to ask at all, without a grid."""
 MEMORY = 256 * 2**20
 """Bytes of grids that are kept; those used longest ago go first."""
 
@@ -138,6 +140,7 @@ class GridSource:
         if torch.is_grad_enabled():
             # What is simulated once more in the backward pass must take the same way as the first time.
             queries = max(queries, int(self.worth * max(len(self.maps), 1)) + 1)
+        queries = max(queries, CALL)
         fresh, self.asked = self.asked == 0, self.asked + queries / max(len(self.maps), 1)
         # The cache is looked into at first and when every map is sure to have been asked often enough.
         if fresh or self.asked >= self.worth:

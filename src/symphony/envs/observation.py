@@ -22,7 +22,7 @@ from symphony.envs.tables import AGENT_FEATURES, POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners, box_gap
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
-from symphony.geometry.nearest import nearest
+from symphony.geometry.nearest import nearest, on_host
 
 __all__ = [
     "OBJECT_FEATURES",
@@ -76,6 +76,12 @@ class ObservationConfig:
     clearance: bool = False
     foresight: tuple[float, ...] = ()
     own: bool = True
+
+    @property
+    def blind(self) -> bool:
+        """Whether nothing is asked for, a route aside."""
+        counts = self.num_objects, self.num_points, self.num_lights
+        return not (any(counts) or self.own or self.road or self.clearance)
 
     @classmethod
     def nothing(cls) -> ObservationConfig:
@@ -188,15 +194,18 @@ def objects_at(
     valid = scenes.log_valid.flatten(0, 1).index_select(0, row)
     valid = valid & (step <= scenes.last_step[scene])[:, None]
     if state is not None and index is not None and index_valid is not None:
-        heading, speed = state[..., 2], state[..., 3:]
-        forward = torch.stack([heading.cos(), heading.sin()], -1)
-        simulated = torch.cat([state[..., :3], speed * forward], -1)
-        # Padded agents are written to a column past the last one, which is cut off again.
-        agents = logged.shape[1]
-        column = torch.where(index_valid, index, agents)
-        wide = column[..., None].expand(*column.shape, 5)
-        logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
-        valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
+        x, y, heading, speed = state.unbind(-1)
+        simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
+        wide = index[..., None].expand(*index.shape, 5)
+        if on_host(state) and bool(index_valid.all()):
+            logged, valid = logged.scatter(1, wide, simulated), valid.scatter(1, index, True)
+        else:
+            # Those not there are written to a column past the last one, which is cut off again.
+            agents = logged.shape[1]
+            column = torch.where(index_valid, index, agents)
+            wide = column[..., None].expand_as(wide)
+            logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
+            valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
     return Objects(logged, valid, scenes.box_size[scene], scenes.agent_type[scene])
 
 
@@ -225,6 +234,8 @@ def observe(
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
         routes: points of the agents' routes and how many of them exist; without, nothing of routes is observed.
     """
+    if config.blind and not config.route:
+        return Observation()
     tables = Tables(scenes, config) if tables is None else tables
     own = _take(objects.state, index)
     own_size = _take(objects.size, index)

@@ -42,22 +42,24 @@ def road_distance(
 def _by_cells(
     scenes: SceneBatch, scene: Tensor, position: Tensor, tables: Tables, cells: Cells
 ) -> Float[Tensor, "M K"]:
-    count = position.shape[1]
-    row = scene.repeat_interleave(count).numpy()
-    flat = position.detach().reshape(-1, 2)
-    x, y = (np.ascontiguousarray(flat[:, k].numpy()) for k in (0, 1))
+    flat = position.detach().reshape(-1, 2).numpy()
+    x, y = np.ascontiguousarray(flat.T)
+    row = np.repeat(scene.numpy(), position.shape[1])
     cell = cells.locate(row, x, y)
     inside = cell >= 0
+    everywhere = bool(inside.all())
     nearest = np.zeros(len(row), np.int64)
-    if inside.any():
+    if everywhere:
+        nearest = cells.nearest_edge(row, cell, x, y, tables.segments)
+    elif inside.any():
         known = np.flatnonzero(inside)
         nearest[known] = cells.nearest_edge(row[known], cell[known], x[known], y[known], tables.segments)
     distance = distance_to(
         position.reshape(1, -1, 2), **tables.edges, nearest=torch.from_numpy(nearest)[None]
     ).view(position.shape[:2])
+    if everywhere:
+        return distance  # a map with cells has a boundary
     distance = torch.where(tables.bounded[scene][:, None], distance, NO_BOUNDARY)
-    if inside.all():
-        return distance
     # Outside of a grid, or of a map that has none: rows that hold such a position, among all edges.
     listed = torch.from_numpy(inside).view(position.shape[:2])
     some = (~listed).any(1).nonzero().squeeze(-1)

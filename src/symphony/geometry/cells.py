@@ -28,9 +28,12 @@ class Cells:
 
     def __init__(self, grids: Sequence[CellGrid | None], stride: int) -> None:
         self.stride = stride
-        self.origin = np.array([(0.0, 0.0) if g is None else g.origin for g in grids])
-        self.size = np.array([1.0 if g is None else g.size for g in grids])
-        self.shape = np.array([(0, 0) if g is None else g.shape for g in grids])
+        self.x, self.y = (np.array([0.0 if g is None else g.origin[k] for g in grids]) for k in (0, 1))
+        # Sides are powers of two, so to multiply is to divide.
+        self.per_metre = np.array([1.0 if g is None else 1.0 / g.size for g in grids])
+        self.columns, self.rows = (
+            np.array([0.0 if g is None else g.shape[k] for g in grids]) for k in (0, 1)
+        )
         some = [grid for grid in grids if grid is not None]
         cells = [0 if g is None else len(g.sign) for g in grids]
         items = np.cumsum([0] + [len(grid.items) for grid in some])
@@ -46,13 +49,18 @@ class Cells:
         self.sign = np.concatenate([grid.sign for grid in some] or [np.zeros(0, np.int8)])
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
-        """Number of the cell in which each position [R] of map ``scene`` [R] lies, -1 outside of its grid."""
-        size = self.size[scene]
-        column, row = (np.floor((v - self.origin[scene, k]) / size) for k, v in ((0, x), (1, y)))
-        columns, rows = self.shape[scene].T
-        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        cell = np.where(inside, row * columns + column, 0).astype(np.int64) + self.first[scene]
-        return np.where(inside, cell, -1)
+        """Number of the cell in which each position of map ``scene`` lies, -1 outside of its grid.
+
+        Args:
+            scene: any shape that broadcasts against the positions.
+            x: of the positions.
+            y: likewise.
+        """
+        per_metre, columns = self.per_metre.take(scene), self.columns.take(scene)
+        column = np.floor((x - self.x.take(scene)) * per_metre)
+        row = np.floor((y - self.y.take(scene)) * per_metre)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < self.rows.take(scene))
+        return np.where(inside, row * columns + column + self.first.take(scene), -1.0).astype(np.int64)
 
     def nearest_points(
         self, scene: Indices, cell: Indices, x: Reals, y: Reals, points: tuple[Reals, Reals], count: int
@@ -86,20 +94,29 @@ class Cells:
 
     def nearest_edge(self, scene: Indices, cell: Indices, x: Reals, y: Reals, edges: Edges) -> Indices:
         """Number [R] of the edge nearest to each position [R]; arguments as for :meth:`nearest_points`."""
-        held = self.count[cell]
+        held = self.count.take(cell)
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
-        owner = np.repeat(np.arange(len(cell)), held)
-        listed = np.arange(len(owner)) + np.repeat(self.begin[cell] - first, held)
-        candidate = self.items[listed] + self.stride * scene[owner]
-        away_x, away_y = x[owner] - edges.x[candidate], y[owner] - edges.y[candidate]
-        unit_x, unit_y, half = edges.unit_x[candidate], edges.unit_y[candidate], edges.half[candidate]
-        beyond = np.maximum(np.abs(away_x * unit_x + away_y * unit_y - half) - half, 0)
-        squared = np.square(beyond) + np.square(away_x * unit_y - away_y * unit_x)
-        hit = np.flatnonzero(squared == np.minimum.reduceat(squared, first)[owner])[::-1]
+        candidate = np.arange(len(cell) and first[-1] + held[-1]) + np.repeat(
+            self.begin.take(cell) - first, held
+        )
+        candidate = self.items.take(candidate) + np.repeat(self.stride * scene, held)
+        start_x, start_y, unit_x, unit_y, half = edges.rows.take(candidate, axis=0).T
+        away_x, away_y = np.repeat(x, held) - start_x, np.repeat(y, held) - start_y
+        beyond = away_x * unit_x
+        beyond += away_y * unit_y
+        beyond -= half
+        np.abs(beyond, out=beyond)
+        beyond -= half
+        np.maximum(beyond, 0, out=beyond)
+        away_x *= unit_y
+        away_y *= unit_x
+        away_x -= away_y
+        squared = np.square(beyond, out=beyond) + np.square(away_x, out=away_x)
+        hit = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), held))[::-1]
         nearest = candidate[first]
         # Written from the last to the first, so the first of equally near ones stays.
-        nearest[owner[hit]] = candidate[hit]
+        nearest[np.repeat(np.arange(len(cell)), held)[hit]] = candidate[hit]
         return nearest
 
 
@@ -107,6 +124,7 @@ class Edges(NamedTuple):
     """All edges of all maps, component by component [B * E].
 
     Attributes:
+        rows: [B * E, 5] the first five of these side by side, for what reads all of them.
         x: of the start.
         y: of the start.
         unit_x: direction.
@@ -116,6 +134,7 @@ class Edges(NamedTuple):
         following: number of the edge that starts where this one ends, likewise.
     """
 
+    rows: Reals
     x: Reals
     y: Reals
     unit_x: Reals
@@ -154,9 +173,7 @@ class Edges(NamedTuple):
         along = end - start
         length = np.hypot(along[:, 0], along[:, 1])
         unit = along / np.where(length > 0, length, 1)[:, None]
-        x, y, unit_x, unit_y, half = (
-            np.ascontiguousarray(part, dtype=start.dtype)
-            for part in (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
-        )
+        parts = (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
+        x, y, unit_x, unit_y, half = (np.ascontiguousarray(part, dtype=start.dtype) for part in parts)
         before, after = (np.where((link >= 0) & valid[link], link, -1) for link in (previous, following))
-        return cls(x, y, unit_x, unit_y, half, before, after)
+        return cls(np.stack([x, y, unit_x, unit_y, half], -1), x, y, unit_x, unit_y, half, before, after)

@@ -47,7 +47,10 @@ def shared(
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ConfigError(f"can't be shared among processes: {error}") from error
     pairs = ((sent, task) for task in tasks)
-    with closing(ordered_map(_done, pairs, workers=config.workers, engine=config.engine)) as results:
+    done = ordered_map(
+        _done, pairs, workers=config.workers, engine=config.engine, imports=[type(work).__module__]
+    )
+    with closing(done) as results:
         try:
             for result in results:
                 yield cast(R, pickle.loads(result))  # noqa: S301  (from our own worker)
