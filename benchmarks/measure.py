@@ -126,11 +126,11 @@ main(["evaluate", "pretrained:bc_ts_h", "--data", str(builtin_store("test"))])
 raise SystemExit("no step was made")
 """
 START = {
-    "torchrl imported": "import torchrl.envs, torchrl.collectors",
-    "symphony.envs imported": "import symphony.envs",
+    "torchrl imported": "import os, torchrl.envs, torchrl.collectors; os._exit(0)",
+    "symphony.envs imported": "import os, symphony.envs; os._exit(0)",
     "first step of symphony evaluate": FIRST_STEP,
 }
-"""Programs whose CPU time is that of a start."""
+"""Programs whose CPU time is that of a start; they end without tidying up."""
 
 
 def rows() -> dict[str, Row]:

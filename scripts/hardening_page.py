@@ -1,8 +1,9 @@
-"""Write what `make fuzz`, `make kills` and `make flat` have counted into docs/hardening.md.
+"""Write what `make fuzz`, `make kills`, `make flat` and `make mutate` have counted into docs/hardening.md.
 
     python scripts/hardening_page.py --records results/hardening
 
-The folder holds ``fuzz*.json`` (added up), ``kills.json`` and ``flat.json`` as those commands write them to out/.
+The folder holds ``fuzz*.json`` and ``kills*.json`` (added up), ``flat.json`` and ``mutate.json`` as those commands
+write them to out/.
 """
 
 from __future__ import annotations
@@ -28,9 +29,16 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args(args)
     fuzz = [json.loads(file.read_text()) for file in sorted(given.records.glob("fuzz*.json"))]
-    kills, flat = (json.loads((given.records / f"{name}.json").read_text()) for name in ("kills", "flat"))
+    kills = [json.loads(file.read_text()) for file in sorted(given.records.glob("kills*.json"))]
+    flat, mutate = (json.loads((given.records / f"{name}.json").read_text()) for name in ("flat", "mutate"))
     text = given.page.read_text(encoding="utf-8")
-    for name, table in (("fuzz", of_fuzz(fuzz)), ("kills", of_kills(kills)), ("flat", of_flat(flat))):
+    tables = {
+        "fuzz": of_fuzz(fuzz),
+        "kills": of_kills(kills),
+        "flat": of_flat(flat),
+        "mutate": of_mutate(mutate),
+    }
+    for name, table in tables.items():
         text, count = re.subn(
             rf"(<!-- counts: {name} -->\n).*?(<!-- end -->)",
             lambda m, t=table: m[1] + t + m[2],
@@ -65,12 +73,14 @@ def of_fuzz(runs: list[dict[str, Any]]) -> str:
     return rows(("kind", "inputs", "read", "refused", "failures"), body)
 
 
-def of_kills(found: dict[str, Any]) -> str:
-    """Kills, and what they lost."""
-    body = [
-        (name, each["kills"], each["finished"], len(each["failed"]), f"{each['seconds']:.2f}")
-        for name, each in found.items()
-    ]
+def of_kills(runs: list[dict[str, Any]]) -> str:
+    """Kills, and what they lost; the time is that of the last run."""
+    body = []
+    for name in dict.fromkeys(name for run in runs for name in run):
+        mine = [run[name] for run in runs if name in run]
+        kills, finished = (sum(each[key] for each in mine) for key in ("kills", "finished"))
+        lost = sum(len(each["failed"]) for each in mine)
+        body.append((name, kills, finished, lost, f"{mine[-1]['seconds']:.2f}"))
     head = (
         "work",
         "kills",
@@ -79,6 +89,15 @@ def of_kills(found: dict[str, Any]) -> str:
         "CPU seconds undisturbed",
     )
     return rows(head, body)
+
+
+def of_mutate(found: dict[str, Any]) -> str:
+    """Changes by module, and those that no test noticed."""
+    body = [
+        (f"`{name}`", each["made"], each["possible"], "; ".join(each["missed"]) or "none")
+        for name, each in found.items()
+    ]
+    return rows(("module", "changes made", "of", "not noticed"), body)
 
 
 def of_flat(found: dict[str, Any]) -> str:

@@ -11,8 +11,10 @@ import ast
 import importlib
 import inspect
 import io
+import json
 import os
 import random
+import resource
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -27,13 +29,23 @@ ROOT = Path(__file__).resolve().parents[1]
 TESTED = {
     "geometry.boxes": "test_geometry_boxes.py",
     "geometry.frames": "test_geometry_frames.py",
+    "geometry.polylines": "test_geometry_polylines.py",
     "collectors.rules": "test_collectors_rules.py",
+    "collectors.beam_search": "test_collectors_beam_search.py",
+    "collectors.result": "test_collectors_beam_search.py",
+    "collectors.scores": "test_collectors_beam_search.py",
     "objectives.bc": "test_objectives_bc.py",
+    "objectives.goal": "test_objectives_goal.py",
     "objectives.distillation": "test_objectives_distillation.py",
+    "objectives.discriminator": "test_objectives_discriminator.py",
     "metrics.realism": "test_metrics_realism.py",
     "metrics.order": "test_metrics_order.py",
+    "metrics.kinds": "test_metrics_kinds.py",
+    "metrics.agents": "test_metrics_agents.py",
 }
 """Modules of ``symphony`` and the tests that are to notice."""
+SECONDS = 300
+"""CPU time that the tests may take with a change: one that makes them go on for ever is noticed, too."""
 QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -109,6 +121,7 @@ def noticed(module: ModuleType, number: int, test: str) -> bool:
     child = os.fork()
     if child == 0:
         status = 1
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
         try:
             tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
             list(changes(tree))[number][2]()
@@ -133,8 +146,10 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--changes", type=int, default=10, help="of each module")
     parser.add_argument("--modules", nargs="+", choices=list(TESTED), default=list(TESTED))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/mutate.json"), help="where the counts are kept")
     given = parser.parse_args(args)
-    made = missed = 0
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    found: dict[str, dict[str, Any]] = {}
     for name in given.modules:
         module = importlib.import_module(f"symphony.{name}")
         if tests(TESTED[name]) != 0:
@@ -142,14 +157,18 @@ def main(args: list[str] | None = None) -> int:
         tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
         possible = list(changes(tree))
         chosen = random.Random(given.seed).sample(range(len(possible)), min(given.changes, len(possible)))  # noqa: S311
+        missed = []
         for number in sorted(chosen):
-            made += 1
             if not noticed(module, number, TESTED[name]):
-                missed += 1
-                print(f"not noticed: {name}, line {possible[number][1]}: {possible[number][0]}", flush=True)
+                missed.append(f"line {possible[number][1]}: {possible[number][0]}")
+                print(f"not noticed: {name}, {missed[-1]}", flush=True)
         print(f"{name}: {len(chosen)} of {len(possible)} changes made", flush=True)
-    print(f"{made} changes, {made - missed} noticed")
-    return int(missed > 0)
+        found[name] = {"possible": len(possible), "made": len(chosen), "missed": missed}
+        given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    made = sum(each["made"] for each in found.values())
+    lost = sum(len(each["missed"]) for each in found.values())
+    print(f"{made} changes, {made - lost} noticed")
+    return int(lost > 0)
 
 
 if __name__ == "__main__":

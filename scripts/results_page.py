@@ -151,6 +151,11 @@ LABELS = (
     ("BC+TS+H, one route taught (seed 0)", "bc/bc_ts_h-0-often"),
     ("BC+TS+H, the set of open routes", "labels/bc_ts_h-0-systematic"),
 )
+SEEDS = (
+    ("BC+TS+H without its search", "driving/{}-none*"),
+    ("BC+TS+H", "driving/{}-replace-branch*"),
+)
+"""The included agent (seed 0) and those trained likewise of two more seeds."""
 PLAYBACK = "log playback"
 NGSIM = (
     (PLAYBACK, "ngsim/{}/playback"),
@@ -524,6 +529,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "roads-unseen": unseen,
     "included": included,
     "labels": lambda: means(LABELS),
+    "seeds": lambda: beside(SEEDS, DRIVEN, ("collision_rate", "offroad_time", "ade", "min_sade")),
     "wosac-log": wosac_log,
     "wosac-parity": wosac_parity,
     "wosac-speed": wosac_speed,

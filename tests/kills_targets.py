@@ -82,7 +82,7 @@ def _train(method: Any, store: Path, out: Path) -> None:
     train(helpers_runs.tiny(method, store, out, steps=8, validation=evaluated, resume=True))
 
 
-def _train_by_two(store: Path, out: Path) -> None:
+def _train_by_two(method: Any, store: Path, out: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -91,7 +91,7 @@ def _train_by_two(store: Path, out: Path) -> None:
 
     def one(rank: int) -> None:
         os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-        _train("bc", store, out)
+        _train(method, store, out)
 
     children = [helpers_distributed.fork(one, rank) for rank in range(2)]
     if any(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children):
@@ -130,7 +130,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "convert": partial(_convert, logs),
         "train bc": partial(_train, "bc", store),
         "train bc_ts_h": partial(_train, "bc_ts_h", store),
-        "train by two": partial(_train_by_two, store),
+        "bc by two": partial(_train_by_two, "bc", store),
+        "bc_ts_h by two": partial(_train_by_two, "bc_ts_h", store),
         "evaluate": partial(_evaluate, store),
         "simulate": partial(_simulate, store),
     }

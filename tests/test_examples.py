@@ -90,9 +90,11 @@ def test_several_processes(example: Any) -> None:
 
 
 @pytest.mark.slow
-def test_many_machines(example: Any) -> None:
+def test_many_machines(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two workers; Ray gives them the folders where modules are."""
     ray = pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
     machines = example("many_machines")
     path = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}
     ray.init(num_cpus=2, include_dashboard=False, runtime_env=path)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from symphony.geometry import rotate, wrap
+from symphony.geometry.frames import forward_speed, with_speed
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -27,6 +28,20 @@ def test_wrap_range_and_congruence(dtype):
     assert (turns - turns.round()).abs().max() < 1e-5
     inside = (angle >= -math.pi) & (angle < math.pi)
     assert torch.equal(wrapped[inside], angle[inside])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_wrap_next_to_the_ends_of_many_turns(dtype):
+    """Where rounding leaves the quotient on the wrong side of a whole number."""
+    odd = torch.arange(-20_001, 20_001, 2, dtype=torch.float64)
+    at = (odd * math.pi).to(dtype)
+    down, up = torch.full_like(at, -torch.inf), torch.full_like(at, torch.inf)
+    for angle in (at, at.nextafter(down), at.nextafter(up)):
+        wrapped = wrap(angle).double()
+        assert (wrapped >= -math.pi - 1e-6).all()
+        assert (wrapped <= math.pi).all()
+        # Half a turn away from the nearest end would be the other direction.
+        assert (wrapped.abs() - math.pi).abs().max() < 20_001 * math.pi * torch.finfo(dtype).eps * 2
 
 
 @given(st.floats(-1e4, 1e4))
@@ -57,3 +72,12 @@ def test_rotation_keeps_distances_and_its_inverse_turns_back():
     torch.testing.assert_close(rotate(turned, -angle), points)
     torch.testing.assert_close(turned.norm(dim=-1), points.norm(dim=-1))
     assert torch.autograd.gradcheck(rotate, (points[0, 0].requires_grad_(), angle[0, 0].requires_grad_()))
+
+
+def test_speed_is_what_of_a_velocity_points_ahead():
+    generator = torch.Generator().manual_seed(0)
+    moving = torch.randn(7, 5, generator=generator, dtype=torch.float64)
+    heading, velocity = moving[:, 2], moving[:, 3:]
+    speed = forward_speed(velocity, heading)
+    torch.testing.assert_close(speed, rotate(velocity, -heading)[:, 0])
+    torch.testing.assert_close(with_speed(moving), torch.cat([moving[:, :3], speed[:, None]], 1))
