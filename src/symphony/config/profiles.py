@@ -84,8 +84,8 @@ def smoke(config: TrainConfig) -> TrainConfig:
 def demo(config: TrainConfig) -> TrainConfig:
     """What `symphony demo` runs, minutes on a laptop.
 
-    Half the states and fewer points than by default: more, cheaper updates suit the few segments of the package. So do
-    inputs beyond the paper's, and displaced states once it drives.
+    Half the states and fewer points than by default: more, cheaper updates suit the few segments of the package. So
+    do inputs beyond the paper's, and displaced states once it drives.
     """
     return replace(
         config,
