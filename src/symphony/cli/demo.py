@@ -47,7 +47,9 @@ class Demo:
         if (run / "config.json").is_file():
             shutil.rmtree(run)
         learn, test = builtin_store("train"), builtin_store("test")
-        console.print(f"Learning to drive from {learn} (behavioural cloning with goals, {self.steps} updates)")
+        console.print(
+            f"Learning to drive from {learn} (behavioural cloning with goals, {self.steps} updates)"
+        )
         config = TrainConfig(method="bc_h", data=learn, out=run, steps=self.steps, seed=self.seed)
         train(demo(config))
         console.print(f"Simulating {test}, which it has not seen")
