@@ -151,10 +151,7 @@ LABELS = (
     ("BC+TS+H, one route taught (seed 0)", "bc/bc_ts_h-0-often"),
     ("BC+TS+H, the set of open routes", "labels/bc_ts_h-0-systematic"),
 )
-SEEDS = (
-    ("BC+TS+H without its search", "driving/{}-none*"),
-    ("BC+TS+H", "driving/{}-replace-branch*"),
-)
+SEEDS = (("BC+TS+H without its search", "driving/{}-none*"), ("BC+TS+H", "driving/{}-replace-branch*"))
 """The included agent (seed 0) and those trained likewise of two more seeds."""
 PLAYBACK = "log playback"
 NGSIM = (
@@ -338,10 +335,34 @@ def crowd(data: str) -> Grid:
         for search, word in (("none", "no"), ("tree", "yes")):
             (record,) = records(f"crowd/{data}-{number}-{search}")
             cells = [f"{record[key]:.{digits}f}" for key, (_, digits) in AGENTS.items()]
-            error = record["agent_collision_rate_se"]
-            cells[0] += f" ± {error:.1f}"
+            cells[0] += f" ± {record['agent_collision_rate_se']:.1f}"
             grid.append([number, word, *cells, f"{record['cost']['simulation'] / record['segments']:.2f}"])
     return grid
+
+
+def mixed() -> Grid:
+    """What learning from searches with more agents changes, in open traffic."""
+    shown = ("agent_collision_rate", "agent_offroad_time", "agent_progress", "agent_speed_distance")
+    grid = [["driven", "learned with", *(AGENTS[key][0] for key in shown)]]
+    for way in ("16-none", "16-tree", "all-none", "all-tree"):
+        for label, name in (("2", "two"), ("2 to 16", "mixed")):
+            (record,) = records(f"mixed/{name}-{way}")
+            cells = [f"{record[key]:.{AGENTS[key][1]}f}" for key in shown]
+            cells[0] += f" ± {record['agent_collision_rate_se']:.1f}"
+            grid.append([way.removesuffix("-none").replace("-tree", ", searched"), label, *cells])
+    return grid
+
+
+def personas() -> Grid:
+    """Whether agents drive in the style that they are told."""
+    (record,) = records("personas/town")
+    digits = {"headway": 2, "free_speed": 3, "speed": 2, "collision": 1, "offroad": 2}
+    named = [(case["asked"].replace(",", ", ") or "drawn", case) for case in record["cases"]]
+    named += [(f"{name}, .8 less .2", found) for name, found in record["differences"].items()]
+    return [["asked", "time headway, s", "free speed / limit", "speed, m/s", "collide %", "off-road %"]] + [
+        [label, *(f"{case[key]:.{n}f} ± {case[f'{key}_se']:.{n}f}" for key, n in digits.items())]
+        for label, case in named
+    ]
 
 
 def included() -> Grid:
@@ -480,14 +501,8 @@ def flattered() -> Grid:
     of runs and the score without a search and with it, its difference paired over segments.
     """
     found = records("planners/*")
-    heads = (
-        "in all branches",
-        "in the leaves",
-        "collisions %, no search",
-        "search",
-        "score, search less none",
-    )
-    grid = [["crowd", "planner", *heads]]
+    before, after = ("in all branches", "in the leaves"), ("collisions %, no search", "search")
+    grid = [["crowd", "planner", *before, *after, "score, search less none"]]
     for record in found:
         search = record["search"]
         if search is None:
@@ -539,6 +554,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "planners-search": flattered,
     "crowd-town": lambda: crowd("town"),
     "crowd-ngsim": lambda: crowd("ngsim"),
+    "mixed": mixed,
+    "personas": personas,
 }
 
 

@@ -24,18 +24,18 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
             writer.append(store[i])
     folders = {"train": builtin_store("train"), "test": tmp_path / "test"}
     monkeypatch.setattr("symphony.data.builtin.builtin_store", folders.__getitem__)
-    earlier = tmp_path / "demo" / "bc" / "config.json"
+    earlier = tmp_path / "demo" / "bc_h" / "config.json"
     earlier.parent.mkdir(parents=True)
     earlier.write_text("{}")
     (earlier.parent / "left").touch()
     assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "2", "--rollouts", "1"]) == 0
     assert not (earlier.parent / "left").exists()
     rows = json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]
-    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC", "included BC+TS+H"]
+    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC+H", "included BC+TS+H"]
     assert all(row["segments"] == 3 for row in rows)
     assert rows[0]["ade"] == rows[0]["collision_rate"] == 0
     assert rows[1]["ade"] > 1
-    # Whatever two updates make of BC, an agent that has learned to drive stays on the road.
+    # Whatever two updates make of BC+H, an agent that has learned to drive stays on the road.
     assert rows[3]["search"] == "tree"
     assert rows[3]["offroad_time"] < rows[1]["offroad_time"]
     assert (tmp_path / "demo" / "rollouts.png").stat().st_size > 50_000

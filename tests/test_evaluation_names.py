@@ -14,6 +14,9 @@ from symphony.evaluation.records import evaluation_name
 from test_table import make_record
 
 CHANGES: dict[str, Any] = {
+    "persona": "speed=.8",
+    "tilt": 1.0,
+    "tilt_on": "cut_in",
     "rollouts": 8,
     "search": "oracle",
     "trees": 2,

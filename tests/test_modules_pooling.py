@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import nn
+from torch import Tensor, nn
 
 from symphony.modules import in_blocks, mlp, pool_elements
 
@@ -204,3 +204,22 @@ def test_cuda_agrees_with_the_cpu(mode):
     got = results(network.cuda(), elements.cuda(), mask.cuda(), mode)
     for a, b in zip(got, expected, strict=True):
         torch.testing.assert_close(a.cpu(), b, rtol=1e-9, atol=1e-9)
+
+
+def test_many_sets_of_weights_at_once_give_what_each_gives_alone() -> None:
+    """TorchRL runs critics under vmap, where nothing may be written in place or looked at."""
+    networks = [mlp((5, 8, 8)) for _ in range(3)]
+    elements, mask = torch.randn(4, 70, 5), torch.rand(4, 70) < 0.7
+    parameters, _ = torch.func.stack_module_state(networks)
+    encoder = networks[0]
+
+    def pooled(weights: dict[str, Tensor]) -> Tensor:
+        def function(x: Tensor) -> Tensor:
+            return torch.func.functional_call(encoder, weights, (x,))
+
+        return in_blocks(nn.ReLU(), pool_elements(function, elements, mask, mode="winner"))
+
+    with torch.no_grad():
+        together = torch.func.vmap(pooled)(parameters)
+        for network, found in zip(networks, together, strict=True):
+            torch.testing.assert_close(found, pool_elements(network, elements, mask, mode="dense").relu())

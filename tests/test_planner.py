@@ -29,8 +29,8 @@ from symphony.simulation.planner import (
     MAX_ACCELERATION,
     MAX_BRAKING,
     Control,
+    Pose,
     Scenario,
-    Target,
     Traffic,
     planner_maker,
 )
@@ -47,14 +47,14 @@ class Wanderer:
         self.rng = np.random.default_rng(scenario.seed)
         self.state, self.step = scenario.state, 0
 
-    def plan(self, traffic: Traffic) -> Target:
+    def plan(self, traffic: Traffic) -> Pose:
         if traffic.step != self.step or not np.allclose(traffic.state, self.state, atol=1e-3):
             raise RuntimeError("taken for another")
         x, y, heading, speed = traffic.state
         self.step, travel = self.step + 1, 0.2 * speed
         speed = max(speed + 0.5 * self.rng.normal(), 0.0)
         self.state = np.array([x + travel * np.cos(heading), y + travel * np.sin(heading), heading, speed])
-        return Target(*self.state)
+        return Pose(*self.state)
 
 
 class Shared(Wanderer):
@@ -203,8 +203,8 @@ def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
         ((1.0, 2.0, 3.0), "not a 3 one"),
         (None, "step 3: "),
         ("left", "step 3: ValueError"),
-        (lambda t: Target(t.state[0] + 50, t.state[1], 0.0, 5.0), "a target 50.0 m away"),
-        (lambda t: Target(t.state[0], t.state[1], 0.0, 500.0), "at 500.0 m/s"),
+        (lambda t: Pose(t.state[0] + 50, t.state[1], 0.0, 5.0), "a target 50.0 m away"),
+        (lambda t: Pose(t.state[0], t.state[1], 0.0, 500.0), "at 500.0 m/s"),
         (lambda t: t.position.fill(0), "read-only"),
     ],
 )
@@ -227,7 +227,7 @@ def test_failures_are_those_of_their_own_rollouts_in_a_search() -> None:
             super().reset(scenario)
             self.bad = bool(fates.setdefault(scenario.seed, len(fates) % 2 == 0))
 
-        def plan(self, traffic: Traffic) -> Target:
+        def plan(self, traffic: Traffic) -> Pose:
             if self.bad and traffic.step == 2:
                 raise RuntimeError("no more")
             return super().plan(traffic)

@@ -20,7 +20,7 @@ from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.planners import planner_record, read_planner_record, run_score, winners
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.planner import Control, Scenario, Target, Traffic, checked_plan, planner_maker
+from symphony.simulation.planner import Control, Pose, Scenario, Traffic, checked_plan, planner_maker
 from symphony.simulation.planner_calls import answer
 from symphony.simulation.planner_view import Observation
 from symphony.simulation.saved_files import RolloutFolder, load_rollouts
@@ -184,7 +184,7 @@ def test_time_limits_leave_other_alarms_as_they_were() -> None:
 
 
 def test_of_a_trajectory_the_first_state_is_driven() -> None:
-    poses = [Target(1.0 + k, 2.0, 0.1, 5.0) for k in range(4)]
+    poses = [Pose(1.0 + k, 2.0, 0.1, 5.0) for k in range(4)]
     at = np.array([0.0, 2.0, 0.1, 5.0])
     assert checked_plan(poses, at, 0.2).tolist() == list(poses[0])
     for wrong in (np.zeros((0, 4)), np.zeros((3, 2)), np.zeros((2, 2, 4))):

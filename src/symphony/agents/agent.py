@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 
 from symphony.agents.checkpoint import load_checkpoint
 from symphony.agents.choice import choose, split_name
@@ -82,6 +82,11 @@ class Agent:
     def searches(self) -> bool:
         """Whether it is meant to be simulated with the search."""
         return self.spec is not None and self.spec.searches
+
+    @property
+    def personas(self) -> Tensor | None:
+        """[M, 2] personas to draw from, equally likely; None for agents without."""
+        return getattr(self.policy, "personas", None)
 
     @property
     def routed(self) -> bool:

@@ -128,6 +128,7 @@ def load_checkpoint(
     generators: Mapping[str, torch.Generator] | None = None,
     partial: bool = False,
     restore_rng: bool = True,
+    widen: bool = False,
 ) -> LoadedCheckpoint:
     """Restore what is passed from the checkpoint folder `path`; nothing is changed unless everything fits.
 
@@ -138,6 +139,8 @@ def load_checkpoint(
         generators: likewise.
         partial: allow the checkpoint to hold more than is asked for (evaluation needs the policy only).
         restore_rng: also set the global random states of Python, numpy and torch.
+        widen: let modules have further inputs: columns that a saved matrix lacks are 0, so that they change nothing
+            at first, and buffers that it lacks are left as they are.
 
     Raises:
         CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, names, shapes or
@@ -164,6 +167,8 @@ def load_checkpoint(
     for part, item in asked.items():
         where = path / f"{part}.safetensors"
         if isinstance(item, nn.Module):
+            if widen:
+                states[part] = _widened(item, states[part])
             match_module(where, item, states[part])
         elif isinstance(item, torch.optim.Optimizer):
             match_optimizer(where, item, states[part])
@@ -177,6 +182,19 @@ def load_checkpoint(
     if restore_rng:
         _set_rng_state(rng)
     return LoadedCheckpoint(path, manifest["step"], states["extra"])
+
+
+def _widened(module: nn.Module, saved: dict[str, Any]) -> dict[str, Any]:
+    """A state with the columns and buffers that a module has beyond it."""
+    found, buffers = dict(saved), {name for name, _ in module.named_buffers()}
+    for name, own in module.state_dict().items():
+        there = saved.get(name)
+        if there is None and name in buffers:
+            found[name] = own.clone()
+        elif isinstance(there, Tensor) and there.ndim == own.ndim == 2:
+            missing = own.shape[1] - there.shape[1]
+            found[name] = nn.functional.pad(there, (0, missing)) if missing > 0 else there
+    return found
 
 
 def checkpoints(folder: Path) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
 from symphony import keys
@@ -21,6 +22,9 @@ from symphony.modules import (
     displacement_policy,
     goal_policy,
 )
+
+PERSONAS = 1024
+"""Personas kept with an agent, to be drawn from."""
 
 
 def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
@@ -49,6 +53,7 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         route=spec.goals,
         along=gaps and spec.goals,
         gaps=gaps,
+        persona=spec.agent.persona,
         road=road,
         clearance=features != "paper",
         foresight=FORESIGHT if gaps or features == "foresight" else (),
@@ -76,17 +81,24 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
     bicycle, or a Gaussian over displacements. Seed torch beforehand.
     """
-    if spec.agent.policy != "paper":
-        return build_object(spec.agent.policy, spec)
+    policy = build_object(spec.agent.policy, spec) if spec.agent.policy != "paper" else _policy(spec)
+    if spec.agent.persona:
+        # What personas are drawn from travels with the weights that were trained on them.
+        policy.register_buffer("personas", torch.zeros(PERSONAS, 2))
+    return policy
+
+
+def _policy(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     sizes: dict[str, Any] = {
         "hidden": spec.agent.hidden,
         "head": (spec.agent.head, spec.agent.head),
-        "own_keys": _own_keys(spec),
+        "own_keys": (*_own_keys(spec), keys.PERSONA) if spec.agent.persona else _own_keys(spec),
         "road_keys": (keys.ROAD, keys.ROAD_AHEAD) if spec.agent.features == "road" else (),
         "encoder": _encoder(spec),
     }
     # Two of each distance: of the centre, of four corners, and of the centre at each time ahead.
     own = _own_features(spec) + 2 * (5 + len(FORESIGHT)) * (spec.agent.features == "road")
+    own += 2 * spec.agent.persona
     dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
         return discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)

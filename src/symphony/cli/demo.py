@@ -43,12 +43,12 @@ class Demo:
 
         console = Console()
         began = time.perf_counter()
-        run, picture, numbers = self.out / "bc", self.out / "rollouts.png", self.out / "metrics.json"
+        run, picture, numbers = self.out / "bc_h", self.out / "rollouts.png", self.out / "metrics.json"
         if (run / "config.json").is_file():
             shutil.rmtree(run)
         learn, test = builtin_store("train"), builtin_store("test")
-        console.print(f"Learning to drive from {learn} (behavioural cloning, {self.steps} updates)")
-        config = TrainConfig(method="bc", data=learn, out=run, steps=self.steps, seed=self.seed)
+        console.print(f"Learning to drive from {learn} (behavioural cloning with goals, {self.steps} updates)")
+        config = TrainConfig(method="bc_h", data=learn, out=run, steps=self.steps, seed=self.seed)
         train(demo(config))
         console.print(f"Simulating {test}, which it has not seen")
         settings = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
@@ -76,4 +76,4 @@ class Demo:
 PANELS = 3
 """Run segments in the picture."""
 PRETRAINED = "pretrained:bc_ts_h"
-NAMES = ("log playback", "constant velocity", "BC", "included BC+TS+H")
+NAMES = ("log playback", "constant velocity", "BC+H", "included BC+TS+H")

@@ -69,6 +69,10 @@ class Evaluate:
             )
         if self.planner and self.calibrate is not None:
             raise ConfigError("--calibrate goes without --planner: give the threshold, --threshold")
+        if self.config.tilt:
+            raise ConfigError(
+                "--tilt goes with `symphony simulate`: the report makes up for it, these numbers don't"
+            )
         if not self.planner_seconds > 0:
             raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
 
@@ -181,7 +185,7 @@ class Evaluate:
 
         with segments_bar(f"WOSAC score of {agent.name}") as advance:
             found = evaluate_wosac(agent, store, items, settings, self.wosac_config, advance)
-        print_wosac(found)
+        print_wosac(found, aside=str(self.json) == "-")
         return wosac_parts(found, record)
 
     def _evaluate_planner(self) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from symphony.config import PROFILES, TrainConfig
 from symphony.config.checks import option
@@ -48,9 +48,13 @@ def expanded(args: Sequence[str]) -> list[str]:
 
 def _changes(before: Any, after: Any, prefix: str = "--") -> Iterator[tuple[str, list[str]]]:
     """Flags and the words that set them, for what differs between two configurations."""
+    hints = get_type_hints(type(before), include_extras=True)
     for field in dataclasses.fields(before):
         old, new = getattr(before, field.name), getattr(after, field.name)
-        flag = prefix + option(field.name)
+        # Some are called otherwise on the command line.
+        extras = getattr(hints[field.name], "__metadata__", ())
+        names = [extra.name for extra in extras if hasattr(extra, "aliases") and extra.name]
+        flag = prefix + (names[0] if names else option(field.name))
         if dataclasses.is_dataclass(old):
             yield from _changes(old, new, f"{flag}.")
         elif new is True and old is False:

@@ -23,12 +23,14 @@ class Simulate:
     `symphony report`, hand them on with `symphony export`.
     """
 
-    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
-    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
     data: Path
     """Store of run segments."""
     out: Path
     """Folder of the rollouts."""
+    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")] = ""
+    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
+    agents: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
+    """The same, by name."""
     segments: tuple[str, ...] = ()
     """Ids of the run segments, or their numbers in the store; by default all."""
     runs: int = 0
@@ -48,6 +50,8 @@ class Simulate:
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
+        if bool(self.agent) == bool(self.agents):
+            raise ConfigError("one agent is simulated: RUN or --agents RUN")
         if self.runs < 0 or (self.runs and self.segments):
             raise ConfigError("--runs is a number of runs, and goes without --segments")
         if not self.planner_seconds > 0:
@@ -64,7 +68,7 @@ class Simulate:
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
-            load_agent(self.agent, self.config.device),
+            load_agent(self.agent or self.agents, self.config.device),
             SegmentStore(self.data),
             self.config,
         )

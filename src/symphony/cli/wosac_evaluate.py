@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from symphony.cli.tables import write_numbers
 from symphony.config import WosacSettings
-from symphony.files import write_json
 
 if TYPE_CHECKING:
     from symphony.evaluation.wosac import WosacEvaluation
@@ -30,7 +30,8 @@ class Evaluate:
     config: Literal["2024", "2025"] = "2025"
     """Year of the challenge."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File to write all numbers to, those of every run segment included."""
+    """File to write all numbers to, those of every run segment included; - for standard output, the table then goes
+    to standard error."""
     segments: tuple[str, ...] = ()
     """Ids of the run segments, or their numbers in the store; by default all."""
     baselines: bool = True
@@ -51,13 +52,13 @@ class Evaluate:
             found = evaluate_wosac(
                 agent, store, items, self.settings, self.config, advance, baselines=self.baselines
             )
-        print_wosac(found)
+        print_wosac(found, aside=str(self.json) == "-")
         if self.json is not None:
-            write_json(self.json, found.record())
+            write_numbers(self.json, found.record())
 
 
-def print_wosac(found: WosacEvaluation) -> None:
-    """Print the numbers of every agent side by side."""
+def print_wosac(found: WosacEvaluation, *, aside: bool = False) -> None:
+    """Print the numbers of every agent side by side; to stderr if ``aside``."""
     from rich.console import Console
     from rich.table import Table
 
@@ -77,7 +78,7 @@ def print_wosac(found: WosacEvaluation) -> None:
         cells = (_shown(getattr(order, share), math.nan) for order in orders.values())
         table.add_row(f"order {share}, of {pairs} pairs", *cells)
     table.add_row("CPU seconds", *(f"{result.seconds:.1f}" for result in found.results.values()))
-    Console().print(table)
+    Console(stderr=aside).print(table)
 
 
 def _shown(mean: float, error: float) -> str:

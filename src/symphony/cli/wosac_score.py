@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from symphony.cli.tables import write_numbers
 from symphony.cli.wosac_files import ScenarioScore, score_files, summary
 from symphony.errors import ConfigError
-from symphony.files import write_json
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Score:
     config: Literal["2024", "2025"] = "2025"
     """Year of the challenge."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File to write all numbers to."""
+    """File to write all numbers to; - for standard output, the table then goes to standard error."""
     per_object: bool = False
     """In that file, give the numbers of each scored object, too."""
     features: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -49,9 +49,9 @@ class Score:
         """Score, showing how far it is, and report."""
         results = self._score()
         found = summary(results, self.config)
-        _print(found)
+        _print(found, aside=str(self.json) == "-")
         if self.json is not None:
-            write_json(self.json, found)
+            write_numbers(self.json, found)
 
     def _score(self) -> list[ScenarioScore]:
         from rich.console import Console
@@ -72,7 +72,7 @@ class Score:
             )
 
 
-def _print(found: dict[str, object]) -> None:
+def _print(found: dict[str, object], *, aside: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -81,4 +81,4 @@ def _print(found: dict[str, object]) -> None:
     for name, value in found.items():
         if isinstance(value, float):
             table.add_row(name, f"{value:.6f}")
-    Console().print(table)
+    Console(stderr=aside).print(table)

@@ -20,7 +20,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from symphony.collectors.branching import check_branching
 from symphony.collectors.result import BeamSearchResult, lineage, ranking
-from symphony.collectors.rules import GroupRule, KeepBest, PruningRule, group_members, prune, takes_groups
+from symphony.collectors.rules import (
+    GroupRule,
+    KeepBest,
+    PruningRule,
+    Systematic,
+    group_members,
+    prune,
+    takes_groups,
+)
 from symphony.collectors.scores import max_then_sum
 from symphony.errors import ConfigError
 
@@ -49,6 +57,7 @@ def beam_search(
     retries: int = 0,
     retry_above: float | None = None,
     reseed: Callable[[TensorDictBase, int], TensorDictBase] | None = None,
+    tilt: Callable[[Sequence[TensorDictBase]], Tensor] | None = None,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
     """Search an environment whose whole state is in the TensorDict (no GymEnv, VmasEnv, SerialEnv or ParallelEnv).
@@ -86,6 +95,9 @@ def beam_search(
         retry_above: threshold of `retries`.
         reseed: ``reseed(state, attempt) -> state`` for attempt 1, 2, ...: gives the start of a repeated period
             fresh random numbers. Not needed if policy and environment draw from a global generator.
+        tilt: importance of rare events: from the kept entries of the steps of a period, [*b, S] each, the logarithm
+            [*b, S] of how much heavier each branch weighs when it is resampled (rule :class:`Systematic`, all leaves,
+            no groups, no retries). The leaves' `log_weights` make up for it.
         exploration_type: under which the policy runs.
 
     Raises:
@@ -93,6 +105,10 @@ def beam_search(
             do not fit.
     """
     _check(start, steps, prune_every, leaves, retries, retry_above)
+    if tilt is not None and not _tiltable(rule, start, leaves, retries, group_key):
+        raise ConfigError(
+            "a tilt goes with rule Systematic and all leaves, without groups and without retries"
+        )
     check_branching(env, start)
     threshold = torch.inf if retry_above is None else retry_above
     groups = None if group_key is None else _groups(start, group_key)
@@ -102,7 +118,7 @@ def beam_search(
 
     now = start
     records: list[TensorDictBase] = []
-    scores, totals, parents = [], [], []
+    scores, totals, parents, weights = [], [], [], []
     simulated = 0
     with set_exploration_type(exploration_type):
         for period, length in enumerate(periods):
@@ -120,10 +136,14 @@ def beam_search(
             scores.append(run.scores)
             totals.append(run.totals)
             last = period == len(periods) - 1
+            compared = run.totals.detach()
             if last and not prune_last:
                 parents.append(torch.arange(start.shape[-1], device=run.totals.device).expand(start.shape))
                 break
-            parents.append(prune(rule, run.totals.detach(), noises[period], members, groups))
+            if tilt is not None and isinstance(rule, Systematic):
+                compared, weight = _tilted(compared, tilt(run.records), rule.temperature)
+                weights.append(weight)
+            parents.append(prune(rule, compared, noises[period], members, groups))
             groups = None if groups is None else groups.gather(-1, parents[-1])
             if not last:
                 now = _fork(run.after, parents[-1], slot_keys)
@@ -136,6 +156,9 @@ def beam_search(
         torch.stack(parents, -2),
     )
     slots = lineage(all_parents)
+    log_weights = None
+    if weights:
+        log_weights = torch.stack(weights, -2).gather(-1, slots[..., : len(weights), :]).sum(-2)
     if leaves is not None:
         best = ranking(all_totals[..., -1, :].detach(), slots[..., -1, :])[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
@@ -153,7 +176,30 @@ def beam_search(
         tree=tree if keep_tree else None,
         prune_every=prune_every,
         simulated_steps=simulated * start.numel(),
+        log_weights=log_weights,
     )
+
+
+def _tiltable(
+    rule: object, start: TensorDictBase, leaves: int | None, retries: int, group_key: NestedKey | None
+) -> bool:
+    return (
+        isinstance(rule, Systematic)
+        and leaves in (None, start.shape[-1])
+        and retries == 0
+        and group_key is None
+    )
+
+
+def _tilted(
+    totals: Float[Tensor, "*b S"], lift: Float[Tensor, "*b S"], temperature: float
+) -> tuple[Float[Tensor, "*b S"], Float[Tensor, "*b S"]]:
+    """Totals whose weights exp(-total / temperature) are exp(lift) times as large, and the logarithm of what a copy
+    of each branch then weighs, so that the mean over copies stays what it was.
+    """
+    usual = -totals.double() / temperature
+    weight = (usual + lift).logsumexp(-1, keepdim=True) - usual.logsumexp(-1, keepdim=True) - lift
+    return totals - temperature * lift, weight
 
 
 def score_state(

@@ -28,6 +28,8 @@ class BeamSearchResult:
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated, retries included.
+        log_weights: [*b, L] float64 logarithm of what each leaf weighs after a tilt: means over leaves with these
+            weights estimate what they would be without it. None without a tilt.
     """
 
     trajectories: TensorDictBase
@@ -39,6 +41,7 @@ class BeamSearchResult:
     tree: TensorDictBase | None
     prune_every: int
     simulated_steps: int
+    log_weights: Float[Tensor, "*b L"] | None = None
 
     @property
     def leaf_totals(self) -> Float[Tensor, "*b P L"]:

@@ -36,6 +36,9 @@ class AgentConfig:
     far its box is from the edge of the road, and its centre within the next 2 s."""
     accelerations: int = 7
     """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
+    persona: bool = False
+    """Drive in a style of one's own: the policy is told how closely the vehicle follows and how fast it drives among
+    those of the log; in simulations that is drawn for each rollout, or given."""
     hidden: int = 64
     """Width of the element encoders."""
     head: int = 128

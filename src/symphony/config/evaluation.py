@@ -27,6 +27,32 @@ for sampling, what the search made of the goals.
 """
 
 
+MANOEUVRES = ("hard_braking", "cut_in")
+"""That a search can make more frequent."""
+PERSONA_PARTS = ("headway", "speed")
+"""What a persona consists of, in the order of its numbers."""
+
+
+def persona_quantiles(text: str) -> dict[str, float]:
+    """From ``headway=.8,speed=.3`` to numbers by name; either may be missing.
+
+    Raises:
+        ConfigError: it can't be read, or a number is not between 0 and 1.
+    """
+    found: dict[str, float] = {}
+    for part in text.split(",") if text else []:
+        name, _, number = part.partition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            found[name] = -1.0
+        if name not in PERSONA_PARTS or not 0 <= found[name] <= 1:
+            raise ConfigError(
+                f"a persona is such as headway=.8,speed=.3 (quantiles from 0 to 1), not '{text}'"
+            )
+    return found
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
     """How agents are evaluated."""
@@ -58,6 +84,16 @@ class EvaluateConfig:
     """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     action_temperature: float = 1.0
     """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
+    persona: str = ""
+    """Style of all agents that the agent drives, such as `headway=.8,speed=.3`: quantiles among the vehicles it
+    learned from; what is not given is drawn for each (agents trained with `agent.persona`)."""
+    tilt: float = 0.0
+    """Raises the chance of a rare manoeuvre: in resampling (rule `systematic`, all branches of a tree as rollouts),
+    branches in which it happened between two prunings weigh exp(tilt) times as much. Rollouts are kept with weights
+    that make up for it."""
+    tilt_on: str = "hard_braking"
+    """Which: `hard_braking` (4 m/s^2), `cut_in` (into the path of another driven agent, within 15 m), or the import
+    path of a function of your own, see `symphony.simulation.importance`."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
@@ -98,6 +134,13 @@ class EvaluateConfig:
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
+        persona_quantiles(self.persona)
+        one_of(self, "tilt_on", MANOEUVRES, path=True)
+        not_negative(self, "tilt")
+        if self.tilt and (self.retries or self.search in ("none", "best")):
+            raise ConfigError(
+                "a tilt needs a search that resamples: no retries, and neither search none nor best"
+            )
         one_of(self, "others", get_args(Others))
         not_negative(self, "radius", "branches", "duration", "prune_every", "temperature", "retries")
         if self.interactive != "all" and not 0 <= self.interactive <= MOST:

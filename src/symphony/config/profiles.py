@@ -84,9 +84,16 @@ def smoke(config: TrainConfig) -> TrainConfig:
 def demo(config: TrainConfig) -> TrainConfig:
     """What `symphony demo` runs, minutes on a laptop.
 
-    Half the states and fewer points than by default: more, cheaper updates suit the few segments of the package.
+    Half the states and fewer points than by default: more, cheaper updates suit the few segments of the package. So
+    do inputs beyond the paper's, and displaced states once it drives.
     """
-    return replace(config, agent=replace(config.agent, num_points=128), states=512, wandb="disabled")
+    return replace(
+        config,
+        agent=replace(config.agent, num_points=128, num_lights=4, features="gaps", accelerations=21),
+        perturb=replace(config.perturb, share=0.5, begin=config.steps // 3),
+        states=512,
+        wandb="disabled",
+    )
 
 
 PROFILES: dict[Profile, Callable[[TrainConfig], TrainConfig]] = {

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from symphony.config.agent import ActionSpace, AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
 from symphony.config.checks import not_negative, one_of, positive
+from symphony.config.evaluation import MOST
 from symphony.errors import ConfigError
 from symphony.keys import SEEN
 
@@ -208,7 +209,10 @@ class TrainConfig(RunConfig):
     """Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are)."""
     agent: AgentConfig = field(default_factory=AgentConfig)
     """The agent."""
-    segments: int = 16
+    most_interactive: int = 0
+    """Simulate more agents in some run segments: their number is drawn for each between `agent.interactive` and this
+    one (methods that simulate; 0: always `agent.interactive`, as in the paper)."""
+    segments: Annotated[int, arg(name="batch")] = 16
     """Run segments per update."""
     states: int = 1024
     """Expert states per update, drawn from those segments."""
@@ -230,8 +234,15 @@ class TrainConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of(self, "method", METHODS)
-        positive(self, "segments", "states", "goals", "learning_rate")
+        if self.segments < 1:  # by its name on the command line
+            raise ConfigError(f"batch must be positive, is {self.segments}")
+        positive(self, "states", "goals", "learning_rate")
         not_negative(self, "duration")
+        if self.most_interactive and not self.agent.interactive <= self.most_interactive <= MOST:
+            raise ConfigError(
+                f"most-interactive is 0 or from agent.interactive ({self.agent.interactive}) to {MOST}, "
+                f"is {self.most_interactive}"
+            )
 
     def spec(
         self,
@@ -269,6 +280,8 @@ class TrainConfig(RunConfig):
             "interactive": self.agent.interactive,
             "duration": self.duration,
             "sampling": self.sampling,
+            "most": self.most_interactive,
+            "persona": self.agent.persona,
         }
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:

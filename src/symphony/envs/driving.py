@@ -161,8 +161,12 @@ class DrivingEnv(EnvBase):
             "state": lambda: floats(n, 4),
             "goal": goals,
         }
-        if self.open_traffic:
-            state["waiting"] = lambda: flags(n)
+        optional: dict[str, Callable[[], Any]] = {
+            "waiting": lambda: flags(n),
+            "persona": lambda: floats(n, 2),
+        }
+        there = {"waiting": self.open_traffic, "persona": config.persona}
+        state |= {name: spec for name, spec in optional.items() if there[name]}
         agents = {name: spec() for name, spec in state.items()}
         if not seen.is_empty():
             agents["observation"] = seen
@@ -212,7 +216,11 @@ class DrivingEnv(EnvBase):
         goal = torch.full_like(real, -1, dtype=torch.int64)
         waiting = real & ~early if self.open_traffic else None
         first = self._logged_state(scene)
-        return self._from_state(scene, torch.zeros_like(scene), stream, first, real & early, goal, waiting)
+        persona = None
+        if self.observation.persona:
+            persona = _rows(self.scenes.persona, scene, self.scenes.interactive[scene])
+        begin, there = torch.zeros_like(scene), real & early
+        return self._from_state(scene, begin, stream, first, there, goal, waiting, persona)
 
     def at(self, state: TensorDictBase) -> TensorDict:
         """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
@@ -237,9 +245,9 @@ class DrivingEnv(EnvBase):
 
     def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
         """A start state whose agents follow the given routes (by default those nearest to the log)."""
-        scene, step, stream, agents, valid, _, waiting = self._read(state)
+        scene, step, stream, agents, valid, _, waiting, persona = self._read(state)
         goal = self.scenes.route_logged[scene] if goal is None else goal
-        return self._from_state(scene, step, stream, agents, valid, goal, waiting)
+        return self._from_state(scene, step, stream, agents, valid, goal, waiting, persona)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
@@ -274,14 +282,14 @@ class DrivingEnv(EnvBase):
         return (torch.arange(shape.numel()) % len(items)).reshape(shape)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scene, step, stream, state, valid, goal, waiting = self._read(tensordict)
+        scene, step, stream, state, valid, goal, waiting, persona = self._read(tensordict)
         index = self.scenes.interactive[scene]
         size = _rows(self.scenes.box_size, scene, index)
         after = self._moved(tensordict, state, size)
         after = torch.where(valid[..., None], after, state)
         if waiting is not None:
             valid, waiting = self._flow(scene, step + 1, state, after, valid, waiting)
-        out = self._from_state(scene, step + 1, stream, after, valid, goal, waiting)
+        out = self._from_state(scene, step + 1, stream, after, valid, goal, waiting, persona)
         earned = self.reward(tensordict, out)
         return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
 
@@ -331,7 +339,7 @@ class DrivingEnv(EnvBase):
 
     def _read(
         self, tensordict: TensorDictBase
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
         state, valid, goal = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL))
         return (
@@ -342,6 +350,7 @@ class DrivingEnv(EnvBase):
             valid,
             goal,
             tensordict.get(keys.WAITING) if self.open_traffic else None,
+            tensordict.get(keys.PERSONA, None) if self.observation.persona else None,
         )
 
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
@@ -359,6 +368,7 @@ class DrivingEnv(EnvBase):
         valid: Tensor,
         goal: Tensor,
         waiting: Tensor | None = None,
+        persona: Tensor | None = None,
     ) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
         shape = scene.shape
@@ -396,6 +406,9 @@ class DrivingEnv(EnvBase):
         )
         if waiting is not None:
             agents.set("waiting", waiting)
+        if self.observation.persona:
+            # A state that says nothing of it, such as one of the log, is of no style in particular.
+            agents.set("persona", state.new_zeros(*each, 2) if persona is None else persona)
         if observation:
             parts = {name: back(value) for name, value in observation.items()}
             agents.set("observation", TensorDict(parts, batch_size=each, device=self.device))

@@ -56,6 +56,7 @@ class ObservationConfig:
         route: whether it observes the route that is its goal.
         along: whether it observes where the objects are along that route.
         gaps: whether it observes how far its box is from others.
+        persona: whether it knows the style in which it drives, a part of its state.
         road: whether it observes how far its box is from the edge of the road, and how far its centre would be ahead.
         clearance: whether it observes how far its box is from others and from the edge of the road.
         foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
@@ -72,6 +73,7 @@ class ObservationConfig:
     route: bool = False
     along: bool = False
     gaps: bool = False
+    persona: bool = False
     road: bool = False
     clearance: bool = False
     foresight: tuple[float, ...] = ()

@@ -78,6 +78,7 @@ class SceneBatch(TensorClass):
         log_valid: [B, T, A].
         box_size: [B, A, 2] length, width.
         agent_type: [B, A] int64.
+        persona: [B, A, 2] headway and speed of each agent among those of the log, from -1 to 1; 0 where not measured.
         interactive: [B, N] int64 rows of A; 0 for padding.
         interactive_valid: [B, N].
         enter: [B, N] int64 step at which the log brings an interactive agent in; 0 for those there from the start.
@@ -111,6 +112,7 @@ class SceneBatch(TensorClass):
     log_valid: Tensor
     box_size: Tensor
     agent_type: Tensor
+    persona: Tensor
     interactive: Tensor
     interactive_valid: Tensor
     enter: Tensor
@@ -146,6 +148,7 @@ def scene(
     number: int = 0,
     edge: MapEdge | None = None,
     background: Sequence[bool] | NDArray[np.bool_] | None = None,
+    persona: NDArray[np.float32] | None = None,
 ) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
@@ -157,6 +160,7 @@ def scene(
         edge: of the map; with it the traffic is open: interactive agents enter where the log first has them within
             the map, and leave at its edge.
         background: [N] which of the interactive agents a rule drives; by default none.
+        persona: [A, 2] of all agents, see :class:`SceneBatch`.
 
     Raises:
         DataError: if the segment has fewer usable agents.
@@ -180,6 +184,7 @@ def scene(
         "log_valid": segment.valid.T,
         "box_size": segment.size[:, :2],
         "agent_type": segment.agent_type.astype(np.int64),
+        "persona": np.zeros((segment.num_agents, 2), np.float32) if persona is None else persona,
         "interactive": chosen.astype(np.int64),
         "interactive_valid": np.ones(len(chosen), bool),
         "enter": np.zeros(len(chosen), np.int64) if edge is None else _first_inside(segment, chosen, edge),
@@ -206,8 +211,8 @@ def scene(
     )
 
 
-def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
-    """Stack scenes into one batch, padded to the largest of each size.
+def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
+    """Stack scenes into one batch, padded to the largest of each size, and to so many interactive agents.
 
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``.
 
@@ -222,6 +227,8 @@ def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
     for name in SceneBatch.__annotations__:
         values = [getattr(item, name) for item in scenes]
         shape = [max(sizes) for sizes in zip(*(v.shape[1:] for v in values), strict=True)]
+        if name in _AGENT_FIELDS:
+            shape[0] = max(shape[0], agents)
         fill = -1 if name in _INDEX_FIELDS else 0
         out = values[0].new_full((sum(len(v) for v in values), *shape), fill)
         row = 0
@@ -234,6 +241,15 @@ def collate(scenes: Sequence[SceneBatch]) -> SceneBatch:
 
 
 _INDEX_FIELDS = {"point_light", "edge_previous", "edge_following"}
+_AGENT_FIELDS = {
+    "interactive",
+    "interactive_valid",
+    "enter",
+    "background",
+    "route",
+    "route_count",
+    "route_logged",
+}
 
 
 def _routes(tables: Sequence[RouteTable], agents: int) -> dict[str, NDArray[Any]]:

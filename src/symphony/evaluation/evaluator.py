@@ -175,10 +175,14 @@ def evaluate_dataset(
         NotFiniteError: if a network of the agent puts out a number that is not finite.
     """
     agent.check_step(dataset.dt)
+    if config.tilt:
+        raise ConfigError(
+            "with a tilt, rare manoeuvres would count as usual ones: simulate, and see the report"
+        )
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.
-    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0)
+    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0, persona="")
     acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     hows = [config] + [once] * (len(everyone) - 1)
     found = [

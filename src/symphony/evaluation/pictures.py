@@ -17,6 +17,7 @@ from symphony.errors import ConfigError
 from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
+from symphony.simulation.control import given_personas
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import acting
 from symphony.simulation.planned import PlannedEnv
@@ -185,6 +186,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         seed=config.seed,
         logged_goals=config.logged_goals,
         goals_per=config.pruning(agent.search).goals,
+        personas=given_personas(agent.personas, config.persona),
     )[:, 0]
     with torch.no_grad():
         result = search(

@@ -149,13 +149,16 @@ def read_planner_record(path: Path) -> Record:
 
 
 def crowd_name(record: Record) -> str:
-    """The crowd in few words: its agent, how many were driven, and whether they were searched."""
+    """The crowd in few words: its agent, how many were driven, whether they were searched, and who drove the rest."""
     name = str(record["crowd"]).rpartition("/")[2].removeprefix("pretrained:")
-    if name == "playback":
-        return "log"
     settings = record["settings"]
+    others = settings.get("others", "log")
+    if name == "playback":
+        return "log" if others == "log" else f"{others}, all driven"
+    many = settings["interactive"]
+    driven = "all" if many == "all" else int(many) - 1
     search = "" if settings.get("search", "agent") == "agent" else f", search {settings['search']}"
-    return f"{name}, {int(settings['interactive']) - 1} driven{search}"
+    return f"{name}, {driven} driven{search}" + ("" if others == "log" else f", others {others}")
 
 
 def planner_grid(records: Sequence[Record]) -> list[list[str]]:

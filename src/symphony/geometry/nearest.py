@@ -12,12 +12,17 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 
+def transformed() -> bool:
+    """Whether a transform of ``torch.func`` (``vmap``) is at work, under which nothing can be written in place."""
+    return torch._C._functorch.peek_interpreter_stack() is not None
+
+
 def on_host(tensor: Tensor) -> bool:
-    """Whether values may steer the computation: on the CPU, outside of ``torch.compile``.
+    """Whether values may steer the computation: on the CPU, outside of ``torch.compile`` and ``torch.func``.
 
     There a step may look at a few numbers to leave out work; elsewhere that would wait for the device.
     """
-    return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
+    return tensor.device.type == "cpu" and not torch.compiler.is_compiling() and not transformed()
 
 
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:

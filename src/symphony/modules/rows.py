@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from symphony.geometry.nearest import transformed
+
 BLOCK = 64
 """Rows per block: large enough that the cost of the calls vanishes, small enough that padding stays cheap."""
 
@@ -33,11 +35,11 @@ def in_blocks(
     alone and the same row computed among others may differ in the last bit. Blocks of one fixed size (the
     last one padded) take that away: on the CPU, in float32 and without gradients, the result of a row does not
     depend on the batch it is in. That rests on the kernels treating the rows of one product alike, which MKL's
-    do in float32, but not in float64. With gradients enabled, or on another device, the function is called
-    once on all rows.
+    do in float32, but not in float64. With gradients enabled, on another device, or under a transform of
+    `torch.func`, the function is called once on all rows.
     """
     flat = x.reshape(-1, x.shape[-1])
-    if torch.is_grad_enabled() or x.device.type != "cpu" or flat.shape[0] == 0:
+    if torch.is_grad_enabled() or x.device.type != "cpu" or flat.shape[0] == 0 or transformed():
         out = function(flat)
     else:
         missing = -flat.shape[0] % rows
@@ -61,9 +63,9 @@ def reusing(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """
     layers = list(function) if isinstance(function, nn.Sequential) else []
     linear = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
-    if torch.compiler.is_compiling() or not linear or layers[::2] != linear or layers[-1] is not linear[-1]:
-        return function
-    if any(type(layer) is not nn.ReLU for layer in layers[1::2]):
+    plain = bool(linear) and layers[::2] == linear and layers[-1] is linear[-1]
+    plain = plain and all(type(layer) is nn.ReLU for layer in layers[1::2])
+    if not plain or torch.compiler.is_compiling() or transformed():
         return function
     parts = [(layer.bias.detach(), layer.weight.detach().t()) for layer in linear]
     kept: list[Tensor] = []

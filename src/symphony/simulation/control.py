@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from symphony import keys
+from symphony.config.evaluation import PERSONA_PARTS, persona_quantiles
 from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
@@ -41,6 +42,24 @@ class Tempered(TensorDictModuleBase):
         """Write actions [..., N]."""
         logits = tensordict.get(keys.LOGITS) / self.temperature
         return tensordict.set(keys.ACTION, inverse_cdf(logits, tensordict.get(keys.NOISE)))
+
+
+def given_personas(personas: Float[Tensor, "M 2"] | None, asked: str) -> Float[Tensor, "M 2"] | None:
+    """Personas to draw from, with the quantiles of headway and speed that are asked for in place of their own.
+
+    Raises:
+        ConfigError: for an agent without personas.
+    """
+    if not asked:
+        return personas
+    if personas is None:
+        raise ConfigError(
+            "this agent was trained without personas (agent.persona), so --persona means nothing to it"
+        )
+    found = personas.clone()
+    for name, quantile in persona_quantiles(asked).items():
+        found[:, PERSONA_PARTS.index(name)] = 2 * quantile - 1
+    return found
 
 
 def given_goals(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from operator import attrgetter
 from typing import Any
 
@@ -16,6 +16,7 @@ from torch import Tensor
 from symphony import keys
 from symphony.config import PerturbConfig, SamplingConfig
 from symphony.data.segment import RunSegment
+from symphony.data.selection import interactive_choice
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig, objects_at, observe
@@ -27,11 +28,15 @@ from symphony.roadgraph import LaneGraph
 from symphony.simulation.experts import Experts, fit_experts
 from symphony.simulation.kept import KeptExperts
 from symphony.simulation.memory import ItemCache
+from symphony.simulation.personas import PersonaScale, styles
 from symphony.simulation.perturbation import perturbed
 from symphony.simulation.weights import infractions, some_of, state_weights
+from symphony.streams import stream_of, uniform
 
 GRAPHS = 64
 """Lane graphs held in memory."""
+_COUNT = (1 << 40) + 3
+"""Number, in a segment's stream, of the draw of how many agents act: far above those of rollouts and steps."""
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
@@ -53,6 +58,9 @@ class SceneDataset:
         keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
             machine's memory; 170 kB each in the built-in data, with routes).
         sampling: what is drawn more often than the rest; nothing by default.
+        most: where it is more than ``interactive``, the number that act is drawn for every segment, once and for all,
+            between the two; a segment with fewer has those that there are.
+        persona: whether the driving style of all agents is measured.
 
     Raises:
         ConfigError, DataError: if its record is of another store or can't be read.
@@ -70,12 +78,14 @@ class SceneDataset:
         duration: float = 0,
         keep: int | None = None,
         sampling: SamplingConfig | None = None,
+        most: int = 0,
+        persona: bool = False,
     ) -> None:
         self.store = store
-        self.interactive = interactive
+        self.least, self.interactive = interactive, max(interactive, most)
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
-        self.routes, self.duration, self.keep = routes, duration, keep
+        self.routes, self.duration, self.keep, self.persona = routes, duration, keep, persona
         self.sampling = SamplingConfig() if sampling is None else sampling
         hard = self.sampling.hard
         self._hard = None if hard is None else infractions(hard, store, self.indices)
@@ -84,13 +94,21 @@ class SceneDataset:
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
         # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
-        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
+        # Of a drawn number of agents the rest is padding, so that N stays what it is.
+        agents = 0 if self.least == self.interactive else self.interactive
+        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items), agents))
 
     def __reduce__(self) -> tuple[Any, ...]:
         build = partial(
-            SceneDataset, routes=self.routes, duration=self.duration, keep=self.keep, sampling=self.sampling
+            SceneDataset,
+            routes=self.routes,
+            duration=self.duration,
+            keep=self.keep,
+            sampling=self.sampling,
+            most=self.interactive,
+            persona=self.persona,
         )
-        return build, (self.store, self.interactive, self.dynamics, self.indices)
+        return build, (self.store, self.least, self.dynamics, self.indices)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -143,8 +161,24 @@ class SceneDataset:
 
     def _scene(self, i: int) -> SceneBatch:
         """Item ``i`` as a batch of one scene."""
-        graph = self.graph(i) if self.routes else None
-        return scene(self.segment(i), self.interactive, graph, number=i)
+        graph, segment = self.graph(i) if self.routes else None, self.segment(i)
+        persona = self.personas.personas(styles(segment, self.graph(i))) if self.persona else None
+        return scene(segment, self._interactive(segment), graph, number=i, persona=persona)
+
+    @cached_property
+    def personas(self) -> PersonaScale:
+        """The driving styles of all items, measured when first asked for."""
+        return PersonaScale.of(styles(self.segment(i), self.graph(i)) for i in range(len(self)))
+
+    def _interactive(self, segment: RunSegment) -> int | list[int]:
+        """How many agents of a segment act, or which."""
+        if self.least == self.interactive:
+            return self.interactive
+        # Of the segment's own stream, so that neither its place in the store nor an interruption matters.
+        share = float(uniform(0, torch.tensor(stream_of(segment.segment_id)), _COUNT))
+        count = self.least + int(share * (self.interactive - self.least + 1))
+        chosen = interactive_choice(segment, count, fewer=True).agents.tolist()
+        return chosen if len(chosen) >= self.least else self.least
 
     def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
         return [self._scene(i) for i in items]
@@ -356,6 +390,8 @@ def expert_batch(
     batch = TensorDict({}, batch_size=[len(step)], device=state.device)
     batch.set(keys.VALID, real)
     batch.set(keys.STATE, here)
+    if observation.persona:
+        batch.set(keys.PERSONA, scenes.persona[scene_of, agent][:, None])
     for name, value in seen._asdict().items():
         if value is not None:
             batch.set(("agents", "observation", name), value)

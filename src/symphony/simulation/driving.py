@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -24,9 +24,10 @@ from symphony.errors import ConfigError
 from symphony.metrics import collisions, offroad
 from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
-from symphony.simulation.control import Tempered
+from symphony.simulation.control import Tempered, given_personas
 from symphony.simulation.demonstrations import logged
 from symphony.simulation.finite import FiniteWatch
+from symphony.simulation.importance import Tilt
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
 from symphony.simulation.search import aggregate_of, pruning_rule, search
@@ -47,6 +48,7 @@ class Simulation(NamedTuple):
         search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
+        log_weight: [B, K] logarithm of what each rollout weighs after a tilt; None without one.
     """
 
     rollouts: Rollouts
@@ -54,6 +56,7 @@ class Simulation(NamedTuple):
     search: BeamSearchResult | None
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
+    log_weight: Float[Tensor, "B K"] | None = None
 
 
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
@@ -112,6 +115,7 @@ def simulation(
         seed=config.seed,
         logged_goals=config.logged_goals,
         goals_per=config.pruning(agent.search).goals,
+        personas=given_personas(agent.personas, config.persona),
     )
     start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
     settings, planned = config.pruning(agent.search), None
@@ -146,6 +150,7 @@ def simulation(
                 keep_tree=keep_tree and not best,
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
+                tilt=Tilt(env, config.tilt, config.tilt_on, ego=planned is None) if config.tilt else None,
             )
         found = rollouts_of(env, start, result.trajectories)
         # A copy of a branch follows the goals of its parent.
@@ -160,7 +165,8 @@ def simulation(
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
-    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn)
+    weights = None if result is None or result.log_weights is None else result.log_weights.flatten(1)
+    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn, log_weight=weights)
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
@@ -242,6 +248,8 @@ def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
     if kind in ("none", "log"):
+        if config.tilt:
+            raise ConfigError("a tilt needs a search: the agent has none, see --search")
         return config.rollouts, 1, 1
     branches = config.branches or agent.search.test_branches
     if kind == "best":
@@ -250,6 +258,11 @@ def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     if taken > branches:
         raise ConfigError(
             f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
+        )
+    if config.tilt and taken < branches:
+        raise ConfigError(
+            f"with a tilt every branch is a rollout: {config.trees} trees of {branches} branches are "
+            f"{config.trees * branches} rollouts, not {config.rollouts}"
         )
     return config.trees, branches, taken
 

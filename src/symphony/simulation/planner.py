@@ -31,10 +31,10 @@ MAX_BRAKING = 10.0
 MAX_STEERING = 0.6
 """Radians of its front wheels either way."""
 MAX_SPEED = 80.0
-"""m/s that a target may ask for, and by which it may lie away from where the vehicle is."""
+"""m/s that a pose may ask for, and by which it may lie away from where the vehicle is."""
 
 
-class Target(NamedTuple):
+class Pose(NamedTuple):
     """The state of the ego at the next step: box centre, heading, speed along it."""
 
     x: float
@@ -146,8 +146,8 @@ class Planner(Protocol):
         """Begin a rollout; called once, before the first plan."""
         ...
 
-    def plan(self, traffic: Traffic) -> Target | Control | Sequence[float] | Sequence[Target] | NDArray[Any]:
-        """What the ego does until the next step: 4 numbers are a :class:`Target`, 2 a :class:`Control`.
+    def plan(self, traffic: Traffic) -> Pose | Control | Sequence[float] | Sequence[Pose] | NDArray[Any]:
+        """What the ego does until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
 
         Of several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
         """

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import SignalState
 from symphony.envs.dynamics import WHEELBASE
-from symphony.simulation.planner import MAX_BRAKING, Control, Reals, Scenario, Target, Traffic
+from symphony.simulation.planner import MAX_BRAKING, Control, Pose, Reals, Scenario, Traffic
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
@@ -26,11 +26,11 @@ class LogPlanner:
         """Remember the log."""
         self.log, self.valid = scenario.log, scenario.log_valid
 
-    def plan(self, traffic: Traffic) -> Target:
+    def plan(self, traffic: Traffic) -> Pose:
         """The next logged state."""
         if not self.valid[traffic.step + 1]:
             raise ValueError("the log has no ego at the next step")
-        return Target(*self.log[traffic.step + 1].tolist())
+        return Pose(*self.log[traffic.step + 1].tolist())
 
 
 class IDMPlanner:

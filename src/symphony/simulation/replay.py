@@ -25,6 +25,7 @@ _LEARNED = (
     keys.POINTS_MASK,
     keys.LIGHTS_MASK,
     keys.VALID,
+    keys.PERSONA,
     keys.ACTION,
     keys.ROLLOUT,
     keys.RANK,

@@ -17,8 +17,8 @@ from symphony.envs.driving import DrivingEnv
 from symphony.modules import drawn_goals
 from symphony.streams import fold_in, uniform
 
-_GOALS = 1 << 40
-"""Number of the stream that goals draw from, far above those of rollouts and agents."""
+_GOALS, _PERSONAS = 1 << 40, (1 << 40) + 4
+"""Numbers of the streams that goals and personas draw from, far above those of rollouts and agents."""
 
 
 class Rollouts(NamedTuple):
@@ -113,6 +113,27 @@ def draw_goals(
     return torch.where(waiting, drawn(everyone), found)
 
 
+def draw_personas(
+    env: DrivingEnv,
+    personas: Float[Tensor, "M 2"],
+    start: TensorDictBase,
+    seed: int,
+    number: Int[Tensor, "*b"],
+) -> Float[Tensor, "*b N 2"]:
+    """The style in which each agent drives from a start state on.
+
+    Args:
+        env: the environment.
+        personas: to draw from, equally likely.
+        start: [...], one entry per draw.
+        seed: of the draw.
+        number: [...] of the draw within its scene.
+    """
+    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _PERSONAS), number[..., None])
+    share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
+    return personas[(share * len(personas)).long()]
+
+
 def start_states(
     env: DrivingEnv,
     goals: TensorDictModuleBase | None,
@@ -122,6 +143,7 @@ def start_states(
     seed: int,
     logged_goals: bool = False,
     goals_per: Literal["tree", "branch"] = "tree",
+    personas: Float[Tensor, "M 2"] | None = None,
 ) -> TensorDictBase:
     """First states [B, trees, branches] of all scenes.
 
@@ -132,12 +154,19 @@ def start_states(
         branches: per tree.
         seed: of the goals.
         logged_goals: take the routes nearest to the log instead.
-        goals_per: who draws goals together: all branches of a tree (paper, section IV-B), or each branch alone.
+        goals_per: who draws goals, and personas, together: all branches of a tree (paper, section IV-B), or each
+            branch alone.
+        personas: that agents drive in, to draw from; None for agents without.
     """
     device, scenes = env.scenes.device, len(env.scenes)
     number = torch.arange(trees * branches, device=device).reshape(trees, branches)
     scene = torch.arange(scenes, device=device)[:, None, None]
     start = env.start(scene.expand(-1, trees, branches), number.expand(scenes, -1, -1))
+    if personas is not None:
+        first = number if goals_per == "branch" else number[:, :1]
+        start.set(
+            keys.PERSONA, draw_personas(env, personas, start, seed, first.expand(scenes, trees, branches))
+        )
     if goals is None:
         return start
     chosen = None if logged_goals else goals

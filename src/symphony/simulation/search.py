@@ -28,6 +28,7 @@ from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.imports import build_object, load_object
 from symphony.modules import SeededNoise
+from symphony.simulation.importance import Tilt
 from symphony.streams import fold_in, uniform
 
 ENDED = -100.0
@@ -52,6 +53,13 @@ KEPT: Sequence[keys.Key] = [
     *OUTCOME,
 ]
 """What is kept of every step of a search: enough to observe its states anew."""
+
+
+def kept_keys(env: DrivingEnv, also: Sequence[keys.Key] = ()) -> list[keys.Key]:
+    """:data:`KEPT`, with the personas of agents that have them."""
+    return [*KEPT, *([keys.PERSONA] if env.observation.persona else []), *also]
+
+
 AGGREGATES = {"max_then_sum": max_then_sum, "mean_then_sum": mean_then_sum}
 
 
@@ -119,12 +127,13 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
     return noise
 
 
-def collector_settings(config: SearchConfig, seed: int, decisions: int) -> dict[str, Any]:
+def collector_settings(config: SearchConfig, env: DrivingEnv, seed: int, decisions: int) -> dict[str, Any]:
     """What a collector of driving needs beside environment, policy and scores: whole trees, random numbers that
     depend on nothing but seed, segment, branch and step.
 
     Args:
         config: of the search.
+        env: that is searched.
         seed: of the pruning.
         decisions: T, actions until the end of the longest segment.
     """
@@ -138,7 +147,7 @@ def collector_settings(config: SearchConfig, seed: int, decisions: int) -> dict[
         # A copy takes the random numbers of the place it lands in, so that forks part.
         "slot_keys": (keys.STREAM,),
         "group_key": keys.GOAL if takes_groups(pruning_rule(config)) else None,
-        "keep": KEPT,
+        "keep": kept_keys(env),
         "frames_per_batch": config.segments * config.branches * decisions,
         "total_frames": -1,
     }
@@ -160,6 +169,7 @@ def search(
     retry_above: float = 0.0,
     ego: bool = True,
     also: Sequence[keys.Key] = (),
+    tilt: Tilt | None = None,
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S] to the last logged step.
 
@@ -179,6 +189,7 @@ def search(
         retry_above: that total.
         ego: whether the first agent is scored, too.
         also: what is kept of every step beside :data:`KEPT`.
+        tilt: importance of rare manoeuvres.
     """
     steps = env.decisions
     return beam_search(
@@ -195,11 +206,12 @@ def search(
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         group_key=keys.GOAL if takes_groups(rule) else None,
-        keep=[*KEPT, *also],
+        keep=kept_keys(env, also),
         keep_tree=keep_tree,
         retries=retries,
         retry_above=retry_above if retries else None,
         reseed=_reseed,
+        tilt=tilt,
     )
 
 

@@ -57,7 +57,7 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
 
 
 def warm_start(agent: Agent, run: Path) -> None:
-    """Take over the networks that another run has too.
+    """Take over the networks that another run has too; inputs that they had not change nothing at first.
 
     Raises:
         ConfigError: if there is no such run.
@@ -66,4 +66,4 @@ def warm_start(agent: Agent, run: Path) -> None:
     source = choose(*split_name(str(run)))
     there = parts_of(source)
     shared = {name: module for name, module in agent.modules.items() if name in there}
-    load_checkpoint(source, modules=shared, partial=True, restore_rng=False)
+    load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=True)

@@ -89,6 +89,8 @@ class Trainer:
         self.done = checkpoint_to_resume(config)
         if config.warm_start is not None and self.done is None:
             warm_start(agent, config.warm_start)
+        if agent.personas is not None and self.done is None:
+            agent.personas.copy_(data.personas.table())
         self.validator: Validator | None = None
         self.previewer: Previewer | None = None
         if self.world.leads and config.validation.data is not None:
