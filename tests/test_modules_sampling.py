@@ -161,6 +161,12 @@ def test_a_draw_from_what_is_no_number_still_names_a_category():
     assert ((drawn >= 0) & (drawn < 5)).all()
 
 
+def test_of_no_categories_none_is_drawn():
+    assert torch.equal(
+        inverse_cdf(torch.zeros(3, 0), torch.full((3,), 0.5)), torch.zeros(3, dtype=torch.int64)
+    )
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cuda_gives_the_same_bits():

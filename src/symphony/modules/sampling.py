@@ -11,8 +11,10 @@ def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> In
     """Draw categories `[...]` int64 from logits `[..., C]` by uniform numbers `[...]` in [0, 1].
 
     The category is the one whose interval of the cumulative distribution holds the number; a category of
-    probability zero is never drawn.
+    probability zero is never drawn. Where there is no category at all it is 0.
     """
+    if logits.shape[-1] == 0:
+        return torch.zeros_like(noise, dtype=torch.int64)
     cumulative = torch.softmax(logits.detach(), -1).cumsum(-1)
     total = cumulative[..., -1:].contiguous()
     # It never falls, so a place in it is the number of elements at most, or less than, a value.
