@@ -18,7 +18,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.evaluation.report import report
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.planner import Scenario, Target, Traffic
+from symphony.simulation.planner import Pose, Scenario, Traffic
 from symphony.simulation.saving import save_simulation
 
 
@@ -36,7 +36,7 @@ class Careful:
         self.arc = np.concatenate([[0.0], np.cumsum(steps)])
         self.along, self.speed = 0.0, float(scenario.state[3])
 
-    def plan(self, traffic: Traffic) -> Target:
+    def plan(self, traffic: Traffic) -> Pose:
         """The next place on the route, slower where someone is near it."""
         others = traffic.valid.copy()
         others[traffic.ego] = False
@@ -49,7 +49,7 @@ class Careful:
         self.along += self.speed * self.dt
         here, there = self.place(self.along), self.place(self.along + 1.0)
         heading = np.arctan2(*(there - here)[::-1])
-        return Target(*here, heading, self.speed)
+        return Pose(*here, heading, self.speed)
 
     def place(self, along: float) -> np.ndarray:
         """The point of the route so many metres from its start, straight on past its end."""

@@ -74,7 +74,7 @@ def _local_corners(size: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 4 2"]:
     return 0.5 * size[..., None, :] * signs
 
 
-_Plane = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
+_Plane = tuple[Float[Tensor, "*#b"], Float[Tensor, "*#b"]]
 """Two components that belong together, each a tensor of its own: operations on a last dimension of 2 are slow."""
 
 
