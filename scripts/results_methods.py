@@ -1,0 +1,181 @@
+"""Tables of the methods: those of the paper, ways to search, the included agent."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, mean_of, means, paired, records
+from results_users import NAMES
+from symphony.evaluation.comparison import Entry
+from symphony.evaluation.paper import paper_figures
+from symphony.evaluation.relations import grid, relations
+
+BC = (
+    ("BC", "bc/bc-*-none"),
+    ("BC+H", "bc/bc_h-*-none"),
+    ("BC+TS", "bc/bc_ts-*-often"),
+    ("BC+TS+H", "bc/bc_ts_h-*-often"),
+)
+MGAIL = (
+    ("MGAIL", "mgail/mgail-*-none"),
+    ("MGAIL+H", "mgail/mgail_h-*-none"),
+    ("MGAIL+TS", "mgail/mgail_ts-*-often"),
+    ("MGAIL+TS+H", "mgail/mgail_ts_h-*-often"),
+)
+FEATURES = (
+    ("`paper`: positions, headings, speeds, sizes, map points", "features/paper/bc_ts_h-0-often"),
+    (
+        "`clearance`: also gaps between boxes, distance to the road's edge",
+        "features/clearance/bc_ts_h-0-often",
+    ),
+    ("`foresight`: also the gaps of the next 2 s", "bc/bc_ts_h-0-often"),
+)
+HALVING = (
+    ("BC+TS, halved every 2 s", "bc/bc_ts-*-tree"),
+    ("BC+TS, resampled every 2 s", "bc/bc_ts-*-systematic"),
+    ("BC+TS, resampled every 0.4 s", "bc/bc_ts-*-often"),
+    ("BC+TS+H, halved every 2 s", "bc/bc_ts_h-*-tree"),
+    ("BC+TS+H, resampled every 2 s", "bc/bc_ts_h-*-systematic"),
+    ("BC+TS+H, resampled every 0.4 s", "bc/bc_ts_h-*-often"),
+    ("MGAIL+TS, halved every 2 s", "mgail/mgail_ts-*-tree"),
+    ("MGAIL+TS, resampled every 0.4 s", "mgail/mgail_ts-*-often"),
+    ("MGAIL+TS+H, halved every 2 s", "mgail/mgail_ts_h-*-tree"),
+    ("MGAIL+TS+H, resampled every 0.4 s", "mgail/mgail_ts_h-*-often"),
+)
+WAYS = (
+    ("one tree of 16, halved every 2 s", "bc/bc_ts_h-0-tree"),
+    ("the same, pruned by the true flags", "bc/bc_ts_h-0-oracle"),
+    ("one tree of 16, resampled every 0.4 s", "bc/bc_ts_h-0-often"),
+    ("a leaf each of 16 trees of 4, resampled every 0.4 s", "bc/bc_ts_h-0-forest"),
+    ("the leaves of 4 trees of 4, resampled every 2 s", "bc/bc_ts_h-0-small"),
+    ("the best of 16 independent rollouts", "bc/bc_ts_h-0-best"),
+    ("learned with resampling too: independent rollouts", "bc-resampled/bc_ts_h-0-none"),
+    ("learned with resampling too: one tree, every 0.4 s", "bc-resampled/bc_ts_h-0-often"),
+)
+SEARCH = (
+    ("log playback", "none", "playback"),
+    ("constant velocity", "none", "constant_velocity"),
+    ("no search", "none", ""),
+    ("resampled, goals of the tree", "systematic-tree", ""),
+    ("resampled, goals of each branch", "systematic-branch", ""),
+    ("only the bad replaced, goals of each branch", "replace-branch", ""),
+)
+"""Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
+FOREST = (
+    ("no search", "none", ""),
+    ("the leaves of one tree of 16", "one", ""),
+    ("a leaf each of 16 trees of 16 (the paper's reading)", "forest", ""),
+)
+"""Of the included agent on every fifth test segment of towns."""
+DRIVEN = {"town": "towns", "ngsim": "real roads"}
+INCLUDED = (
+    ("log playback", "none", "playback"),
+    ("constant velocity", "none", "constant_velocity"),
+    ("BC", "bc", ""),
+    ("BC+TS+H without its search", "none", ""),
+    ("BC+TS+H", "replace-branch", ""),
+)
+LABELS = (
+    ("BC+H, one route taught (seed 0)", "bc/bc_h-0-none"),
+    ("BC+H, the set of open routes", "labels/bc_h-0-none"),
+    ("BC+TS+H, one route taught (seed 0)", "bc/bc_ts_h-0-often"),
+    ("BC+TS+H, the set of open routes", "labels/bc_ts_h-0-systematic"),
+)
+SEEDS = (("BC+TS+H without its search", "driving/{}-none*"), ("BC+TS+H", "driving/{}-replace-branch*"))
+"""The included agent (seed 0) and those trained likewise of two more seeds."""
+NGSIM = (
+    (PLAYBACK, "ngsim/{}/playback"),
+    ("constant velocity", "ngsim/{}/constant_velocity"),
+    ("BC", "ngsim/{}/bc-0-none"),
+    ("BC+H", "ngsim/{}/bc_h-0-none"),
+    ("BC+TS", "ngsim/{}/bc_ts-0-often"),
+    ("BC+TS+H", "ngsim/{}/bc_ts_h-0-often"),
+    ("BC+TS+H, freeways among the simulated data", "ngsim-mixed/{}/bc_ts_h-0-often"),
+)
+
+
+def setting(folder: str) -> Grid:
+    """The eight methods in one of the paper's other settings."""
+    rows = [(label, f"{folder}/{Path(pattern).name.replace('*', '0')}") for label, pattern in (*BC, *MGAIL)]
+    return means(rows)
+
+
+def held() -> Grid:
+    """The paper's relations as `symphony table --relations` has them, those that the records can tell."""
+    entries = []
+    for _, pattern in (*BC, *MGAIL):
+        entries += [_entry(record, pattern) for record in records(pattern)]
+    return grid([relation for relation in relations(entries) if relation.held is not None])
+
+
+def _entry(record: Record, pattern: str) -> Entry:
+    """A record as the comparison reads it; older ones keep a list per metric instead of a row per run segment."""
+    facts = record.get("run") or record
+    rows = record["per_segment"]
+    if isinstance(rows, dict):
+        columns = {name: json.loads(values) for name, values in rows.items()}
+        each = zip(*columns.values(), strict=True)
+        rows = [{"segment": f"{k:04d}"} | dict(zip(columns, row, strict=True)) for k, row in enumerate(each)]
+    config = {"method": facts["method"], "seed": facts["seed"]}
+    return Entry(RECORDS, config, pattern, {"curvature": {}} | record | {"per_segment": rows})
+
+
+def against_paper() -> Grid:
+    """Collisions, time off the road and ADE beside the paper's on WOMD."""
+    columns = ("collision_rate", "offroad_time", "ade")
+    figures = paper_figures("main", "womd") or {}
+    grid = [["", *(head for name in columns for head in (COLUMNS[name][0], "paper"))]]
+    for label, pattern in (*BC, *MGAIL):
+        line = [label]
+        for name in columns:
+            line.append(mean_of([row[name] for row in records(pattern)], COLUMNS[name][1]))
+            mean, error = figures[Path(pattern).name.split("-")[0]][name]
+            line.append(f"{mean:.2f} ± {error:.2f}")
+        grid.append(line)
+    return grid
+
+
+def sweep() -> Grid:
+    """What every change of the adversarial settings did, paired over segments with the base."""
+    grid = [["", "change", *(heading for heading, _ in COLUMNS.values()), "collisions against base", "AUC"]]
+    for method, title in NAMES.items():
+        rows = {row["name"]: row for row in records(f"sweep/{method}-*")}
+        for name in sorted(rows, key=lambda name: (name != "start", name != "base", name)):
+            row = rows[name]
+            cells = [mean_of([row[key]], digits) for key, (_, digits) in COLUMNS.items()]
+            apart = "–" if name == "base" else paired([rows["base"]], [row], "collision_rate", 1)
+            what = "the regression alone" if name == "start" else name
+            grid.append([title, what, *cells, apart, f"{row['auc']:.2f}" if "auc" in row else "–"])
+    return grid
+
+
+def searched(folder: str, data: str, rows: Sequence[tuple[str, str, str]] = SEARCH) -> Grid:
+    """One agent simulated in several ways: errors over recordings, and CPU seconds per segment."""
+    grid = [["", *(heading for heading, _ in COLUMNS.values()), "CPU s"]]
+    for label, name, part in rows:
+        (record,) = records(f"{folder}/{data}-{name}")
+        row = record[part] if part else record
+        cells = [
+            f"{row[key]:.{digits}f} ± {row[f'{key}_se']:.{digits}f}" for key, (_, digits) in COLUMNS.items()
+        ]
+        cost = "" if part else f"{record['cost']['simulation'] / record['segments']:.2f}"
+        grid.append([label, *cells, cost])
+    return grid
+
+
+def included() -> Grid:
+    """The agent that comes with the package beside baselines, on simulated towns and on real roads."""
+    columns = ("collision_rate", "ade", "min_sade")
+    grid = [["", *(f"{where}: {COLUMNS[key][0]}" for where in DRIVEN.values() for key in columns)]]
+    for label, name, part in INCLUDED:
+        line = [label]
+        for data in DRIVEN:
+            (record,) = records(f"driving/{data}-{name}")
+            row = record[part] if part else record
+            line += [
+                f"{row[key]:.{COLUMNS[key][1]}f} ± {row[f'{key}_se']:.{COLUMNS[key][1]}f}" for key in columns
+            ]
+        grid.append(line)
+    return grid

@@ -1,0 +1,107 @@
+"""Tables of real roads."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, figures, records
+from symphony.evaluation.paired import clustered_mean
+
+REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
+ROAD_BASELINES = (("log playback", "playback"), ("constant velocity", "constant_velocity"), ("IDM", "idm"))
+ROAD_AGENTS = {
+    "bc": "BC",
+    "bc_h": "BC+H",
+    "bc_ts": "BC+TS",
+    "none": "BC+TS+H without its search",
+    "bc_ts_h": "BC+TS+H",
+    "mgail_ts_h": "MGAIL+TS+H",
+}
+LEARNED_FROM = {"sumo": "SUMO", "ngsim": "NGSIM", "both": "SUMO, NGSIM"}
+ELSEWHERE = {
+    "2-constant_velocity": "driving/ngsim-constant-velocity",
+    "2-both-bc": "driving/ngsim-bc",
+    "2-both-none": "driving/ngsim-none",
+    "2-both-bc_ts_h": "driving/ngsim-replace-branch",
+}
+"""Records of the table on real roads that other tables have, too."""
+UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
+UNSEEN_ROWS = (
+    ("log playback", "idm", "playback"),
+    ("constant velocity", "idm", "constant_velocity"),
+    ("IDM", "idm", ""),
+    ("BC", "bc", ""),
+    ("BC+TS+H without its search", "bc_h", ""),
+    ("BC+TS+H", "bc_ts_h", ""),
+    ("MGAIL+TS+H", "mgail_ts_h", ""),
+)
+KINDS = {
+    "collision_rate": ("collisions %", 1),
+    "collision_with_playback": ("with playback", 1),
+    "collision_into_leader": ("into a leader", 1),
+    "collision_rear_ended": ("rear-ended", 1),
+    "collision_crossing": ("crossing", 1),
+    "collision_oncoming": ("oncoming", 1),
+    "collision_sideswipe": ("sideswipe", 1),
+}
+"""Collisions by kind: their headings, and the digits after their points."""
+NO_CARS = {"collision_pedestrian": ("into a pedestrian", 1), "collision_cyclist": ("into a cyclist", 1)}
+OTHERWISE = {name: COLUMNS[name] for name in ("offroad_time", "ade", "min_sade")}
+
+
+def road_rows(count: int) -> list[tuple[str, str, Record]]:
+    """What was learned from, agent and record on the NGSIM test part, as far as there are records, for a number of
+    interactive agents.
+    """
+    names = [("", label, name) for label, name in ROAD_BASELINES]
+    for data, source in LEARNED_FROM.items():
+        names += [(source, label, f"{data}-{method}") for method, label in ROAD_AGENTS.items()]
+    found = []
+    for source, label, name in names:
+        path = RECORDS / f"roads/{count}-{name}.json"
+        if not path.is_file() and f"{count}-{name}" in ELSEWHERE:
+            path = RECORDS / f"{ELSEWHERE[f'{count}-{name}']}.json"
+        if path.is_file():
+            found.append((source, label, json.loads(path.read_text())))
+    return found
+
+
+def by_place(count: int) -> Grid:
+    """Each place of the NGSIM test part: collisions (in brackets those with playback vehicles) and ADE."""
+    head = [f"{place}: {what}" for place in REAL.values() for what in ("collisions %", "ADE m")]
+    grid = [["", "learned from", *head]]
+    for source, label, record in road_rows(count):
+        line = [label, source]
+        for place in REAL:
+            rows = [row for row in record["per_segment"] if place in row["group"]]
+            groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
+            for key, digits in (("collision_rate", 1), ("ade", 2)):
+                values = np.array([row[key] for row in rows], np.float64)
+                mean, error = clustered_mean(values, groups)
+                ghosts = np.mean([row["collision_with_playback"] for row in rows])
+                aside = f" ({ghosts:.1f})" if key == "collision_rate" else ""
+                line.append(f"{mean:.{digits}f} ± {error:.{digits}f}{aside}")
+        grid.append(line)
+    return grid
+
+
+def by_kind(count: int) -> Grid:
+    """The NGSIM test part as a whole: collisions by kind."""
+    columns = KINDS | OTHERWISE
+    grid = [["", "learned from", *(heading for heading, _ in columns.values())]]
+    return grid + [[label, source, *figures(record, columns)] for source, label, record in road_rows(count)]
+
+
+def unseen() -> Grid:
+    """Real roads that no agent has learned from, one set after the other."""
+    columns = KINDS | NO_CARS | OTHERWISE
+    grid = [["", "", *(heading for heading, _ in columns.values())]]
+    for data, title in UNSEEN.items():
+        for label, name, part in UNSEEN_ROWS:
+            (record,) = records(f"roads/{data}-{name}")
+            size = f"{title} ({record['segments']} segments, {record['groups']} recordings)"
+            row = record[part] if part else record
+            grid.append([size if label == PLAYBACK else "", label, *figures(row, columns)])
+    return grid
