@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from helpers_runs import build, tiny
 from helpers_segments import CAR, crossing, make_segment, straight_road
 from symphony import keys
 from symphony.agents import Agent, load_agent
+from symphony.agents.checkpoint import CheckpointError
 from symphony.config import METHODS, AgentConfig, EvaluateConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore, StoreWriter
@@ -152,6 +154,23 @@ def test_a_warm_start_without_personas_drives_as_before(store: Path, tmp_path: P
     for asked in ("", "headway=1,speed=0"):
         told = simulated(after, scenes, EvaluateConfig(rollouts=2, persona=asked)).state
         assert torch.equal(told, simulated(plain, scenes, EvaluateConfig(rollouts=2)).state)
+
+
+@pytest.mark.parametrize(
+    ("method", "before", "after"),
+    [
+        ("bc_h", {"features": "road"}, {"features": "road"}),  # a route would stand before the road
+        ("bc", {"features": "road"}, {"features": "road", "persona": True}),  # and so would a persona
+        ("bc", {"features": "gaps"}, {"features": "road"}),
+    ],
+)
+def test_inputs_that_would_take_the_weights_of_others_are_refused(
+    method: Any, before: dict[str, Any], after: dict[str, Any], store: Path, tmp_path: Path
+) -> None:
+    own = replace(OWN, persona=False)
+    run = train(tiny("bc", store, tmp_path / "before", agent=replace(own, **before)))
+    with pytest.raises(CheckpointError, match="policy"):
+        build(tiny(method, store, tmp_path / "after", agent=replace(own, **after), warm_start=run))
 
 
 def test_the_number_of_agents_is_drawn_for_each_segment(store: Path, tmp_path: Path) -> None:

@@ -139,8 +139,8 @@ def load_checkpoint(
         generators: likewise.
         partial: allow the checkpoint to hold more than is asked for (evaluation needs the policy only).
         restore_rng: also set the global random states of Python, numpy and torch.
-        widen: let modules have further inputs: columns that a saved matrix lacks are 0, so that they change nothing
-            at first, and buffers that it lacks are left as they are.
+        widen: let modules have further inputs after those that were saved: columns that a saved matrix lacks are 0,
+            so that they change nothing at first, and buffers that it lacks are left as they are.
 
     Raises:
         CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, names, shapes or

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from symphony.agents.agent import Agent
+from symphony.agents.agent import Agent, read_spec
 from symphony.agents.checkpoint import latest, load_checkpoint, parts_of
 from symphony.agents.choice import choose, split_name
-from symphony.config import RunConfig, read_json
+from symphony.config import AgentSpec, RunConfig, read_json
 from symphony.errors import ConfigError
 
 FREE = (
@@ -57,13 +57,25 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
 
 
 def warm_start(agent: Agent, run: Path) -> None:
-    """Take over the networks that another run has too; inputs that they had not change nothing at first.
+    """Take over the networks that another run has too; personas that they had not change nothing at first.
 
     Raises:
         ConfigError: if there is no such run.
         CheckpointError: if its networks have other shapes.
     """
-    source = choose(*split_name(str(run)))
+    folder, which = split_name(str(run))
+    source = choose(folder, which)
     there = parts_of(source)
     shared = {name: module for name, module in agent.modules.items() if name in there}
-    load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=True)
+    widen = agent.spec is not None and _only_personas(read_spec(folder), agent.spec)
+    load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=widen)
+
+
+def _only_personas(before: AgentSpec, after: AgentSpec) -> bool:
+    """Whether personas are all that is new to the networks, and come after all that they knew.
+
+    Any other input would stand before inputs that are learned already, whose weights it would get.
+    """
+    told = dataclasses.replace(before.agent, persona=True, interactive=after.agent.interactive)
+    alike = told == after.agent and before.goals == after.goals and before.action_space == after.action_space
+    return alike and not before.agent.persona and after.agent.features != "road"
