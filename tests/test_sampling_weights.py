@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_runs import tiny
 from symphony import keys
 from symphony.config import SamplingConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, ObservationConfig
 from symphony.errors import ConfigError, DataError
+from symphony.recipes import train
 from symphony.simulation import SceneDataset
 from symphony.simulation.weights import some_of, state_weights
 
@@ -61,6 +64,20 @@ def test_segments_that_went_badly_come_in_proportion(tmp_path: Path) -> None:
     assert copy.draw(8, rng(1)) == data.draw(8, rng(1))
     # Without a share of them all is drawn as without a record.
     assert dataset(SamplingConfig(hard=record, share=0.0)).draw(8, rng(1)) == dataset().draw(8, rng(1))
+
+
+def test_a_run_does_not_go_on_with_another_record(tmp_path: Path) -> None:
+    store = SegmentStore(builtin_store("train"))
+    record = record_of(store, tmp_path / "hard.json", {store.ids[0]: 1.0, store.ids[1]: 2.0})
+    sampling = SamplingConfig(hard=record)
+    config = tiny("bc", store.path, tmp_path / "run", sampling=sampling)
+    train(config)
+    more = replace(config, steps=config.steps + 2, resume=True)
+    record_of(store, record, {store.ids[0]: 2.0, store.ids[1]: 1.0})
+    with pytest.raises(DataError, match="record of hard ones"):
+        train(more)
+    record_of(store, record, {store.ids[0]: 1.0, store.ids[1]: 2.0})
+    train(more)
 
 
 def test_records_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
@@ -138,6 +139,12 @@ class SceneDataset:
         """Actions until the last logged step of the longest segment, or up to the duration."""
         longest = int(self.store.num_steps[self.indices].max()) - 1
         return min(longest, round(self.duration / self.dt)) if self.duration else longest
+
+    def checksum(self) -> str:
+        """Of the store, and of the record that says which segments are hard, if there is one."""
+        if self._hard is None:
+            return self.store.checksum()
+        return hashlib.sha256(self.store.checksum().encode() + self._hard.numpy().tobytes()).hexdigest()
 
     def segment(self, i: int) -> RunSegment:
         """The run segment behind item ``i``, up to the duration."""

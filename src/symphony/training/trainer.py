@@ -85,7 +85,7 @@ class Trainer:
         self.best: Best | None = None
         self.progress = _progress(shown=processes.leads)
         self.tracker: Tracker | None = None
-        self.checksum = data.store.checksum()
+        self.checksum = data.checksum()
         self.done = checkpoint_to_resume(config)
         if config.warm_start is not None and self.done is None:
             warm_start(agent, config.warm_start)
@@ -298,8 +298,8 @@ class Trainer:
             )
         if extra.get("data", self.checksum) != self.checksum:
             raise DataError(
-                f"not the run segments that {self.config.out} learned from so far: checksum {self.checksum[:12]}, "
-                f"then {str(extra['data'])[:12]}",
+                f"not the run segments, or the record of hard ones, that {self.config.out} learned from so far: "
+                f"checksum {self.checksum[:12]}, then {str(extra['data'])[:12]}",
                 file=self.data.store.path,
             )
         self.best = Best.of(extra)
