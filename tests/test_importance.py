@@ -19,17 +19,20 @@ from torch import Tensor
 from helpers_collectors import STREAM, Policy, Walk, X, starts
 from helpers_saved import played
 from helpers_segments import crossing
+from symphony import keys
 from symphony.agents import load_agent
 from symphony.collectors import BeamSearchResult, KeepBest, Systematic, beam_search
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
+from symphony.envs import Bicycle, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import evaluate_dataset
 from symphony.evaluation.report import Report, add_segment
+from symphony.simulation import SceneDataset
 from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.driving import simulated
-from symphony.simulation.importance import BRAKING, cut_in, hard_braking
+from symphony.simulation.importance import BRAKING, Tilt, cut_in, hard_braking
 from symphony.simulation.saved_tensors import KEY, read_tensors, tensors_of
 from symphony.simulation.saving import save_simulation
 
@@ -153,6 +156,31 @@ def test_who_comes_closely_in_front_of_another_from_the_side_cuts_in() -> None:
         ((-10.0, 2.5, 0.0, 10.0), (-8.0, 1.9, 0.0, 10.0)),
     ):
         assert not cut_in(states(follower, before), states(follower, after), SIZE, 0.2).any()
+
+
+@pytest.mark.parametrize("driver", [0, 1])
+def test_branches_are_lifted_where_it_happens_to_a_driven_agent_that_is_there(driver: int) -> None:
+    scenes = SceneDataset(SegmentStore(builtin_store("test"))).scenes([0])
+    env = DrivingEnv(scenes, Bicycle(), ObservationConfig.nothing())
+    record = env.step(env.rand_action(env.start(torch.zeros(3, dtype=torch.int64))))
+    for key in (keys.VALID, ("next", *keys.VALID)):
+        record.set(key, torch.ones_like(record.get(key)))
+    state = record[keys.STATE].clone()
+    state[..., 3] = 20.0
+    after = state.clone()
+    after[1, driver, 3] -= 1.1 * BRAKING * env.dt  # in the second branch only
+    record.set(keys.STATE, state).set(("next", *keys.STATE), after)
+
+    def lifts(changed: TensorDictBase, *, ego: bool = True) -> list[float]:
+        return Tilt(env, 2.0, "hard_braking", ego=ego)([changed]).tolist()
+
+    assert lifts(record) == [0.0, 2.0, 0.0]
+    assert lifts(record, ego=False) == [0.0, 2.0 * driver, 0.0]
+    gone = record.clone()
+    gone[("next", *keys.VALID)][:, driver] = False
+    late = record.clone().set(keys.STEP, scenes.last_step.expand(3)[:, None])
+    for nothing in (gone, late):
+        assert lifts(nothing) == [0.0, 0.0, 0.0]
 
 
 def test_weights_are_kept_with_rollouts_and_the_report_makes_up_for_the_tilt(tmp_path: Path) -> None:

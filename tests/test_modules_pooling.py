@@ -213,13 +213,14 @@ def test_many_sets_of_weights_at_once_give_what_each_gives_alone() -> None:
     parameters, _ = torch.func.stack_module_state(networks)
     encoder = networks[0]
 
-    def pooled(weights: dict[str, Tensor]) -> Tensor:
+    def pooled(weights: dict[str, Tensor], seen: Tensor) -> Tensor:
         def function(x: Tensor) -> Tensor:
             return torch.func.functional_call(encoder, weights, (x,))
 
-        return in_blocks(nn.ReLU(), pool_elements(function, elements, mask, mode="winner"))
+        return in_blocks(nn.ReLU(), pool_elements(function, elements, seen, mode="winner"))
 
     with torch.no_grad():
-        together = torch.func.vmap(pooled)(parameters)
-        for network, found in zip(networks, together, strict=True):
-            torch.testing.assert_close(found, pool_elements(network, elements, mask, mode="dense").relu())
+        masks = torch.stack([mask, ~mask, torch.ones_like(mask)])
+        together = torch.func.vmap(pooled)(parameters, masks)
+        for network, seen, found in zip(networks, masks, together, strict=True):
+            torch.testing.assert_close(found, pool_elements(network, elements, seen, mode="dense").relu())

@@ -59,6 +59,9 @@ class ItemCache(Generic[T]):
     def __len__(self) -> int:
         return len(self._kept)
 
+    def __contains__(self, item: int) -> bool:
+        return item in self._kept
+
     def __call__(self, item: int) -> T:
         """What belongs to one item."""
         return self.many([item])[0]
