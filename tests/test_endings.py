@@ -192,6 +192,22 @@ def test_pictures_of_unknown_kinds_are_refused_before_the_work(
     assert "must end in" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--json", "--figure"])
+@pytest.mark.parametrize(("place", "complaint"), [("file/a.png", "can't be written"), ("folder", "is a folder")])
+def test_places_for_results_are_tried_before_the_work(
+    option: str, place: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    # There is no store: whoever got to work would complain of that.
+    given = ["evaluate", "playback", "--data", str(tmp_path / "no-store"), option, str(tmp_path / place)]
+    assert main(given) == 1
+    told = capsys.readouterr().err
+    assert place.partition("/")[0] in told
+    assert complaint in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
 def test_folders_of_killed_simulations_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     old = time.time() - 2 * process.SETTLED

@@ -46,6 +46,24 @@ def replacing(path: Path) -> Iterator[Path]:
             draft.unlink(missing_ok=True)
 
 
+def check_writable(path: Path) -> None:
+    """See now, before work that takes long, that a file can be written in the end. Makes its folder.
+
+    Raises:
+        DataError: it can't; names the file.
+    """
+    place = Path(os.path.realpath(path))
+    with naming(path):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if place.is_dir():
+            raise DataError("is a folder; name a file", file=path)
+        if place.exists() and not place.is_file():  # a terminal, a pipe
+            return
+        draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
+        draft.touch()
+        draft.unlink()
+
+
 def _remove_left(place: Path) -> None:
     """Drafts of this file by processes that were killed."""
     if os.name != "posix":  # elsewhere there is no asking whether a process lives

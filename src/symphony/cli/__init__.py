@@ -37,10 +37,14 @@ from symphony.cli import (
     wosac,
 )
 from symphony.errors import ConfigError, DataWarning, SymphonyError, printable
+from symphony.files import check_writable
 
 __all__ = ["main"]
 
 FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+
+RESULTS = ("json", "figure")
+"""Fields of commands: files that are written once everything is done."""
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
@@ -96,7 +100,15 @@ def main(args: Sequence[str] | None = None) -> int:
         return _guarded(lambda: None) or int(stop.code or 0)
     except BrokenPipeError:
         return _guarded(_gone)
-    return _guarded(command.run)
+
+    def run() -> None:
+        for name in RESULTS:
+            path = getattr(command, name, None)
+            if path is not None and str(path) != "-":
+                check_writable(path)
+        command.run()
+
+    return _guarded(run)
 
 
 def _gone() -> None:
