@@ -31,7 +31,7 @@ TESTED = {
     "geometry.frames": "test_geometry_frames.py",
     "geometry.polylines": "test_geometry_polylines.py",
     "collectors.rules": "test_collectors_rules.py",
-    "collectors.beam_search": "test_collectors_beam_search.py",
+    "collectors.beam_search": "test_collectors_beam_search.py test_importance.py",
     "collectors.result": "test_collectors_beam_search.py",
     "collectors.scores": "test_collectors_beam_search.py",
     "objectives.bc": "test_objectives_bc.py",
@@ -43,7 +43,7 @@ TESTED = {
     "metrics.kinds": "test_metrics_kinds.py",
     "metrics.agents": "test_metrics_agents.py",
 }
-"""Modules of ``symphony`` and the tests that are to notice."""
+"""Modules of ``symphony`` and the files of tests that are to notice."""
 SECONDS = 300
 """CPU time that the tests may take with a change: one that makes them go on for ever is noticed, too."""
 QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
@@ -132,10 +132,11 @@ def noticed(module: ModuleType, number: int, test: str) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
 
 
-def tests(name: str) -> int:
-    """Run a file of tests quietly."""
+def tests(names: str) -> int:
+    """Run files of tests quietly."""
+    files = [str(ROOT / "tests" / name) for name in names.split()]
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        return int(pytest.main([str(ROOT / "tests" / name), "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
+        return int(pytest.main([*files, "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import subprocess
 import sys
@@ -31,6 +32,7 @@ from symphony.collectors import (
     mean_then_sum,
     with_rows,
 )
+from symphony.collectors.result import ranking
 from symphony.errors import ConfigError
 
 
@@ -287,6 +289,20 @@ def test_marks_of_the_tree():
                 slot = found.slots[row, step // 4, leaf]
                 assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
     assert_close(found.leaf_totals, max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2)))
+
+
+def test_leaves_rank_by_their_total_after_those_of_histories_not_named_yet():
+    generator = torch.Generator().manual_seed(0)
+    totals = torch.randint(3, (4, 5, 6), generator=generator).float()
+    slots = torch.randint(6, (4, 5, 7), generator=generator)
+    found = ranking(totals, slots)
+    for row in itertools.product(range(4), range(5)):
+        names = slots[row].tolist()
+
+        def place(leaf, row=row, names=names):
+            return names[:leaf].count(names[leaf]), float(totals[row][names[leaf]]), leaf
+
+        assert found[row].tolist() == sorted(range(7), key=place)
 
 
 def test_leaves_are_the_best_and_distinct():

@@ -202,6 +202,28 @@ def test_unequal_groups_are_errors(groups):
         group_members(torch.tensor(groups))
 
 
+@pytest.mark.parametrize(
+    ("parents", "complaint"),
+    [
+        ([0, 2, 1], None),
+        ([0, 0, 0], None),
+        ([0, 1, 3], "outside of 0 ... 2"),
+        ([-1, 1, 2], "outside of 0 ... 2"),
+        ([0.0, 1.0, 2.0], "must return int64"),
+        ([0, 1], "must return int64"),
+    ],
+)
+def test_what_rules_of_others_return_is_checked(parents, complaint):
+    def rule(totals, noise):
+        return torch.tensor([parents])
+
+    if complaint is None:
+        assert prune(rule, torch.zeros(1, 3)).tolist() == [parents]
+    else:
+        with pytest.raises(ConfigError, match=complaint):
+            prune(rule, torch.zeros(1, 3))
+
+
 def test_bad_parameters_are_errors():
     for fraction in (0.0, 1.1, math.nan):
         with pytest.raises(ConfigError, match="fraction"):

@@ -127,6 +127,19 @@ def test_touching_boxes_do_not_overlap():
     assert boxes_overlap(here, zero, size, torch.tensor([3.99, 0.0]), zero, size)
 
 
+def test_boxes_that_touch_but_for_rounding_are_as_near_in_single_precision_as_in_double():
+    # Rounding may put a corner inside by one test and outside by another.
+    generator = torch.Generator().manual_seed(0)
+    center, size, other = (torch.rand(20_000, 2, generator=generator) * scale for scale in (100, 4, 4))
+    heading, turn = torch.rand(2, 20_000, generator=generator)
+    size, other = size + 0.5, other + 0.5
+    reach = size[:, 0] + other[:, 0] * turn.cos() + other[:, 1] * turn.sin()
+    way = torch.stack((heading.cos(), heading.sin()), -1) * (reach / 2)[:, None]
+    boxes = (center, heading, size, center + way, heading + turn, other)
+    exact = box_gap(*(value.double() for value in boxes))
+    torch.testing.assert_close(box_gap(*boxes).double(), exact, atol=1e-5, rtol=0)
+
+
 def test_boxes_without_area():
     zero, size, point = torch.tensor(0.0), torch.tensor([4.0, 2.0]), torch.zeros(2)
     assert boxes_overlap(torch.zeros(2), zero, size, torch.tensor([1.0, 0.5]), zero, point)

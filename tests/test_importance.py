@@ -22,6 +22,7 @@ from helpers_segments import crossing
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.collectors import BeamSearchResult, KeepBest, Systematic, beam_search
+from symphony.collectors.beam_search import _tilted
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
@@ -100,6 +101,15 @@ def test_a_tilt_makes_up_for_itself_beside_scores_too() -> None:
     _, error = mean_error(happened(tilted) * weight)
     assert float(happened(tilted).mean()) > usual + 0.02
     assert abs(restored - usual) < 5 * math.hypot(error, usual_error)
+
+
+def test_tilted_odds_times_weights_are_the_odds_without_a_tilt() -> None:
+    generator = torch.Generator().manual_seed(0)
+    totals, lift = 5 * torch.randn(2, 50, 6, generator=generator, dtype=torch.float64)
+    for temperature in (0.3, 1.0, 4.0):
+        tilted, weight = _tilted(totals, lift, temperature)
+        odds = (-tilted / temperature).softmax(-1)
+        torch.testing.assert_close(odds * weight.exp(), (-totals / temperature).softmax(-1))
 
 
 def test_a_tilt_of_nothing_changes_nothing() -> None:
