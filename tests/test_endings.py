@@ -193,7 +193,9 @@ def test_pictures_of_unknown_kinds_are_refused_before_the_work(
 
 
 @pytest.mark.parametrize("option", ["--json", "--figure"])
-@pytest.mark.parametrize(("place", "complaint"), [("file/a.png", "can't be written"), ("folder", "is a folder")])
+@pytest.mark.parametrize(
+    ("place", "complaint"), [("file/a.png", "can't be written"), ("folder", "is a folder")]
+)
 def test_places_for_results_are_tried_before_the_work(
     option: str, place: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

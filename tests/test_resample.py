@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,10 +10,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from helpers_convert import FakeReader
 from helpers_segments import crossing, hide, segments, straight_road
 from symphony.data import resample as resampling
-from symphony.data.resample import resample, smooth
-from symphony.data.segment import RunSegment, content_hash, validate
+from symphony.data.convert import convert
+from symphony.data.resample import hold_lights, resample, smooth
+from symphony.data.segment import RunSegment, SignalState, content_hash, validate
+from symphony.data.sources.base import Item
+from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 
 PER_STEP = ("position", "heading", "velocity", "valid", "signal_state")
@@ -99,6 +105,53 @@ def test_lights_keep_the_latest_logged_state() -> None:
     new = resample(log.replace(signal_state=states), 0.15)
     expected = (np.floor(np.arange(new.num_steps) * 1.5 + 1e-9) % 9).astype(np.uint8)
     np.testing.assert_array_equal(new.signal_state[0], expected)
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 8), min_size=7, max_size=7), min_size=12, max_size=12).map(
+        lambda rows: np.array(rows, np.uint8)
+    )
+)
+@settings(max_examples=30, deadline=None)
+def test_held_lights_are_never_unknown_if_they_were_ever_known(state: NDArray[np.uint8]) -> None:
+    log = crossing(2, steps=7, dt=0.2).replace(signal_state=state)
+    held = hold_lights(log)
+    for before, after in zip(state.tolist(), held.signal_state.tolist(), strict=True):
+        known = [value for value in before if value]
+        for step, value in enumerate(after):
+            past = [known_before for known_before in before[: step + 1] if known_before]
+            assert value == (past[-1] if past else known[0] if known else SignalState.UNKNOWN)
+    assert held.signal_state.dtype == log.signal_state.dtype
+    assert content_hash(hold_lights(held)) == content_hash(held)
+    assert content_hash(held.replace(signal_state=state)) == content_hash(log)
+
+
+class FlashOfLight(FakeReader):
+    """Crossings that show their lights at one step that 5 Hz does not keep."""
+
+    name = "flash"
+
+    def _read(self, path: Path) -> Iterator[Item]:
+        log = crossing(steps=91, dt=0.1)
+        state = np.zeros_like(log.signal_state)
+        state[:, 7] = SignalState.GO
+        yield log.replace(signal_state=state)
+
+
+def test_a_conversion_can_hold_lights_and_says_where_they_are_hardly_known(tmp_path: Path) -> None:
+    (tmp_path / "a.scene").touch()
+    stores = {hold: tmp_path / str(hold) for hold in (False, True)}
+    reports = {
+        hold: convert(FlashOfLight(), [tmp_path], out, hold_lights=hold) for hold, out in stores.items()
+    }
+    states = {hold: SegmentStore(out)[0].signal_state for hold, out in stores.items()}
+    assert (states[True] == SignalState.GO).all()
+    assert (states[False] == SignalState.GO).sum(1).tolist() == [1] * len(states[False])
+    assert reports[True].settings["hold_lights"] is True
+    assert "hold_lights" not in reports[False].settings
+    told = {hold: " ".join(report.odd) for hold, report in reports.items()}
+    assert "--hold-lights" in told[False]
+    assert not told[True]
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, float("nan"), float("inf")])

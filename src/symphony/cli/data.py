@@ -61,6 +61,9 @@ class Convert:
     districts, whose maps would exceed the paper's limit (ScenarioNet)."""
     exclude_overlaps: bool = False
     """Leave out segments in whose log a moving vehicle's box overlaps another box."""
+    hold_lights: bool = False
+    """Give lights the last state that the log knows (before the first: the first) where it knows none, instead of
+    `unknown`: for scenes that show their lights at a single step (see docs/datasets.md)."""
     append: bool = False
     """Add to a store that exists; what it holds already is left as it is."""
     workers: int = 1
@@ -126,6 +129,7 @@ class Convert:
                     engine=self.engine,
                     exclude_overlaps=self.exclude_overlaps,
                     radius=self.radius,
+                    hold_lights=self.hold_lights,
                     reader_options=self._options(),
                     progress=show,
                 )

@@ -151,8 +151,15 @@ def oddities(segment: RunSegment) -> list[str]:
         f"a time step outside {ODD_DT[0]:g} to {ODD_DT[1]:g} s": not ODD_DT[0] <= s.dt <= ODD_DT[1],
         "a heading that has turned more than 4 times": _largest(s.heading[seen]) > ODD_HEADING,
         f"a map that reaches beyond {ODD_FAR / 1000:g} km": max(map(_largest, points)) > ODD_FAR,
+        "lights known for less than half of the time (see --hold-lights)": _now_and_then(s.signal_state),
     }
     return [what for what, applies in found.items() if applies]
+
+
+def _now_and_then(state: NDArray[np.integer[Any]]) -> bool:
+    """Whether lights [K, T] that have a state at some step have none (0) at most others."""
+    share = (state != 0).mean(1)
+    return bool(((share > 0) & (share < 0.5)).any())
 
 
 def _jumps(s: RunSegment) -> NDArray[np.float64]:

@@ -60,6 +60,7 @@ def convert(
     append: bool = False,
     exclude_overlaps: bool = False,
     radius: float | None = None,
+    hold_lights: bool = False,
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
@@ -84,6 +85,7 @@ def convert(
         exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`); they
             are counted either way.
         radius: metres around the ego's path that are kept, of map and agents; None for all.
+        hold_lights: give lights the last state that the log knows (before the first: the first) where it knows none.
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
             depend on it.
@@ -108,6 +110,7 @@ def convert(
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
     settings |= {} if radius is None else {"radius": radius}
+    settings |= {"hold_lights": True} if hold_lights else {}
     paths = expand(files, reader.patterns)
     draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
     with closing(draft):
@@ -115,7 +118,7 @@ def convert(
         try:
             if not draft.finished:
                 recipe = Preparation(
-                    reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius
+                    reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius, hold_lights
                 )
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:

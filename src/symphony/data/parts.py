@@ -69,6 +69,7 @@ class Preparation:
         before: path of the store that is added to, and the segments it held; their ids are passed over.
         exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
         radius: metres around the ego's path that are kept (see :mod:`symphony.data.crop`); None for all.
+        hold_lights: keep the state of lights where the log has none.
     """
 
     reader: Reader
@@ -78,6 +79,7 @@ class Preparation:
     before: tuple[str, int] | None = None
     exclude_overlaps: bool = False
     radius: float | None = None
+    hold_lights: bool = False
 
     def outcomes(self, path: str) -> Iterator[Outcome]:
         """One for each record of a file, in its order."""
@@ -94,6 +96,8 @@ class Preparation:
         try:
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
+            if self.hold_lights:
+                segment = resampling.hold_lights(segment)
             segment = resampling.resample(segment, self.dt)
             if self.radius is not None:
                 segment = crop(segment, self.radius)

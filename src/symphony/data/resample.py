@@ -1,4 +1,4 @@
-"""Changing a run segment's time step, and smoothing noisy logs.
+"""Changing a run segment's time step, smoothing noisy logs, and filling in lights.
 
 Both are choices of the one who prepares the data; readers keep to the log.
 """
@@ -74,6 +74,19 @@ def _picked_lights(state: NDArray[Any], every: int) -> NDArray[Any]:
         before = state[:, every - back :: every][:, : later.shape[1]]
         later[later == SignalState.UNKNOWN] = before[later == SignalState.UNKNOWN]
     return found
+
+
+def hold_lights(segment: RunSegment) -> RunSegment:
+    """Lights with the last state that the log knows, where it knows none, and with the first before that.
+
+    For logs that show lights at a single step: an agent that has never met an unknown light may wait at it for ever.
+    """
+    state = segment.signal_state
+    known = state != SignalState.UNKNOWN
+    steps = np.arange(state.shape[1])
+    last = np.maximum.accumulate(np.where(known, steps, -1), axis=1)
+    source = np.where(last < 0, known.argmax(1)[:, None], last)
+    return segment.replace(signal_state=np.take_along_axis(state, source, axis=1))
 
 
 def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
