@@ -431,6 +431,14 @@ def test_score_of_a_module_leaves_no_trace():
         search(start, score=KeyScore("nothing"))
 
 
+@pytest.mark.parametrize("shape", [(3,), (3, 1), (3, 2), (3, 1, 1), (3, 2, 1)])
+def test_scores_of_any_usual_shape_become_one_number_per_agent(shape):
+    # Of three branches: without agents, with one or two, and with a last dimension as TorchRL's rewards have it.
+    values = torch.rand(5, *shape)
+    td = TensorDict({"score": values}, [5, 3])
+    assert torch.equal(KeyScore("score")(td), values.reshape(5, 3, -1))
+
+
 def test_padded_agents_do_not_count():
     td = TensorDict({"score": torch.tensor([[1.0, torch.nan]]), "valid": torch.tensor([[True, False]])}, [1])
     assert KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]

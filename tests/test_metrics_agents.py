@@ -84,6 +84,10 @@ def test_segments_add_up_whatever_the_batch(seed: int, first: int, second: int) 
     apart = [result for part in cut for result in agent_results(part)]
     together = agent_results(whole)
     assert totals(apart) == totals(together)
+    alone = [agent_rates([result]) for result in together]  # errors are over segments, or groups of them
+    for name, (total, weight) in agent_rates(together).items():
+        assert total.tolist() == [float(rates[name][0].item()) for rates in alone]
+        assert weight.tolist() == [float(rates[name][1].item()) for rates in alone]
     assert speed_distance(apart) == speed_distance(together)
 
 

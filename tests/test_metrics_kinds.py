@@ -10,7 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from symphony.geometry import box_corners, rotate
 from symphony.metrics import CollisionKind, CollisionKinds, RolloutMetrics, collision_kinds, collisions
+from symphony.metrics.kinds import _Poses, _separations
 
 KIND = CollisionKind
 STEPS, DT = 10, 0.2
@@ -248,6 +250,35 @@ def test_flags_that_are_not_those_of_the_states_are_refused():
         collision_kinds(**{**inputs, "collided": flags})
     with pytest.raises(ValueError, match="stands for no agent"):
         collision_kinds(**{**inputs, "collided": flags.flip(0)})
+
+
+def test_of_several_that_do_not_touch_the_farthest_is_named():
+    far, near = stage(EGO, (12, 30, 0, 2), subjects=(0, -1)), stage(EGO, (12, 20, 0, 2), subjects=(0, -1))
+    both = {key: torch.stack((near[key], far[key])) for key in near}
+    both["collided"] = torch.zeros(2, 2, STEPS, dtype=torch.bool)
+    both["collided"][:, 0, 3] = True
+    with pytest.raises(ValueError, match=r"28\.\d+ m away from all others"):
+        collision_kinds(**both)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_gaps_along_and_across_are_those_of_the_corners(seed):
+    generator = torch.Generator().manual_seed(seed)
+    position, size = (torch.rand(2, 50, 2, generator=generator, dtype=torch.float64) * k for k in (20, 6))
+    heading = torch.rand(2, 50, generator=generator, dtype=torch.float64) * 1.5
+    poses = [
+        _Poses(position[k], heading[k], torch.zeros(50, 2), torch.ones(50, dtype=torch.bool)) for k in (0, 1)
+    ]
+    found = torch.stack(_separations(*poses, *size))
+    mean = heading.mean(0)
+    corners = [rotate(box_corners(position[k], heading[k], size[k]), -mean[:, None]) for k in (0, 1)]
+    middle = rotate(position, -mean)
+    for axis in (0, 1):
+        reach = sum((corners[k][..., axis] - middle[k, :, None, axis]).amax(-1) for k in (0, 1))
+        away = middle[1, :, axis] - middle[0, :, axis]
+        torch.testing.assert_close(found[1 + axis], away.abs() - reach)
+    torch.testing.assert_close(found[0], middle[1, :, 0] - middle[0, :, 0])
 
 
 @pytest.mark.parametrize("name", ["state", "exists", "subject", "log_state", "log_valid", "size"])

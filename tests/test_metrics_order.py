@@ -73,6 +73,23 @@ def test_steps_that_are_not_valid_do_not_count() -> None:
     assert gap(along_x(4.0), wild, second_valid=TIME < 7.0) == gap(along_x(4.0), along_y(6.0))
 
 
+def test_the_last_moment_counts() -> None:
+    # The second is within reach of the origin at the very end only, 1.4 m from it.
+    end = float(TIME[-1])
+    mine, theirs = along_x(end - 1.0, 3.0), along_y(end + 1.4 / 3, 3.0)
+    assert gap(mine, theirs) > 0
+    assert math.isnan(gap(mine, theirs, second_valid=end > TIME))
+
+
+def test_a_path_does_not_go_from_where_it_was_seen_to_its_padding() -> None:
+    # Straight from the one place it was seen at to zeros, it would meet the other at the origin.
+    once = torch.zeros_like(EVERY)
+    once[20] = True
+    apart = along_y(6.0)
+    apart[20] = torch.tensor([0.0, -6.0])
+    assert math.isnan(gap(along_x(4.0), apart, second_valid=once))
+
+
 def test_both_at_once() -> None:
     assert gap(along_x(5.0), along_y(5.0)) == 0
 

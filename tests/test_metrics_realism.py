@@ -126,6 +126,9 @@ def test_offroad_of_a_car_at_the_kerb():
     size = torch.tensor([[[4.0, 1.8]] * 3]).double()
     assert offroad(position, *edge).tolist() == [[False, False, True]]
     assert offroad(position, *edge, heading=heading, size=size).tolist() == [[False, True, True]]
+    assert not offroad(
+        torch.tensor([[[50.0, 0.0], [0.0, 5.0], [0.0, 0.0]]]).double(), *edge
+    ).any()  # on the edge
     with pytest.raises(ValueError, match="heading and size"):
         offroad(position, *edge, size=size)
 

@@ -207,6 +207,12 @@ def test_bad_arguments_are_refused(arguments, message):
         DistillationLoss(categorical_actor(), **arguments)
 
 
+def test_rollouts_of_no_weight_leave_the_loss_of_the_experts():
+    td = batch(5)
+    found = DistillationLoss(categorical_actor(), rollout_weight=0.0)(td)
+    torch.testing.assert_close(found["loss_distillation"], found["nll_expert"])
+
+
 def test_bad_inputs_are_refused():
     loss, td = DistillationLoss(categorical_actor(), survivors="best"), batch(5)
     td[RANK] = td[RANK][:, :1]
