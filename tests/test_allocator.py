@@ -65,8 +65,31 @@ def test_nothing_happens_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_sets_it_for_a_process_of_its_own_only(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
     monkeypatch.setattr(allocator, "tune", lambda: calls.append(1))
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     assert cli.main(["--version"]) == 0
     assert calls == []
+    assert "OMP_WAIT_POLICY" not in os.environ
     monkeypatch.setattr(sys, "argv", ["symphony", "--version"])
     assert cli.main() == 0
     assert calls == [1]
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    assert cli.main() == 0
+    assert os.environ["OMP_WAIT_POLICY"] == "active"
+
+
+def test_threads_wait_as_the_command_has_set_it() -> None:
+    given = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    script = "import sys; from symphony.cli import main; sys.argv = ['symphony', 'doctor']; main()"
+    # The library tells what it was loaded with.
+    shown = subprocess.run(
+        [sys.executable, "-c", script],
+        env=given | {"OMP_DISPLAY_ENV": "true"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    told = shown.stdout + shown.stderr
+    if "OMP_WAIT_POLICY = '" not in told:
+        pytest.skip("this torch has another library of threads")
+    assert "OMP_WAIT_POLICY = 'PASSIVE'" in told

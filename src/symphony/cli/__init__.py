@@ -79,7 +79,7 @@ def main(args: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 143 terminated.
     """
     if args is None:
-        allocator.tune()  # only where the process is ours
+        settle()
         args = sys.argv[1:]
     args = list(args)
     if args == ["--version"]:
@@ -109,6 +109,13 @@ def main(args: Sequence[str] | None = None) -> int:
         command.run()
 
     return _guarded(run)
+
+
+def settle() -> None:
+    """Settings of a process that is ours alone, before it loads torch; those of the user take precedence."""
+    allocator.tune()
+    # Threads of OpenMP that spin while they wait take the cores of a busy machine.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def _gone() -> None:

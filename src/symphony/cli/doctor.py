@@ -72,7 +72,7 @@ def examined() -> dict[str, Any]:
         "extras": {name: _extra(module, package) for name, (module, package) in EXTRAS.items()},
         "torch": {
             "threads": torch.get_num_threads(),
-            "OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "not set; passive is faster on few cores"),
+            "OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "not set"),
             "CUDA devices": devices or "none",
         },
         "agents": {"included": ", ".join(pretrained_names())},

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from symphony.cli import settle
 from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
 from symphony.cli.profiles import WORDS, expanded
 from symphony.config import EvaluateConfig, Method, Profile, TrainConfig
@@ -30,6 +31,8 @@ class Arguments:
 
 def run(method: Method, description: str | None, args: Sequence[str] | None = None) -> None:
     """Run the recipe of a method with command-line arguments, by default those of the process."""
+    if args is None:
+        settle()
     from symphony.agents import load_agent
     from symphony.data.store import SegmentStore
     from symphony.evaluation.records import evaluation_record, keep_evaluation
