@@ -22,7 +22,7 @@ from symphony.envs.observation import objects_at
 from symphony.envs.points import nearest_points, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.tables import Tables
-from symphony.geometry import NO_BOUNDARY
+from symphony.geometry import NO_BOUNDARY, segments_of
 from symphony.geometry.grid import edge_grid, point_grid
 from symphony.geometry.nearest import nearest, smallest
 
@@ -120,6 +120,55 @@ def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) 
     cells = tables.edge_grids(1)
     assert cells is not None
     assert 0.3 < (cells.sign != 0).mean() < 1
+
+
+@pytest.mark.usefixtures("at_once")
+@pytest.mark.parametrize("reach", [0.3, 2.0])
+def test_cells_that_edges_pass_through_have_no_side(scenes: SceneBatch, reach: float) -> None:
+    # Where a cell's side could be wrong: beside edges of every direction and around their corners.
+    rng = torch.Generator().manual_seed(5)
+    row = torch.arange(len(scenes) - 1)
+    start, end = scenes.edge_start[:-1], scenes.edge_end[:-1]
+    share = torch.rand(*start.shape[:2], 12, 1, generator=rng).round(decimals=1)  # some at the ends
+    along = start[:, :, None] + share * (end - start)[:, :, None]
+    where = (along + reach * torch.randn(along.shape, generator=rng)).flatten(1, 2)
+    tables = Tables(scenes, FEW)
+    flags = offroad_flags(scenes, row, where, tables)
+    expected = oracle.road_distance(scenes, row, where)
+    sure = expected.abs() > 1e-4
+    assert torch.equal(flags[sure], (expected > 0)[sure])
+
+
+@pytest.mark.usefixtures("at_once")
+@pytest.mark.parametrize("seed", range(4))
+def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rings = [
+        np.array([[90, 90], [110, 91], [90, 92], [90, 90]], float)[:: rng.choice([-1, 1])]
+    ]  # the first edge's are acute
+    for centre in rng.uniform(-80, 80, (12, 2)):
+        angle = np.sort(rng.uniform(0, 2 * np.pi, 7)) + np.linspace(0, 0.1, 7)
+        ring = centre + rng.uniform(1, 20, (7, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
+        rings.append(np.concatenate([ring, ring[:1]])[:: rng.choice([-1, 1])])
+    start, end, previous, following = segments_of(np.concatenate(rings), np.cumsum([0, *map(len, rings)]))
+    given = scene(straight_road())
+    given = given.replace(
+        edge_start=torch.from_numpy(start)[None].float(),
+        edge_end=torch.from_numpy(end)[None].float(),
+        edge_valid=torch.ones(1, len(start), dtype=torch.bool),
+        edge_previous=torch.from_numpy(previous)[None],
+        edge_following=torch.from_numpy(following)[None],
+    )
+    batch, row = collate([given]), torch.zeros(1, dtype=torch.int64)
+    corner = torch.from_numpy(start).float().repeat(60, 1)
+    where = (corner + 1.5 * torch.from_numpy(rng.normal(size=corner.shape)).float())[None]
+    tables = Tables(batch, FEW)
+    expected = oracle.road_distance(batch, row, where)
+    sure = expected.abs() > 1e-3
+    assert torch.equal(offroad_flags(batch, row, where, tables)[sure], (expected > 0)[sure])
+    cells = tables.edge_grids(1)
+    assert cells is not None
+    assert (cells.sign != 0).any()
 
 
 @pytest.mark.usefixtures("at_once")
@@ -228,6 +277,8 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
     np.testing.assert_array_equal(found, expected)
     index, finite = nearest(torch.from_numpy(values), count)
     assert index.shape == finite.shape == (rows, count)
+    deep = nearest(torch.from_numpy(values)[None, :, None], count)
+    assert all(torch.equal(more[0, :, 0], one) for more, one in zip(deep, (index, finite), strict=True))
     known = np.isfinite(values[np.arange(rows)[:, None], expected])
     np.testing.assert_array_equal(finite[:, : expected.shape[1]], known)
     assert not finite[:, expected.shape[1] :].any()
