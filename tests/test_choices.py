@@ -79,6 +79,16 @@ def test_a_single_sample_has_no_error() -> None:
     assert math.isnan(found.error)
 
 
+def test_of_two_samples_the_error_is_half_the_difference_of_what_each_says() -> None:
+    counts, log = np.array([[3, 1], [1, 5]]), np.array([[1, 0], [1, 1]])
+    found = sampled_divergence(counts, log)
+    whole = float(jensen_shannon(counts.sum(0), log.sum(0)))
+    each = [2 * whole - float(jensen_shannon(counts[k], log[k])) for k in (1, 0)]
+    assert found.value == pytest.approx(whole)
+    assert found.corrected == pytest.approx(sum(each) / 2)
+    assert found.error == pytest.approx(abs(each[0] - each[1]) / 2)
+
+
 @pytest.mark.parametrize("segments", [50, 200])
 def test_the_floor_is_what_another_log_scores(segments: int) -> None:
     rng = np.random.default_rng(segments)
@@ -152,6 +162,8 @@ def test_turns_do_not_depend_on_where_a_route_lies(turn: float, angle: float, sh
     wanted = 0 if abs(angle) < math.radians(45) else int(np.sign(angle))
     assert (route_turns(routes, count) - 1).tolist() == [wanted, -wanted]
     assert (route_turns(moved, count) - 1).tolist() == [wanted, -wanted]
+    both = route_turns(torch.stack([routes, routes.flip(0)]).expand(3, 2, 2, -1, -1), count.expand(3, 2, 2))
+    assert (both - 1).tolist() == 3 * [[[wanted, -wanted], [-wanted, wanted]]]
     # What lies past the end of a route is no part of it.
     assert route_turns(routes, torch.tensor([9, 9])).tolist() == [1, 1]
 
