@@ -48,7 +48,7 @@ TESTED = {
     "metrics.agents": "test_metrics_agents.py",
     "metrics.choices": "test_choices.py",
     "metrics.curvature": "test_metrics_summary.py test_choices.py",
-    "metrics.summary": "test_metrics_summary.py",
+    "metrics.summary": "test_metrics_summary.py test_metrics_kinds.py",
     "metrics.wosac.boxes": "test_wosac_features.py test_wosac_parity.py",
     "metrics.wosac.composite": "test_wosac_scoring.py",
     "metrics.wosac.estimators": "test_wosac_scoring.py test_wosac_parity.py",

@@ -327,6 +327,11 @@ def test_in_the_table_kinds_sum_to_the_collision_rate():
     rear = (kind == KIND.REAR_ENDED) & playback
     assert numbers["collision_rear_ended_by_playback"] == pytest.approx(100 * float(rear.double().mean()))
     assert numbers["collision_crossing_se"] > 0
+    rows = whole.rows()
+    shares = [pair[1].double().mean() for pair in found]
+    assert np.mean([row["collision_with_playback"] for row in rows]) == pytest.approx(
+        100 * float(sum(shares) / len(shares))
+    )
 
 
 def test_the_table_refuses_kinds_of_other_collisions_or_for_a_part():

@@ -242,6 +242,10 @@ def test_errors_over_groups_by_hand():
     for group, hits in zip(groups, collided, strict=True):
         totals[int(group[1])] += 100 * hits
         weights[int(group[1])] += 4
+    named = dict(zip(inputs["segment_ids"], groups, strict=True))
+    assert {row["segment"]: row["group"] for row in metrics.rows()} == {name: name for name in named}
+    grouped = scored(inputs | {"groups": groups})
+    assert {row["segment"]: row["group"] for row in grouped.rows()} == named
     residual = totals - found["collision_rate"] * weights
     expected = np.sqrt(3 / 2 * (residual**2).sum()) / weights.sum()
     assert found["collision_rate_se"] == pytest.approx(expected)
