@@ -53,7 +53,7 @@ from results_users import (
 
 PAGES = (
     "README.md",
-    *(f"docs/{name}.md" for name in ("results", "appendix", "wosac", "planners", "rollouts")),
+    *(f"docs/{name}.md" for name in ("results", "roads", "appendix", "wosac", "planners", "rollouts")),
 )
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
