@@ -230,6 +230,22 @@ def test_broken_submissions(tmp_path: Path, change: Callable[[list[Shard]], None
         assert "wrong.tar.gz" in problem
 
 
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        (META.account_name, "account_name"),
+        (META.num_model_parameters, "num_model_parameters"),
+        (META.affiliation, "affiliation"),
+        ("cccc", "scenario_id"),
+    ],
+)
+def test_text_that_is_not_utf8_is_named(text: str, field: str, tmp_path: Path) -> None:
+    bad = b"\xff" + text.encode()[1:]
+    shards = {name: data.replace(text.encode(), bad) for name, data in named(good_shards()).items()}
+    found = problems(pack(tmp_path / "wrong.tar.gz", shards))
+    assert any(f"field {field}: " in problem and "is not UTF-8" in problem for problem in found), found
+
+
 def test_without_the_scenarios_rollouts_are_compared_with_each_other(tmp_path: Path) -> None:
     shards = good_shards()
     assert problems(pack(tmp_path / "good.tar.gz", named(shards)), None) == []

@@ -38,7 +38,9 @@ def meta_message(meta: SubmissionMeta) -> pb.SimAgentsChallengeSubmission:
 
 def meta_problems(message: pb.SimAgentsChallengeSubmission) -> list[tuple[str, str]]:
     """(field, what is wrong with it) of a submission's metadata."""
-    found = []
+    found = [(name, "is not UTF-8") for name in _not_text(message)]
+    if found:
+        return found
     if message.submission_type != SIM_AGENTS:
         found.append(("submission_type", f"is {message.submission_type}, expected {SIM_AGENTS} (sim agents)"))
     if "@" not in message.account_name:
@@ -60,6 +62,13 @@ def meta_problems(message: pb.SimAgentsChallengeSubmission) -> list[tuple[str, s
     if not message.acknowledge_complies_with_closed_loop_requirement:
         found.append(("acknowledge_complies_with_closed_loop_requirement", "not acknowledged"))
     return found
+
+
+def _not_text(message: pb.SimAgentsChallengeSubmission) -> list[str]:
+    """Fields of text that the message was given other bytes for, which it keeps as they are."""
+    texts = [(field.name, value) for field, value in message.ListFields() if field.type == field.TYPE_STRING]
+    several = ((name, [value] if isinstance(value, str | bytes) else value) for name, value in texts)
+    return [name for name, values in several if any(isinstance(value, bytes) for value in values)]
 
 
 def shard_name(shard: int, shards: int) -> str:

@@ -219,7 +219,10 @@ def _scenario_problems(
     seen: set[str],
     required: Mapping[str, frozenset[int]] | None,
 ) -> Iterator[DataError]:
-    name = scenario.scenario_id
+    name: str | bytes = scenario.scenario_id
+    if not isinstance(name, str):
+        yield DataError(f"{name!r} is not UTF-8", file=where, field="scenario_id")
+        return
 
     def problem(message: str, what: str) -> DataError:
         return DataError(message, file=where, segment=name or None, field=what)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ MAX_PLACE, MAX_TURN, MAX_SPEED = 1e5, 1e4, 1e3
 MAX_LENGTH = 100_000
 """Rollouts, steps or agents."""
 
+_NUMBER = re.compile(r"[0-9]{1,9}")
+"""Of a rollout."""
 _LINES = ("lanes", "boundary", "marks")
 _ROAD = tuple(item.name for item in fields(RoadMap) if item.name not in _LINES)
 _SCALARS = ("segment_id", "source", "dt", "ego", "current_step", "file", "group")
@@ -152,14 +155,18 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
         parts = {name: reader.array(f"tree.{name}") for name in _TREE}
         trees = SavedTrees(**parts, prune_every=reader.fact("prune_every", int))
     failed = reader.fact("failed", dict)
-    if not all(str(number).isdecimal() for number in failed):
+    # Longer numbers than there are rollouts; thousands of digits would be no number to Python either.
+    if not all(_NUMBER.fullmatch(number) for number in failed):
         raise DataError("must name rollouts by number", field="failed")
+    drivers = reader.fact("drivers", list)
+    if not all(isinstance(name, str) for name in drivers):
+        raise DataError("must be names", field="drivers")
     return SavedRollouts(
         segment=segment,
         **{name: reader.array(name) for name in _SHAPES},
         routes=reader.lines("routes"),
         start=reader.fact("start", int),
-        drivers=tuple(reader.fact("drivers", list)),
+        drivers=tuple(drivers),
         failed={int(number): str(reason) for number, reason in failed.items()},
         trees=trees,
         log_weight=arrays.get(_WEIGHT),
