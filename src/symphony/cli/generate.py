@@ -45,6 +45,10 @@ class Generate:
     """Seconds of a segment."""
     interactive: int = 2
     """Vehicles that must be there and move at the first step."""
+    parked: float = 0.0
+    """Share of the places along straight kerbs with a parked car."""
+    pedestrians: int = 0
+    """People who walk or stand beside the road in each segment, at most; nobody steps onto it."""
     workers: int = 1
     """Processes that make networks."""
     engine: Literal["local", "ray"] = "local"
@@ -72,7 +76,16 @@ class Generate:
             return {split: (plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()}
         kinds = tuple(kind.strip() for kind in self.kinds.split(","))
         segments = 0 if self.count is None else self.count
-        plan = Plan(segments, self.seed, self.split, kinds, self.duration, self.interactive)
+        plan = Plan(
+            segments,
+            self.seed,
+            self.split,
+            kinds,
+            self.duration,
+            self.interactive,
+            self.parked,
+            self.pedestrians,
+        )
         return {self.split: (plan, self.out)}
 
     def run(self) -> None:

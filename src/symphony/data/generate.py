@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -20,6 +21,7 @@ import numpy as np
 
 from symphony.data import store_format
 from symphony.data.engine import Engine, ordered_map
+from symphony.data.roadside import Roadside, add_roadside
 from symphony.data.segment import RunSegment
 from symphony.data.selection import usable
 from symphony.data.sources.sumo import KINDS, crop_rule, generate_run, sumo_version
@@ -38,6 +40,9 @@ FIRST_NETWORK = 1_000_000
 BLOCK = 100_000
 """Networks that a seed has for each split."""
 MAX_SEED = 9_999
+MAX_PEDESTRIANS = 100
+_BEFORE = {"parked": 0.0, "pedestrians": 0}
+"""Settings of stores that were made before there were these."""
 PER_NETWORK = 8
 """Segments taken from one network."""
 RECORDED = 90.0
@@ -62,6 +67,8 @@ class Plan:
         kinds: of networks, which take turns; one named twice comes twice as often.
         duration: seconds of a segment, one of :data:`DURATIONS`.
         interactive: moving vehicles a segment must have at its first step (N_I).
+        parked: share of the places to park along straight kerbs that are taken (see :mod:`symphony.data.roadside`).
+        pedestrians: people beside the road in each segment, at most.
 
     Raises:
         ConfigError: a value out of range; names the field.
@@ -73,6 +80,8 @@ class Plan:
     kinds: tuple[str, ...] = ("town",)
     duration: int = 10
     interactive: int = 2
+    parked: float = 0.0
+    pedestrians: int = 0
 
     def __post_init__(self) -> None:
         if self.segments < 1:
@@ -91,6 +100,10 @@ class Plan:
             raise ConfigError(f"duration must be one of {DURATIONS}, is {self.duration}")
         if self.interactive < 2:
             raise ConfigError(f"interactive must be at least 2, is {self.interactive}")
+        if not 0 <= self.parked <= 1:
+            raise ConfigError(f"parked must be between 0 and 1, is {self.parked}")
+        if not 0 <= self.pedestrians <= MAX_PEDESTRIANS:
+            raise ConfigError(f"pedestrians must be between 0 and {MAX_PEDESTRIANS}, is {self.pedestrians}")
 
     def network(self, number: int) -> Task:
         """The plan's network of that number, counted from 0.
@@ -102,7 +115,11 @@ class Plan:
             raise ConfigError(f"one seed has {BLOCK} networks for each split: make more stores instead")
         first = FIRST_NETWORK + (self.seed * len(SPLITS) + SPLITS.index(self.split)) * BLOCK
         return Task(
-            self.kinds[number % len(self.kinds)], first + number, float(self.duration), self.interactive
+            self.kinds[number % len(self.kinds)],
+            first + number,
+            float(self.duration),
+            self.interactive,
+            Roadside(self.parked, self.pedestrians),
         )
 
     def networks(self, start: int = 0) -> Iterator[Task]:
@@ -165,12 +182,13 @@ PRESETS: dict[str, Preset] = {
 
 @dataclass(frozen=True)
 class Task:
-    """One network: its kind and seed, the seconds of a segment, and N_I."""
+    """One network: its kind and seed, the seconds of a segment, N_I, and what is beside the road."""
 
     kind: str
     seed: int
     duration: float
     interactive: int
+    roadside: Roadside = field(default_factory=Roadside)
 
     @property
     def name(self) -> str:
@@ -211,8 +229,9 @@ def harvest(task: Task) -> Harvest:
     good = []
     for segment in run.segments:
         try:
-            usable(segment, task.interactive)
-            good.append(segment)
+            whole = add_roadside(segment, task.roadside, zlib.crc32(segment.segment_id.encode()))
+            usable(whole, task.interactive)
+            good.append(whole)
         except DataError as error:
             run.reasons[f"{error.field}: excluded by the paper's limits"] += 1
     taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
@@ -350,9 +369,10 @@ def _begin(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
             "is a segment store that was not generated: refusing to write into it", file=store.path
         )
     for name, value in settings.items():
-        if there.get(name) != value:
+        made = there.get(name, _BEFORE.get(name))
+        if made != value:
             raise ConfigError(
-                f"{store.path} was made with {name} {_plain(there.get(name))}, not {_plain(value)}: "
+                f"{store.path} was made with {name} {_plain(made)}, not {_plain(value)}: "
                 "give the same arguments to continue it, or choose another folder"
             )
     found, state = report["generation"], Generation()
