@@ -208,7 +208,8 @@ def _beside_the_road(segment: RunSegment, pose: Line, size: Line) -> NDArray[np.
 def _clear_of_stops(segment: RunSegment, pose: Line, size: Line) -> NDArray[np.bool_]:
     """[M] who stand away from the stop points of lights."""
     away = np.linalg.norm(pose[:, None, :2] - segment.signal_point[:, :2].astype(np.float64), axis=-1)
-    return np.all(away > _STOP, axis=1)
+    clear: NDArray[np.bool_] = np.all(away > _STOP, axis=1)
+    return clear
 
 
 def _out_of_the_way(segment: RunSegment, pose: Line, size: Line) -> NDArray[np.bool_]:
