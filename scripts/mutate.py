@@ -52,10 +52,10 @@ TESTED = {
     "metrics.wosac.boxes": "test_wosac_features.py test_wosac_parity.py",
     "metrics.wosac.composite": "test_wosac_scoring.py",
     "metrics.wosac.estimators": "test_wosac_scoring.py test_wosac_parity.py",
-    "metrics.wosac.interaction": "test_wosac_features.py",
-    "metrics.wosac.kinematics": "test_wosac_features.py",
-    "metrics.wosac.lights": "test_wosac_features.py",
-    "metrics.wosac.road": "test_wosac_features.py",
+    "metrics.wosac.interaction": "test_wosac_features.py test_wosac_parity.py",
+    "metrics.wosac.kinematics": "test_wosac_features.py test_wosac_parity.py",
+    "metrics.wosac.lights": "test_wosac_features.py test_wosac_parity.py",
+    "metrics.wosac.road": "test_wosac_features.py test_wosac_parity.py",
     "metrics.wosac.scoring": "test_wosac_scoring.py",
 }
 """Modules of ``symphony`` and the files of tests that are to notice."""

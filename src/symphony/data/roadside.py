@@ -202,7 +202,8 @@ def _beside_the_road(segment: RunSegment, pose: Line, size: Line) -> NDArray[np.
     middle = (corner + corner.roll(1, -2)) / 2
     points = torch.cat([corner, middle], -2).numpy()
     depth = -_signed(segment, points.reshape(1, -1, 2)).reshape(points.shape[:2])
-    return (depth < REACH + 0.1).all(1)
+    beside: NDArray[np.bool_] = np.all(depth < REACH + 0.1, axis=1)
+    return beside
 
 
 def _clear_of_stops(segment: RunSegment, pose: Line, size: Line) -> NDArray[np.bool_]:
