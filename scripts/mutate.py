@@ -56,7 +56,7 @@ TESTED = {
     "metrics.wosac.kinematics": "test_wosac_features.py test_wosac_parity.py",
     "metrics.wosac.lights": "test_wosac_features.py test_wosac_parity.py",
     "metrics.wosac.road": "test_wosac_features.py test_wosac_parity.py",
-    "metrics.wosac.scoring": "test_wosac_scoring.py",
+    "metrics.wosac.scoring": "test_wosac_scoring.py test_wosac_parity.py test_wosac_evaluation.py",
 }
 """Modules of ``symphony`` and the files of tests that are to notice."""
 SECONDS = 300
@@ -164,24 +164,30 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--changes", type=int, default=10, help="of each module")
     parser.add_argument("--modules", nargs="+", choices=list(TESTED), default=list(TESTED))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--again", type=Path, help="earlier counts: make only the changes that were not noticed"
+    )
     parser.add_argument("--out", type=Path, default=Path("out/mutate.json"), help="where the counts are kept")
     given = parser.parse_args(args)
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    found: dict[str, dict[str, Any]] = {}
-    for name in given.modules:
+    found: dict[str, dict[str, Any]] = {} if given.again is None else json.loads(given.again.read_text())
+    for name in list(found) or given.modules:
         module = importlib.import_module(f"symphony.{name}")
         if tests(TESTED[name]) != 0:
             raise SystemExit(f"{TESTED[name]} fails as it is")
         tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-        possible = list(changes(tree))
-        chosen = random.Random(given.seed).sample(range(len(possible)), min(given.changes, len(possible)))  # noqa: S311
-        missed = []
-        for number in sorted(chosen):
-            if not noticed(module, number, TESTED[name]):
-                missed.append(f"line {possible[number][1]}: {possible[number][0]}")
-                print(f"not noticed: {name}, {missed[-1]}", flush=True)
+        possible = [f"line {line}: {what}" for what, line, _ in changes(tree)]
+        if name in found:
+            chosen = [k for k, text in enumerate(possible) if text in found[name]["missed"]]
+        else:
+            number = min(given.changes, len(possible))
+            chosen = random.Random(given.seed).sample(range(len(possible)), number)  # noqa: S311
+            found[name] = {"possible": len(possible), "made": number}
+        missed = [possible[k] for k in sorted(chosen) if not noticed(module, k, TESTED[name])]
+        for text in missed:
+            print(f"not noticed: {name}, {text}", flush=True)
         print(f"{name}: {len(chosen)} of {len(possible)} changes made", flush=True)
-        found[name] = {"possible": len(possible), "made": len(chosen), "missed": missed}
+        found[name]["missed"] = missed
         given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     made = sum(each["made"] for each in found.values())
     lost = sum(len(each["missed"]) for each in found.values())

@@ -160,6 +160,12 @@ def test_displacement_of_the_best_rollout() -> None:
     found = score(scenario, replace(log, y=y))
     assert found.average_displacement_error == pytest.approx((1 + 1 + 4 + 0) / 4 * 80 / 91, rel=1e-5)
     assert found.min_average_displacement_error == pytest.approx(80 / 91, rel=1e-5)
+    parts = object_scores(compute_features(scenario, replace(log, y=y)))
+    each = [part["average_displacement_error"] for part in parts]
+    assert sum(each) / len(each) == pytest.approx(found.average_displacement_error, rel=1e-5)
+    assert sum(part["min_ade"] for part in parts) / len(parts) == pytest.approx(
+        found.min_average_displacement_error, rel=1e-5
+    )
 
 
 def test_playback_scores_better_than_noise() -> None:
