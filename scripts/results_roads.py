@@ -19,12 +19,17 @@ ROAD_AGENTS = {
     "bc_ts_h": "BC+TS+H",
     "mgail_ts_h": "MGAIL+TS+H",
 }
-LEARNED_FROM = {"sumo": "SUMO", "ngsim": "NGSIM", "both": "SUMO, NGSIM"}
+LEARNED_FROM = {
+    "sumo": "SUMO",
+    "ngsim": "NGSIM",
+    "both": "SUMO, NGSIM",
+    "included": "SUMO, NGSIM, longer",
+}
 ELSEWHERE = {
     "2-constant_velocity": "driving/ngsim-constant-velocity",
-    "2-both-bc": "driving/ngsim-bc",
-    "2-both-none": "driving/ngsim-none",
-    "2-both-bc_ts_h": "driving/ngsim-replace-branch",
+    "2-included-bc": "driving/ngsim-bc",
+    "2-included-none": "driving/ngsim-none",
+    "2-included-bc_ts_h": "driving/ngsim-replace-branch",
 }
 """Records of the table on real roads that other tables have, too."""
 UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
@@ -57,7 +62,9 @@ def road_rows(count: int) -> list[tuple[str, str, Record]]:
     """
     names = [("", label, name) for label, name in ROAD_BASELINES]
     for data, source in LEARNED_FROM.items():
-        names += [(source, label, f"{data}-{method}") for method, label in ROAD_AGENTS.items()]
+        for method, label in ROAD_AGENTS.items():
+            plain = data == "included" and method == "bc"
+            names.append((source, f"{label}, the paper's inputs" if plain else label, f"{data}-{method}"))
     found = []
     for source, label, name in names:
         path = RECORDS / f"roads/{count}-{name}.json"
