@@ -184,6 +184,7 @@ def put(value: Any) -> Any:
         ("log.position", put(np.inf), "not finite"),
         ("road.successors", lambda a: a[:, :1], "shape"),
         ("road.lanes.offsets", put(0), "offsets"),
+        ("routes.offsets", lambda a: np.array([0, 2**63 - 1, -2, a[-1]], a.dtype), "offsets"),
         ("tree.score", put(np.inf), "infinite"),
         ("tree.parents", put(9), "outside"),
         ("tree.slots", lambda a: a[..., :1], "not 2 rollouts"),

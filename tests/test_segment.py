@@ -335,6 +335,19 @@ def test_absurd_values_are_refused(field: str) -> None:
     assert caught.value.field == field
 
 
+@pytest.mark.parametrize("name", ["lanes", "boundary", "marks"])
+def test_offsets_whose_differences_overflow_are_refused(name: str) -> None:
+    segment = validate(random_segment(seed=3, lanes=3, marks=3))
+    lines = getattr(segment.road, name)
+    # Once around: all differences are positive.
+    offsets = np.array([0, 2**63 - 1, -2, len(lines.points)], np.int64)
+    assert (np.diff(offsets) >= 0).all()
+    damaged = dataclasses.replace(segment.road, **{name: Polylines(lines.points, offsets)})
+    with pytest.raises(DataError, match="offsets") as caught:
+        validate(segment.replace(road=damaged))
+    assert caught.value.field == f"road.{name}"
+
+
 def test_odd_values_are_named() -> None:
     segment = straight_road(3, steps=8)
     assert oddities(segment) == []
