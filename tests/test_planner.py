@@ -146,6 +146,9 @@ def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
     assert simulated(Locked).failed == ({}, {})
     with pytest.raises(ConfigError, match=r"'mine' can't be copied.*--search none"):
         simulated(Locked, search="tree", branches=6, rule="best", prune_every=5)
+    # Said before the work, also where no branch might turn out to be copied.
+    with pytest.raises(ConfigError, match="can't be copied"):
+        simulated(Locked, search="tree", branches=6, rule="replace", threshold=1e9, prune_every=5)
 
 
 @pytest.mark.parametrize("search", ["tree", "oracle"])

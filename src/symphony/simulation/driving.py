@@ -121,7 +121,8 @@ def simulation(
     settings, planned = config.pruning(agent.search), None
     if egos is not None:
         keep_every = settings.prune_every if config.retries else 0
-        start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every)
+        forked = search_kind(agent, config) not in ("none", "log")
+        start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
     drawn = goal

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -75,7 +76,13 @@ class EgoPlanners:
         self.name, self.make, self.segments, self.seconds = name, make, segments, seconds
 
     def begin(
-        self, env: DrivingEnv, start: TensorDictBase, *, seed: int, keep_every: int = 0
+        self,
+        env: DrivingEnv,
+        start: TensorDictBase,
+        *,
+        seed: int,
+        keep_every: int = 0,
+        forked: bool = False,
     ) -> tuple[TensorDictBase, EgoPolicy]:
         """A planner for every start state, and what asks them.
 
@@ -84,6 +91,10 @@ class EgoPlanners:
             start: [...] of it; the egos get the routes of the log.
             seed: of all rollouts.
             keep_every: steps at whose multiples the search may come back to try again; 0 for never.
+            forked: a search will copy planners with its branches.
+
+        Raises:
+            ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
         """
         if env.scenes.route.shape[2] == 0:
             goal = start.get(keys.GOAL)
@@ -93,7 +104,10 @@ class EgoPlanners:
         start = env.with_goals(start, goal)
         number = torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
         start.set(keys.PLANNER, number)
-        return start, EgoPolicy(env, self, start, seed, keep_every)
+        policy = EgoPolicy(env, self, start, seed, keep_every)
+        if forked:
+            policy.check_copies()
+        return start, policy
 
 
 class EgoPolicy(TensorDictModuleBase):
@@ -203,6 +217,12 @@ class EgoPolicy(TensorDictModuleBase):
                 taken.add(chosen)
             out.append(chosen)
         return out
+
+    def check_copies(self) -> None:
+        """ConfigError if the first planner that came up can't be copied."""
+        there = (planner for planner in self._held.values() if not isinstance(planner, Failure))
+        for planner in itertools.islice(there, 1):
+            self._copy(planner)
 
     def _copy(self, planner: Planner) -> Planner:
         try:

@@ -258,7 +258,9 @@ def _check_state(name: str, value: NDArray[Any]) -> None:
 
 def _check_lines(lines: Polylines) -> None:
     offsets = lines.offsets
-    whole = offsets[0] == 0 and offsets[-1] == len(lines.points) and (offsets[1:] >= offsets[:-1]).all()  # subtracted, damaged ones can overflow
+    whole = (
+        offsets[0] == 0 and offsets[-1] == len(lines.points) and (offsets[1:] >= offsets[:-1]).all()
+    )  # subtracted, damaged ones can overflow
     if not whole:
         raise DataError("offsets do not match the points", field="routes")
     if lines.points.dtype != np.float32 or lines.points.shape[1:] != (3,):
