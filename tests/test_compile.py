@@ -17,6 +17,7 @@ SEES = ObservationConfig(num_objects=3, num_points=60, clearance=True, foresight
 @pytest.mark.parametrize(
     ("dynamics", "config"), [(Bicycle(), SEES), (Displacement(), ObservationConfig.nothing())]
 )
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
 @torch.no_grad()
 def test_a_compiled_step_is_the_step(dynamics: Any, config: ObservationConfig) -> None:
     torch.compiler.reset()

@@ -246,7 +246,7 @@ def test_workers_end_with_the_command(store: SegmentStore, tmp_path: Path, how: 
     with subprocess.Popen(
         [*command, *options], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
-        until = time.monotonic() + 120  # generously long, for a busy machine
+        until = time.monotonic() + 400  # generously long, for a busy machine
         while len(list((tmp_path / "started").iterdir())) < 2 and time.monotonic() < until:
             assert process.poll() is None
             time.sleep(0.1)

@@ -45,8 +45,8 @@ def drivable_rings(
     """
     _check_effort([ring for outline in outlines for ring in _rings_of(outline)], field)
     try:
-        # Shapely takes NaN on its way through outlines of no width for something to warn of.
-        with np.errstate(invalid="ignore"):
+        # Shapely takes NaN and infinity on its way through outlines of no width for something to warn of.
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             polygons = shapely.make_valid(
                 np.array([shapely.Polygon(outline) for outline in outlines], object)
             )
