@@ -121,6 +121,7 @@ def test_no_manifest_makes_loading_fail_otherwise(saved: Path) -> None:
         (("parts", "rng", "state", "cuda"), [3], "rng.cuda"),
         (("parts", "rng", "state", "generators"), [], "rng.generators"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), -1.0, "param_groups.lr"),
+        (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), 1e300, "param_groups.lr"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "lr"), "fast", "param_groups.lr"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "amsgrad"), 7, "param_groups.amsgrad"),
         (("parts", "optimizer.adam", "state", "param_groups", 0, "amsgrad"), True, "param_groups.amsgrad"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,6 +53,10 @@ def _check_finite(file: Path, name: str, saved: Tensor) -> None:
         raise CheckpointError(f"{bad} of {saved.numel()} numbers are not finite", file=file, field=name)
 
 
+MOST = 1e3
+"""Of a rate of learning, or another number that an optimizer is set to."""
+
+
 def match_optimizer(file: Path, optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
     """See that a state is one of this kind of optimizer for parameters of these shapes, and finite.
 
@@ -94,7 +97,7 @@ def _match_group(file: Path, own: dict[str, Any], group: dict[str, Any]) -> None
 
 
 def _is_setting(own: Any, value: Any) -> bool:
-    """Whether a value is of the kind of an optimizer's own: the same flag, finite numbers that are not negative."""
+    """Whether a value is of the kind of an optimizer's own: the same flag, numbers from 0 to :data:`MOST`."""
     if own is None or isinstance(own, bool):  # another one would need other moments, or climb the loss
         return value is own
     if isinstance(own, tuple | list):
@@ -108,7 +111,7 @@ def _is_setting(own: Any, value: Any) -> bool:
         return isinstance(value, Tensor) and value.shape == own.shape and bool((value >= 0).all())
     if isinstance(own, int | float):
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        return number and math.isfinite(value) and value >= 0
+        return number and 0 <= value <= MOST
     return type(value) is type(own)
 
 
