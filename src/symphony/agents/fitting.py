@@ -13,6 +13,8 @@ from torch import Tensor, nn
 
 from symphony.errors import DataError
 
+MOST = 1e3
+"""Of a rate of learning, or another number that an optimizer is set to."""
 _ADAM = {"step", "exp_avg", "exp_avg_sq"}
 
 
@@ -51,10 +53,6 @@ def _check_finite(file: Path, name: str, saved: Tensor) -> None:
     bad = int((~torch.isfinite(saved)).sum()) if saved.is_floating_point() or saved.is_complex() else 0
     if bad:
         raise CheckpointError(f"{bad} of {saved.numel()} numbers are not finite", file=file, field=name)
-
-
-MOST = 1e3
-"""Of a rate of learning, or another number that an optimizer is set to."""
 
 
 def match_optimizer(file: Path, optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:

@@ -78,13 +78,13 @@ class Generate:
         segments = 0 if self.count is None else self.count
         plan = Plan(
             segments,
-            self.seed,
-            self.split,
-            kinds,
-            self.duration,
-            self.interactive,
-            self.parked,
-            self.pedestrians,
+            seed=self.seed,
+            split=self.split,
+            kinds=kinds,
+            duration=self.duration,
+            interactive=self.interactive,
+            parked=self.parked,
+            pedestrians=self.pedestrians,
         )
         return {self.split: (plan, self.out)}
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.agents.networks import PERSONAS
+from symphony.data.resample import wrap
 from symphony.data.segment import AgentType, RunSegment
 from symphony.roadgraph import LaneGraph, lane_of
 
@@ -41,7 +42,7 @@ def styles(segment: RunSegment, graph: LaneGraph) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         headway = headway / speed
     follows = moves & (headway <= FOLLOWING)
-    turn = np.abs((np.diff(heading, axis=1, append=heading[:, -1:]) + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.abs(wrap(np.diff(heading, axis=1, append=heading[:, -1:])))
     limit = np.full(position.shape[:2], np.nan)
     free = moves & ~(headway <= FOLLOWING) & (turn <= STRAIGHT * segment.dt)
     if free.any():
@@ -67,7 +68,7 @@ def _headway(segment: RunSegment, step: int, position: Floats, heading: Floats) 
     delta = where[None] - where[:, None]
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
     ahead, aside = delta[..., 0] * cos + delta[..., 1] * sin, delta[..., 1] * cos - delta[..., 0] * sin
-    turn = np.abs((angle[None] - angle[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.abs(wrap(angle[None] - angle[:, None]))
     inside = (ahead > 0) & (np.abs(aside) < (size[:, None, 1] + size[None, :, 1]) / 2) & (turn < ALIGNED)
     between = ahead - (size[:, None, 0] + size[None, :, 0]) / 2
     gap[there] = np.where(inside, np.maximum(between, 0.0), np.inf).min(1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -220,9 +219,9 @@ class EgoPolicy(TensorDictModuleBase):
 
     def check_copies(self) -> None:
         """ConfigError if the first planner that came up can't be copied."""
-        there = (planner for planner in self._held.values() if not isinstance(planner, Failure))
-        for planner in itertools.islice(there, 1):
-            self._copy(planner)
+        first = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
+        if first is not None:
+            self._copy(first)
 
     def _copy(self, planner: Planner) -> Planner:
         try:
