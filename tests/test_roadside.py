@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,6 +135,12 @@ def test_roads_without_an_edge_have_none() -> None:
         **{**vars(segment.road), "boundary": type(boundary)(boundary.points[:0], np.zeros(1, np.int64))}
     )
     assert add_roadside(segment.replace(road=bare), FULL, 0).num_agents == segment.num_agents
+
+
+@pytest.mark.parametrize("bad", [{"parked": 2.0}, {"parked": float("nan")}, {"pedestrians": -1}])
+def test_a_roadside_out_of_range_is_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(bad))):
+        Roadside(**bad)
 
 
 def _harvest(task: Task) -> Harvest:

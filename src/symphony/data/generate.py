@@ -40,7 +40,6 @@ FIRST_NETWORK = 1_000_000
 BLOCK = 100_000
 """Networks that a seed has for each split."""
 MAX_SEED = 9_999
-MAX_PEDESTRIANS = 100
 _BEFORE = {"parked": 0.0, "pedestrians": 0}
 """Settings of stores that were made before there were these."""
 PER_NETWORK = 8
@@ -100,10 +99,7 @@ class Plan:
             raise ConfigError(f"duration must be one of {DURATIONS}, is {self.duration}")
         if self.interactive < 2:
             raise ConfigError(f"interactive must be at least 2, is {self.interactive}")
-        if not 0 <= self.parked <= 1:
-            raise ConfigError(f"parked must be between 0 and 1, is {self.parked}")
-        if not 0 <= self.pedestrians <= MAX_PEDESTRIANS:
-            raise ConfigError(f"pedestrians must be between 0 and {MAX_PEDESTRIANS}, is {self.pedestrians}")
+        Roadside(self.parked, self.pedestrians)  # or complain now
 
     def network(self, number: int) -> Task:
         """The plan's network of that number, counted from 0.

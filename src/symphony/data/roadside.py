@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, Polylines, RunSegment, validate
+from symphony.errors import ConfigError
 from symphony.geometry import box_corners, box_gap, segments_of, signed_distance
 
 Line = NDArray[np.float64]
@@ -25,6 +26,7 @@ CLEARANCE = 0.25
 """Metres between a parked car and whoever ever passes."""
 MOST = 60
 """Parked cars in a segment: those nearest to the ego's way."""
+MAX_PEDESTRIANS = 100
 _STRAIGHT = 0.15
 """Metres between the kerb and its chord, along a car."""
 _STOP = 8.0
@@ -40,10 +42,19 @@ class Roadside:
     Attributes:
         parked: share of the places along straight kerbs that are taken.
         pedestrians: people, at most (whose way would lead over a road or through a car is left out).
+
+    Raises:
+        ConfigError: a number out of range.
     """
 
     parked: float = 0.0
     pedestrians: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.parked <= 1:
+            raise ConfigError(f"parked must be between 0 and 1, is {self.parked}")
+        if not 0 <= self.pedestrians <= MAX_PEDESTRIANS:
+            raise ConfigError(f"pedestrians must be between 0 and {MAX_PEDESTRIANS}, is {self.pedestrians}")
 
 
 def add_roadside(segment: RunSegment, roadside: Roadside, seed: int) -> RunSegment:
