@@ -54,9 +54,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @settings(max_examples=20, deadline=None)
-@given(speed=st.floats(5, 13), headway=st.floats(0.3, 2.7))
+@given(speed=st.floats(5, 13), headway=st.floats(0.3, 2.5))
 def test_headway_is_of_who_follows_and_speed_of_who_is_free(speed: float, headway: float) -> None:
-    segment = column(speed * headway, (speed, speed))
+    segment = column(2.0 + speed * headway, (speed, speed))
     found = styles(segment, LaneGraph(segment.road))
     np.testing.assert_allclose(found[0, 0], headway, rtol=1e-3)
     np.testing.assert_allclose(found[1, 1], speed / 14, rtol=1e-3)
@@ -66,6 +66,13 @@ def test_headway_is_of_who_follows_and_speed_of_who_is_free(speed: float, headwa
     assert np.isnan(styles(column(5.0, (0.0, 0.0)), LaneGraph(segment.road))).all()
     brief = segment.replace(valid=segment.valid & (np.arange(11) < 4))
     assert np.isnan(styles(brief, LaneGraph(brief.road))).all()
+    # Nor does who catches up, changes speed, or creeps in a queue: that is the situation.
+    assert np.isnan(styles(column(15.0, (speed + 1.1, speed)), LaneGraph(segment.road))[0, 0])
+    assert not np.isnan(styles(column(15.0, (speed + 0.9, speed)), LaneGraph(segment.road))[0, 0])
+    assert np.isnan(styles(column(5.0, (3.9, 3.9)), LaneGraph(segment.road))[0, 0])
+    braking = segment.velocity.copy()
+    braking[..., 0] += 2.0 - np.arange(11) * 0.2
+    assert np.isnan(styles(segment.replace(velocity=braking), LaneGraph(segment.road))[0, 0])
 
 
 @given(
