@@ -38,11 +38,11 @@ ALIGNED = np.pi / 4
 
 
 def styles(segment: RunSegment, graph: LaneGraph) -> Floats:
-    """[A, 2] headway in seconds, and the speed, relative to the lane's limit, that a vehicle stays below nine tenths of
-    the time while it is free and drives straight. NaN where the log does not tell.
+    """[A, 2] headway in seconds, and the speed, relative to the lane's limit, that a vehicle stays below nine
+    tenths of the time while it is free and drives straight. NaN where the log does not tell.
 
-    The headway is the median of (gap - 2 m) / speed while a vehicle follows steadily. Where it brakes behind another or
-    starts behind it, the gap is that of the situation: such steps are left out, as they hide the driver.
+    The headway is the median of (gap - 2 m) / speed while a vehicle follows steadily. Where it brakes behind another
+    or starts behind it, the gap is that of the situation: such steps are left out, as they hide the driver.
     """
     position, heading = segment.position[..., :2].astype(np.float64), segment.heading.astype(np.float64)
     velocity = segment.velocity[..., :2].astype(np.float64)
