@@ -152,9 +152,18 @@ def test_a_resumed_run_ends_like_an_uninterrupted_one(
     assert [r["step"] for r in read_metrics(tmp_path / "part")] == [1, 2, 3, 4]
 
 
-def test_so_does_one_whose_discriminator_sees_noise_and_a_penalty(store: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("network", ["paper", "split"])
+def test_so_does_one_whose_discriminator_sees_noise_and_a_penalty(
+    store: Path, tmp_path: Path, network: str
+) -> None:
     discriminator = DiscriminatorConfig(
-        hidden=8, head=8, states=8, instance_noise=0.1, gradient_penalty=0.1, features="foresight"
+        hidden=8,
+        head=8,
+        states=8,
+        instance_noise=0.1,
+        gradient_penalty=0.1,
+        features="foresight",
+        network=network,
     )
     whole = train(tiny("bc_ts", store, tmp_path / "whole", discriminator=discriminator))
     stopped(whole, tmp_path / "part", 2)

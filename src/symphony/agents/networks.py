@@ -122,7 +122,7 @@ def discriminator_network(spec: AgentSpec) -> TensorDictModule:
     config = spec.discriminator
     if config is None:
         raise ValueError("the specification has no discriminator")
-    if config.network != "paper":
+    if config.network not in ("paper", "split"):
         return build_object(config.network, spec)
     return discriminator(
         _own_features(spec),
@@ -133,6 +133,7 @@ def discriminator_network(spec: AgentSpec) -> TensorDictModule:
         hidden=config.hidden,
         head=(config.head,),
         features=config.features,
+        split=config.network == "split",
     )
 
 

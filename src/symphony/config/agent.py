@@ -73,7 +73,8 @@ class DiscriminatorConfig:
     head: int = 64
     """Width of its head."""
     network: str = "paper"
-    """`paper`; or the import path of a function from an `AgentSpec` to a module that writes one logit per agent."""
+    """`paper`; `split`: a logit of the agent on the map plus the highest of it with each other; or the import path
+    of a function from an `AgentSpec` to a module that writes one logit per agent."""
     states: int = 256
     """States of either kind (simulated, logged) per update, each with all its interactive agents."""
     learning_rate: float = 1e-3
@@ -85,7 +86,7 @@ class DiscriminatorConfig:
 
     def __post_init__(self) -> None:
         one_of(self, "features", get_args(Features))
-        one_of(self, "network", ["paper"], path=True)
+        one_of(self, "network", ["paper", "split"], path=True)
         positive(self, "radius", "hidden", "head", "states", "learning_rate")
         not_negative(self, "gradient_penalty", "instance_noise")
 
