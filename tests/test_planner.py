@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
@@ -23,7 +25,7 @@ from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import simulation
+from symphony.simulation.driving import _plan, simulation, spread_runs
 from symphony.simulation.planned import EgoPlanners
 from symphony.simulation.planner import (
     MAX_ACCELERATION,
@@ -300,6 +302,48 @@ def test_the_command_simulates_reports_and_shows(
     assert json.loads((Path(sim) / "report.json").read_text())["failed_runs"] == 4
     assert main(["view", sim]) == 0
     assert "mine:Planner" in (Path(sim) / "view.html").read_text()
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    runs=st.integers(1, 300),
+    segments=st.integers(1, 600),
+    search=st.sampled_from(["none", "tree", "best", "tilted"]),
+    trees=st.sampled_from([1, 2, 16]),
+)
+def test_runs_are_spread_over_as_many_segments_as_there_are(
+    runs: int, segments: int, search: str, trees: int
+) -> None:
+    agent, tilt = load_agent(AGENT), search == "tilted"
+    config = EvaluateConfig(
+        search="tree" if tilt else search, trees=trees, tilt=float(tilt), rule="systematic"
+    )  # type: ignore[arg-type]
+    config = dataclasses.replace(config, branches=16 // trees if tilt else 0)
+    count, how = spread_runs(agent, config, runs, segments)
+    trees_of, _, taken = _plan(agent, how)  # refuses what can't be simulated
+    assert 1 <= count <= segments
+    assert trees_of * taken == how.rollouts
+    assert runs <= count * how.rollouts
+    if not tilt and (search == "none" or trees == 1):
+        # No fewer rollouts of each would do, but for runs that come out exactly: less than twice as many.
+        least = -(-runs // segments)
+        assert least <= how.rollouts
+        assert count * how.rollouts < runs + how.rollouts
+        assert how.rollouts < 2 * least + 2
+    if search == "none" and segments >= runs:
+        assert (count, how.rollouts) == (runs, 1)
+
+
+def test_a_hundred_runs_are_a_hundred(store: Path, tmp_path: Path) -> None:
+    words = ["--data", str(store), "--planner", "idm", "--duration", "2", "--out", str(tmp_path / "sim")]
+    assert main(["simulate", "playback", "--runs", "9", "--rollouts", "3", *words]) == 2
+    assert main(["simulate", "playback", "--runs", "9", *words]) == 0
+    assert report(load_rollouts(tmp_path / "sim"), "ego").totals()["runs"] == 9
+    words[-1] = str(tmp_path / "searched")
+    assert main(["simulate", AGENT, "--runs", "20", "--branches", "4", *words]) == 0
+    found = load_rollouts(tmp_path / "searched")
+    # 10 of each would be 20; three trees of four branches give 12.
+    assert [entry.rollouts for entry in (*found.entries, *found.failures)] == [12, 12]
 
 
 def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> None:

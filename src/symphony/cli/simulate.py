@@ -34,8 +34,9 @@ class Simulate:
     segments: tuple[str, ...] = ()
     """Ids of the run segments, or their numbers in the store; by default all."""
     runs: int = 0
-    """Simulate as many segments, spread evenly over the store, as give at least so many runs (rollouts of a segment);
-    0 for all segments."""
+    """Simulate so many runs (rollouts of a segment), or a few more where no number of them per segment divides it: of
+    as many segments as there are, evenly spread, and as few of each as it takes, in place of `rollouts`. 0: all
+    segments."""
     planner: str = ""
     """Drives the ego, the agent the other interactive agents: `idm`, `log`, or one of your own: a file `my.py:plan`,
     an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as the agent all others play
@@ -54,6 +55,8 @@ class Simulate:
             raise ConfigError("one agent is simulated: RUN or --agents RUN")
         if self.runs < 0 or (self.runs and self.segments):
             raise ConfigError("--runs is a number of runs, and goes without --segments")
+        if self.runs and not self.config.tilt and self.config.rollouts != EvaluateConfig.rollouts:
+            raise ConfigError("--runs says how many rollouts a segment gives: it goes without --rollouts")
         if not self.planner_seconds > 0:
             raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
 
@@ -65,6 +68,7 @@ class Simulate:
         from symphony.data.store import SegmentStore
         from symphony.simulation.crowd import crowd_dataset
         from symphony.simulation.demonstrations import evenly_spaced
+        from symphony.simulation.driving import spread_runs
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
@@ -76,7 +80,8 @@ class Simulate:
         others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = [segment_index(store, name) for name in self.segments]
         if self.runs:
-            chosen = evenly_spaced(len(store), min(-(-self.runs // config.rollouts), len(store)))
+            count, config = spread_runs(agent, config, self.runs, len(store))
+            chosen = evenly_spaced(len(store), count)
         dataset = crowd_dataset(
             store,
             agent,

@@ -268,6 +268,26 @@ def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     return config.trees, branches, taken
 
 
+def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
+    """How many of the run segments give a number of runs together, and the configuration with as few rollouts of
+    each as that takes: what is independent of each other are segments.
+
+    It is exactly that number where some number of rollouts divides it, else a few more. More rollouts than a tree has
+    branches come from several trees; with a tilt every branch stays a rollout.
+    """
+    kind, least = search_kind(agent, config), -(-runs // segments)
+    branches = config.branches or agent.search.test_branches
+    if config.tilt:
+        each = config.rollouts * -(-least // config.rollouts)
+        return -(-runs // each), dataclasses.replace(
+            config, rollouts=each, trees=config.trees * each // config.rollouts
+        )
+    dividing = next((each for each in range(least, runs + 1) if runs % each == 0 and each < 2 * least), least)
+    trees = max(config.trees, -(-dividing // branches)) if kind in ("tree", "oracle") else 1
+    each = -(-dividing // trees) * trees
+    return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
+
+
 def _branches(part: Tensor, order: Tensor) -> Tensor:
     """part [B, trees, S, ...] at the branches order [B, trees, K]."""
     index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
