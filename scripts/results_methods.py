@@ -6,9 +6,12 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, mean_of, means, paired, records
 from results_users import NAMES
 from symphony.evaluation.comparison import Entry
+from symphony.evaluation.paired import clustered_mean
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
 
@@ -83,6 +86,17 @@ LABELS = (
     ("BC+TS+H, one route taught (seed 0)", "bc/bc_ts_h-0-often"),
     ("BC+TS+H, the set of open routes", "labels/bc_ts_h-0-systematic"),
 )
+EIGHT = {
+    "bc": "BC",
+    "bc_h": "BC+H",
+    "bc_ts": "BC+TS",
+    "bc_ts_h": "BC+TS+H",
+    "mgail": "MGAIL",
+    "mgail_h": "MGAIL+H",
+    "mgail_ts": "MGAIL+TS",
+    "mgail_ts_h": "MGAIL+TS+H",
+}
+"""The eight methods, trained anew alike: records `eight/PLACE-METHOD-SEED`."""
 SEEDS = (("BC+TS+H without its search", "driving/{}-none*"), ("BC+TS+H", "driving/{}-replace-branch*"))
 """The included agent (seed 0) and those trained likewise of two more seeds."""
 NGSIM = (
@@ -96,16 +110,48 @@ NGSIM = (
 )
 
 
+def eight(place: str) -> Grid:
+    """The eight methods on one test part: means over seeds, ± standard error over recordings of what the seeds
+    together give a segment; for collisions also that over seeds.
+    """
+    names = ("collision_rate", "collision_with_playback", "offroad_time", "ade", "min_sade")
+    head = ["collisions %", "± over seeds", "with playback %", *(COLUMNS[name][0] for name in names[2:])]
+    grid = [["", *head, COLUMNS["curvature_jsd"][0], "CPU s", "seeds"]]
+    baselines = records(f"eight/{place}-bc-*")[0]
+    rows = [(PLAYBACK, [baselines], "playback"), ("constant velocity", [baselines], "constant_velocity")]
+    rows += [(label, records(f"eight/{place}-{method}-*"), "") for method, label in EIGHT.items()]
+    for label, found, part in rows:
+        line = [label]
+        for name in names:
+            digits = COLUMNS[name][1] if name in COLUMNS else 1
+            if part:
+                mean, error = found[0][part][name], found[0][part][f"{name}_se"]
+            else:
+                each = np.mean([[row[name] for row in record["per_segment"]] for record in found], 0)
+                groups = np.unique([row["group"] for row in found[0]["per_segment"]], return_inverse=True)[1]
+                mean, error = clustered_mean(each, groups)
+            shown = name != "collision_with_playback"
+            line.append(f"{mean:.{digits}f}" + (f" ± {error:.{digits}f}" if shown else ""))
+            if name == "collision_rate":
+                values = [record[name] for record in found]
+                several = len(values) > 1
+                line.append(f"{np.std(values, ddof=1) / len(values) ** 0.5:.1f}" if several else "")
+        jsd = [(record[part] if part else record)["curvature_jsd"] for record in found]
+        cost = "" if part else f"{np.mean([r['cost']['simulation'] / r['segments'] for r in found]):.2f}"
+        grid.append([*line, f"{np.mean(jsd):.3f}", cost, "" if part else str(len(found))])
+    return grid
+
+
 def setting(folder: str) -> Grid:
     """The eight methods in one of the paper's other settings."""
     rows = [(label, f"{folder}/{Path(pattern).name.replace('*', '0')}") for label, pattern in (*BC, *MGAIL)]
     return means(rows)
 
 
-def held() -> Grid:
+def held(patterns: Sequence[str]) -> Grid:
     """The paper's relations as `symphony table --relations` has them, those that the records can tell."""
     entries = []
-    for _, pattern in (*BC, *MGAIL):
+    for pattern in patterns:
         entries += [_entry(record, pattern) for record in records(pattern)]
     return grid([relation for relation in relations(entries) if relation.held is not None])
 

@@ -22,6 +22,7 @@ from results_base import ROOT, Grid, beside, means, records
 from results_methods import (
     BC,
     DRIVEN,
+    EIGHT,
     FEATURES,
     FOREST,
     HALVING,
@@ -31,6 +32,7 @@ from results_methods import (
     SEEDS,
     WAYS,
     against_paper,
+    eight,
     held,
     included,
     searched,
@@ -58,7 +60,10 @@ PAGES = (
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
     "methods": lambda: means((*BC, *MGAIL)),
-    "relations": held,
+    "relations": lambda: held([f"eight/town-{method}-*" for method in EIGHT]),
+    "relations-before": lambda: held([pattern for _, pattern in (*BC, *MGAIL)]),
+    "eight-town": lambda: eight("town"),
+    "eight-ngsim": lambda: eight("ngsim"),
     "features": lambda: means(FEATURES),
     "ngsim": lambda: beside(NGSIM, PLACES, THREE),
     "halving": lambda: means(HALVING),
