@@ -95,7 +95,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "crowd-town": lambda: crowd("town"),
     "crowd-ngsim": lambda: crowd("ngsim"),
     "mixed": mixed,
-    "personas": personas,
+    "personas-town": lambda: personas("town"),
+    "personas-ramp": lambda: personas("ramp"),
 }
 
 

@@ -51,26 +51,35 @@ def crowd(data: str) -> Grid:
     return grid
 
 
+LEARNED_WITH = {
+    "two": "2",
+    "many16": "2 to 16",
+    "split16": "2 to 16, map and neighbours apart",
+}
+"""What searches in training drove, and how the discriminator judged: names of records and labels."""
+
+
 def mixed() -> Grid:
-    """What learning from searches with more agents changes, in open traffic."""
+    """What learning from searches with more agents changes, and a discriminator that separates, in open traffic."""
     shown = ("agent_collision_rate", "agent_offroad_time", "agent_progress", "agent_speed_distance")
-    grid = [["driven", "learned with", *(AGENTS[key][0] for key in shown)]]
-    for way in ("16-none", "16-tree", "all-none", "all-tree"):
-        for label, name in (("2", "two"), ("2 to 16", "mixed")):
-            (record,) = records(f"mixed/{name}-{way}")
-            cells = [f"{record[key]:.{AGENTS[key][1]}f}" for key in shown]
-            cells[0] += f" ± {record['agent_collision_rate_se']:.1f}"
-            grid.append([way.removesuffix("-none").replace("-tree", ", searched"), label, *cells])
+    grid = [["", "searched", "learned with", *(AGENTS[key][0] for key in shown)]]
+    for data, place in (("town", "towns"), ("ngsim", "NGSIM")):
+        for search, word in (("none", "no"), ("tree", "yes")):
+            for name, label in LEARNED_WITH.items():
+                (record,) = records(f"mixed/{name}-{data}-16-{search}")
+                cells = [f"{record[key]:.{AGENTS[key][1]}f}" for key in shown]
+                cells[0] += f" ± {record['agent_collision_rate_se']:.1f}"
+                grid.append([place, word, label, *cells])
     return grid
 
 
-def personas() -> Grid:
+def personas(place: str) -> Grid:
     """Whether agents drive in the style that they are told."""
-    (record,) = records("personas/town")
+    (record,) = records(f"personas/{place}")
     digits = {"headway": 2, "free_speed": 3, "speed": 2, "collision": 1, "offroad": 2}
     named = [(case["asked"].replace(",", ", ") or "drawn", case) for case in record["cases"]]
     named += [(f"{name}, .8 less .2", found) for name, found in record["differences"].items()]
-    return [["asked", "time headway, s", "free speed / limit", "speed, m/s", "collide %", "off-road %"]] + [
+    return [["asked", "headway, s", "free speed / limit", "speed, m/s", "collide %", "off-road %"]] + [
         [label, *(f"{case[key]:.{n}f} ± {case[f'{key}_se']:.{n}f}" for key, n in digits.items())]
         for label, case in named
     ]

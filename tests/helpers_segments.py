@@ -309,3 +309,21 @@ def segments(segment_ids: st.SearchStrategy[str] | None = None) -> st.SearchStra
         lights=st.integers(0, 3),
         marks=st.integers(0, 3),
     )
+
+
+def ring(gap: float = 25.0, radius: float = 15.0, steps: int = 51, aside: float = 0.2) -> RunSegment:
+    """A circle of two lanes that lead into one another, so that routes go around it twice; a car drives towards one
+    that stands so many metres ahead of its centre, `aside` metres beside the middle of the lane.
+    """
+    angle = np.linspace(0.0, np.pi, 24)
+    half = radius * np.stack([np.sin(angle), -np.cos(angle)], -1)
+    road = make_road([half, -half], successors=[(0, 1), (1, 0)])
+    time, speed = 0.2 * np.arange(steps), 4.0
+    turn = np.stack([0.2 + 0.0 * time, 0.2 + (gap / radius) + 0.0 * time])
+    # As logged it comes to a stop in time.
+    turn[0] += (np.minimum(speed * time, gap - 10.0)) / radius
+    place = (radius + aside) * np.stack([np.sin(turn), -np.cos(turn)], -1)
+    moves = np.zeros((2, steps))
+    moves[0] = np.where(speed * time < gap - 10.0, speed, 0.0)
+    velocity = moves[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    return make_segment(road, place, turn, velocity, segment_id="ring")

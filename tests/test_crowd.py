@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, straight_road
+from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, ring, straight_road
 from helpers_store import fill
 from symphony import keys
 from symphony.agents import Agent, build_agent, load_agent
@@ -297,7 +297,7 @@ def test_a_saved_world_shows_who_is_there(store: SegmentStore, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    "segment", [straight_road(6, seed=2), crossing(4, seed=1), crossing(4, seed=5), row(cars(2))]
+    "segment", [straight_road(6, seed=2), crossing(4, seed=1), crossing(4, seed=5), row(cars(2)), ring()]
 )
 def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
     from symphony.simulation.planned import EgoPlanners
@@ -309,7 +309,8 @@ def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
     one = simulation(quiet, alone, EvaluateConfig(rollouts=1), egos=egos).rollouts.state
     ruled = scene(segment, [segment.ego], graph, background=[True])
     many = simulation(quiet, ruled, EvaluateConfig(rollouts=1, others="idm")).rollouts.state
-    assert (one - many).abs().max() < 0.05
+    # Of what stands askew in a bend one takes the corners, the other how far it reaches along and across.
+    assert (one - many).abs().max() < (0.1 if segment.segment_id == "ring" else 0.05)
 
 
 def test_the_baseline_is_the_planner_for_everyone(store: SegmentStore) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely import LineString, Point
 
-from helpers_segments import CAR, LANE_WIDTH, crossing, hide, make_road, make_segment, straight_road
+from helpers_segments import CAR, LANE_WIDTH, crossing, hide, make_road, make_segment, ring, straight_road
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment, SignalState
@@ -71,6 +71,19 @@ def test_idm_follows_at_its_headway() -> None:
     gap = 60 + leader * 80 - found[-1, 0] - LENGTH
     assert found[-1, 3] == pytest.approx(leader, abs=0.05)
     assert gap == pytest.approx((2 + 1.5 * leader) / np.sqrt(1 - (leader / LIMIT) ** 4), abs=0.3)
+
+
+@pytest.mark.parametrize("aside", [-0.4, 0.0, 0.4])
+@pytest.mark.parametrize("gap", [15.0, 25.0, 40.0])
+def test_idm_stops_behind_a_standing_car_where_its_route_comes_by_twice(gap: float, aside: float) -> None:
+    segment = ring(gap, aside=aside)
+    assert (scene(segment, [0], LaneGraph(segment.road)).route_count.max() * 3 > 2 * np.pi * 15).item()
+    found = states(segment)
+    turned = np.arctan2(found[:, 0], -found[:, 1])
+    ahead = (0.2 + gap / 15 - turned) * 15.0
+    assert ahead.min() > LENGTH + 1.0
+    assert ahead[-1] < LENGTH + 5.0
+    assert found[-1, 3] < 0.5
 
 
 def test_idm_alone_drives_at_the_limit() -> None:

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from symphony.data.segment import RunSegment, SignalState
 from symphony.evaluation.contacts import Bools, Indices, Reals, lane_widths
+from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.saved import SavedRollouts
@@ -134,8 +134,8 @@ class Progress(NamedTuple):
 def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     """How far evaluated agents (numbers [M] of the driven ones) got on.
 
-    Along the route that an agent follows, from the place on it nearest to its first state to that nearest to its last
-    one; without a route, the length of its path.
+    Along the route that an agent follows, from where it begins to where it ends, also where the route passes a place
+    twice (:func:`symphony.geometry.stations.stations_along`); without a route, the length of its path.
     """
     rows, within = saved.agents[evaluated], slice(saved.start, saved.last + 1)
     there = saved.there[..., evaluated].swapaxes(1, 2)
@@ -144,16 +144,15 @@ def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     seen = saved.segment.valid[rows, within]
     goal = saved.goal[:, evaluated]
     counts = np.diff(saved.routes.offsets)
-    lines = [
-        shapely.LineString(saved.routes[k][:, :2]) if counts[k] > 1 else None
-        for k in range(len(saved.routes))
-    ]
-    along = np.array([*lines, None], dtype=object)[goal]
-    has = np.array([*(line is not None for line in lines), False])[goal]
+    most = max(2, int(counts.max(initial=0)))
+    routes = [saved.routes[k][:, :2] for k in np.flatnonzero(counts).tolist()]
+    lines = [np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in routes]
+    has = np.append(counts > 1, False)[goal]
+    along = np.array(lines, np.float64).reshape(-1, most, 2)[np.cumsum(counts > 0)[goal[has]] - 1]
     driven, logged = _length(path, there), np.broadcast_to(_length(log, seen), goal.shape).copy()
-    driven[has] = _advance(along[has], path[has], there[has])
+    driven[has] = _advance(along, path[has], there[has])
     number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)[has]
-    logged[has] = _advance(along[has], log[number], seen[number])
+    logged[has] = _advance(along, log[number], seen[number])
     return Progress(driven, logged)
 
 
@@ -163,12 +162,11 @@ def _length(path: Reals, valid: Bools) -> Reals:
     return np.where(valid[..., 1:] & valid[..., :-1], strides, 0).sum(-1)
 
 
-def _advance(lines: NDArray[np.object_], path: Reals, valid: Bools) -> Reals:
-    """Metres [R] along lines [R] from the first to the last valid point of paths [R, U, 2]."""
+def _advance(lines: Reals, path: Reals, valid: Bools) -> Reals:
+    """Metres [R] along lines [R, P, 2] from the first to the last valid point of paths [R, U, 2]."""
     row, last = np.arange(len(path)), valid.shape[1] - 1 - valid[:, ::-1].argmax(1)
-    ends = path[row, valid.argmax(1)], path[row, last]
-    begin, end = (shapely.line_locate_point(lines, shapely.points(point)) for point in ends)
-    return np.where(valid.any(1), end - begin, 0.0)
+    along = stations_along(lines, path, valid)
+    return np.where(valid.any(1), along[row, last] - along[row, valid.argmax(1)], 0.0)
 
 
 class Comfort(NamedTuple):

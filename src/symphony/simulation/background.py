@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -23,6 +23,7 @@ from symphony.envs.routes import SPACING, pick_routes
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap
 from symphony.geometry.nearest import nearest
+from symphony.geometry.stations import NEAR
 from symphony.simulation.planner import MAX_BRAKING, MAX_STEERING
 from symphony.simulation.planners import AMBER, RED, IDMPlanner
 
@@ -32,6 +33,10 @@ _VIEW = 100.0
 """Metres ahead within which the route's bends and limits, and others, are looked at."""
 _LEADERS = 16
 """Nearest others ahead of which one is followed."""
+_BACK = 5.0
+"""Metres along around the rear axle's place within which it is looked for."""
+_WITH = 0.25
+"""Cosine of the largest angle between a vehicle and the part of its route that it is on."""
 _STOP_ASIDE, _STOP_CHORD = 1.5, 15.0
 """Metres of a stop point from a route that it is on, and metres behind it at which the way of its lane is told."""
 
@@ -83,13 +88,15 @@ class CarFollower(TensorDictModuleBase):
         everyone = self.env.objects(row, at, state, valid)
         size = scenes.box_size[row[m], scenes.interactive[row[m], n]]
         own, line = state[m, n], _Lines(*(part[row[m], n] for part in self.routes))
-        station = _project(line, own[:, None, :2])[0][:, 0]
+        station = _own_station(line, own)
         front = station + 0.5 * size[:, 0]
         gap, speed = self._leader(line, everyone, m, scenes.interactive[row[m], n], own, size, station)
         red = self._red(line, row[m], at[m], front, own[:, 3])
         gap, speed = torch.minimum(gap, red), torch.where(red < gap, 0.0, speed)
         pull = self._acceleration(own[:, 3], self._free_speed(line, station), gap, speed)
-        after = bicycle_step(own, pull, self._steering(line, own, size[:, 0]), size[:, 0], self.env.dt)
+        after = bicycle_step(
+            own, pull, self._steering(line, own, size[:, 0], station), size[:, 0], self.env.dt
+        )
         moved = state.index_put((m, n), after)
         return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
 
@@ -129,7 +136,7 @@ class CarFollower(TensorDictModuleBase):
         chosen, there = chosen[:, 0], there[:, 0]
         pick = (m[:, None], chosen)
         pose, box = everyone.state[pick], everyone.size[pick]
-        along, aside, way = _project(line, pose[..., :2])
+        along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], _VIEW))
         turn = pose[..., 2] - way
         cos, sin = turn.cos().abs(), turn.sin().abs()
         reach = 0.5 * (cos * box[..., 0] + sin * box[..., 1])
@@ -153,11 +160,12 @@ class CarFollower(TensorDictModuleBase):
         gap = torch.where(stops & (gap > -2.0), gap, torch.inf)
         return torch.cat([gap, torch.full_like(gap[:, :0].sum(-1, keepdim=True), torch.inf)], -1).amin(-1)
 
-    def _steering(self, line: _Lines, own: Tensor, length: Tensor) -> Float[Tensor, " P"]:
+    def _steering(self, line: _Lines, own: Tensor, length: Tensor, station: Tensor) -> Float[Tensor, " P"]:
         base, (x, y, heading, speed) = WHEELBASE * length, own.unbind(-1)
         rear = torch.stack([x - 0.5 * base * heading.cos(), y - 0.5 * base * heading.sin()], -1)
         ahead = (3.0 + 0.5 * speed.abs()).clamp_max(20.0)
-        to = _at(line, _project(line, rear[:, None])[0][:, 0] + ahead) - rear
+        near = _within(line, station - base - _BACK, base + 2 * _BACK)
+        to = _at(line, _project(line, rear[:, None], near)[0][:, 0] + ahead) - rear
         angle = torch.atan2(to[:, 1], to[:, 0]) - heading
         found = torch.atan(2.0 * base * angle.sin() / to.norm(dim=-1).clamp_min(0.1))
         return found.clamp(-MAX_STEERING, MAX_STEERING)
@@ -256,17 +264,43 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
     return out
 
 
+def _own_station(line: _Lines, own: Float[Tensor, "P 4"]) -> Float[Tensor, " P"]:
+    """Metres along of agents that follow the lines: of the places nearly nearest the earliest one that leads their
+    way, as routes lead around blocks.
+    """
+    way = line.points.diff(dim=1)
+    heading = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
+    with_it = (way * heading[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
+    with_it = with_it | ~with_it.any(-1, keepdim=True)
+    return _project(line, own[:, None, :2], with_it)[0][:, 0]
+
+
+def _within(line: _Lines, low: Float[Tensor, " P"], length: Tensor | float) -> Bool[Tensor, "P pieces"]:
+    """Pieces of the lines that reach into what lies from `low` metres along on for `length` metres."""
+    return (line.arc[:, 1:] >= low[:, None]) & (line.arc[:, :-1] <= (low + length)[:, None])
+
+
 def _project(
-    line: _Lines, places: Float[Tensor, "P J 2"]
+    line: _Lines,
+    places: Float[Tensor, "P J 2"],
+    pieces: Bool[Tensor, "P pieces"] | None = None,
 ) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J"]]:
-    """Metres along, metres to the left, and heading of the line, at its places nearest to some."""
+    """Metres along, metres to the left, and heading of the line, at its places nearest to some: of several passes of
+    the pieces that count the earliest, see :mod:`symphony.geometry.stations`.
+    """
     start, length = line.points[:, :-1], line.arc.diff(dim=-1)
     ahead = line.points.diff(dim=1) / length.clamp_min(1e-6)[..., None]
     x, y = (places[:, :, None, k] - start[:, None, :, k] for k in (0, 1))
     cos, sin = ahead[:, None, :, 0], ahead[:, None, :, 1]
     share = (x * cos + y * sin).clamp_min(0.0).minimum(length[:, None])
     squared = (x - share * cos).square() + (y - share * sin).square()
-    _, which = squared.min(-1, keepdim=True)
+    if pieces is not None:
+        squared = squared.masked_fill(~pieces[:, None], torch.inf)
+    distance = squared.sqrt()
+    beside = torch.nn.functional.pad(distance, (1, 1), value=torch.inf)
+    lowest = (distance <= beside[..., :-2]) & (distance <= beside[..., 2:])
+    lowest &= distance <= distance.amin(-1, keepdim=True) + NEAR
+    which = lowest.to(torch.uint8).argmax(-1, keepdim=True)
 
     def of(values: Tensor) -> Tensor:
         return values.expand_as(squared).gather(-1, which)[..., 0]

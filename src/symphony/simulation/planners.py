@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import SignalState
 from symphony.envs.dynamics import WHEELBASE
+from symphony.geometry.stations import earliest_pass
 from symphony.simulation.planner import MAX_BRAKING, Control, Pose, Reals, Scenario, Traffic
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
@@ -16,7 +17,13 @@ AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
 _BEFORE, _BEYOND = 50.0, 10_000.0
 """Metres by which a route goes straight on before its start and past its end."""
 _VIEW = 100.0
-"""Metres ahead within which the route's bends and limits are looked at."""
+"""Metres ahead within which the route's bends and limits, and others, are looked at."""
+_BACK, _ON = 5.0, 15.0
+"""Metres of the route around where the ego last was, within which it is now. The nearest place of all may be another
+pass: routes lead around blocks.
+"""
+_AT_STOP = 1.5
+"""Metres of a stop point from a route that it is on."""
 
 
 class LogPlanner:
@@ -81,14 +88,16 @@ class IDMPlanner:
             np.sqrt(self.lateral / np.maximum(self.route.curvature, 1e-6)),
         )
         lights = np.arange(len(scenario.signal_lane))
-        mine = np.array([_leads_along(scenario, self.route, int(q)) for q in lights], bool)
-        self.lights = lights[mine]
-        self.stops = self.route.project(scenario.signal_point[self.lights])[0]
+        stops = [_stops_along(scenario, self.route, int(q)) for q in lights]
+        self.lights = np.repeat(lights, [len(found) for found in stops])
+        self.stops = np.array([station for found in stops for station in found], np.float64)
+        self.station = float(self.route.project(scenario.state[None, :2])[0][0])
 
     def plan(self, traffic: Traffic) -> Control:
         """Speed by the leader, steering by the route."""
         x, y, heading, speed = traffic.state.tolist()
-        station = float(self.route.project(np.array([[x, y]]))[0][0])
+        within = self.station - _BACK, self.station + _ON
+        self.station = station = float(self.route.project(np.array([[x, y]]), *within)[0][0])
         pull = self._acceleration(speed, self._free_speed(station), self._leader(traffic, station, speed))
         return Control(pull, self._steering(x, y, heading, speed))
 
@@ -111,13 +120,14 @@ class IDMPlanner:
         front = station + 0.5 * self.length
         others = traffic.valid.copy()
         others[traffic.ego] = False
-        centre, aside, direction = self.route.project(traffic.position[others])
+        within = station - self.length, station + _VIEW
+        centre, aside, direction = self.route.project(traffic.position[others], *within)
         reach = 0.5 * self.width + self.margin
         # Only boxes that could reach into the corridor are looked at by their corners.
         near = (centre > station) & (np.abs(aside) < reach + 0.5 * np.hypot(*traffic.size[others].T))
         which = np.flatnonzero(others)[near]
         corners = _corners(traffic.position[which], traffic.heading[which], traffic.size[which])
-        along, aside, _ = self.route.project(corners)
+        along, aside, _ = self.route.project(corners, *within)
         along, aside = along.reshape(-1, 4), aside.reshape(-1, 4)
         ahead = (aside.min(-1) < reach) & (aside.max(-1) > -reach)
         found = (math.inf, 0.0)
@@ -137,7 +147,8 @@ class IDMPlanner:
         base = WHEELBASE * self.length
         rear = np.array([x - 0.5 * base * math.cos(heading), y - 0.5 * base * math.sin(heading)])
         ahead = min(3.0 + 0.5 * abs(speed), 20.0)
-        goal = self.route.at(float(self.route.project(rear[None])[0][0]) + ahead)
+        within = self.station - base - _BACK, self.station + _BACK
+        goal = self.route.at(float(self.route.project(rear[None], *within)[0][0]) + ahead)
         dx, dy = (goal - rear).tolist()
         angle = math.atan2(dy, dx) - heading
         return math.atan(2.0 * base * math.sin(angle) / max(math.hypot(dx, dy), 0.1))
@@ -177,17 +188,34 @@ class RouteLine:
         """The point [2] so many metres along."""
         return np.array([np.interp(station, self.arc, self.points[:, k]) for k in (0, 1)])
 
-    def project(self, points: NDArray[np.floating]) -> tuple[Reals, Reals, Reals]:
-        """Metres along [M], distance to the left [M] and direction [M, 2] of the places nearest to points [M, 2]."""
-        offset = points[:, None] - self.points[None, :-1]
-        share = ((offset * self.direction).sum(-1)).clip(0.0, self._length)
-        away = offset - share[..., None] * self.direction
-        distance = np.linalg.norm(away, axis=-1)
-        which = distance.argmin(-1)
+    def project(
+        self, points: NDArray[np.floating], low: float = -math.inf, high: float = math.inf
+    ) -> tuple[Reals, Reals, Reals]:
+        """Metres along [M], distance to the left [M] and direction [M, 2] of the places nearest to points [M, 2], of
+        the pieces between two points of the line that reach into what lies from `low` to `high` metres along. Of
+        several passes it is the earliest.
+        """
+        share, away, distance = self._to_pieces(points)
+        outside = (self.arc[1:] < low) | (self.arc[:-1] > high)
+        which = earliest_pass(np.where(outside, np.inf, distance))
         row = np.arange(len(points))
         direction, away = self.direction[which], away[row, which]
         side = np.where(direction[:, 0] * away[:, 1] - direction[:, 1] * away[:, 0] < 0, -1.0, 1.0)
         return self.arc[which] + share[row, which], side * distance[row, which], direction
+
+    def passes(self, point: NDArray[np.floating], within: float) -> list[float]:
+        """Metres along of all places at which the line passes a point [2] so closely."""
+        share, _, distance = self._to_pieces(point[None])
+        beside = np.pad(distance[0], 1, constant_values=np.inf)
+        lowest = (distance[0] <= beside[:-2]) & (distance[0] < beside[2:]) & (distance[0] < within)
+        return (self.arc[:-1] + share[0])[lowest].tolist()
+
+    def _to_pieces(self, points: NDArray[np.floating]) -> tuple[Reals, Reals, Reals]:
+        """Metres [M, P' - 1] along each piece to its place nearest to points [M, 2], and from there to the points."""
+        offset = points[:, None] - self.points[None, :-1]
+        share = ((offset * self.direction).sum(-1)).clip(0.0, self._length)
+        away = offset - share[..., None] * self.direction
+        return share, away, np.linalg.norm(away, axis=-1)
 
 
 def _corners(
@@ -209,12 +237,18 @@ def _limits(scenario: Scenario, points: Reals, unknown: float) -> Reals:
     return np.where(np.isnan(limit), unknown, limit)
 
 
-def _leads_along(scenario: Scenario, route: RouteLine, light: int) -> bool:
-    """Whether the route follows the lane of a light, from its stop point on for up to 15 m."""
+def _stops_along(scenario: Scenario, route: RouteLine, light: int) -> list[float]:
+    """Metres along the route at which a light stops it: where it follows the lane of the light, from the stop point
+    on for up to 15 m.
+    """
     stop = scenario.signal_point[light]
     lane = scenario.road.lanes[int(scenario.signal_lane[light])][:, :2].astype(np.float64)
     nearest = int(np.linalg.norm(lane - stop, axis=-1).argmin())
     path = lane[nearest:]
     path = np.concatenate([stop[None], path[np.linalg.norm(path - stop, axis=-1) < 15.0]])
-    along, aside, _ = route.project(path)
-    return bool((np.abs(aside) < 1.5).all() and along[0] > -5.0 and along[-1] - along[0] > -1.0)
+    found = []
+    for station in route.passes(stop, _AT_STOP):
+        along, aside, _ = route.project(path, station - _BACK, station + 25.0)
+        if (np.abs(aside) < _AT_STOP).all() and station > -_BACK and along[-1] - along[0] > -1.0:
+            found.append(station)
+    return found
