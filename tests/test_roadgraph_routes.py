@@ -227,3 +227,25 @@ def test_lanes_of_next_to_no_length_in_a_circle(size):
     assert all(follows(graph, route) for route in found)
     ordinary = [route for route in found if a not in route]
     assert ordinary == routes(LaneGraph(road), [(name["in0"], 10.0)])
+
+
+def test_going_around_the_block_first_is_not_the_way_of_the_log():
+    # A street that leads back into itself, and on: 0 leads to 1 and, by the loop 2, to its own start.
+    street = np.stack([np.linspace(0.0, 30.0, 16), np.zeros(16)], -1)
+    onward = street + np.array([30.0, 0.0])
+    angle = np.linspace(0.0, 2.0 * np.pi, 60)[:, None]
+    loop = np.array([30.0, 0.0]) + 8.0 * np.concatenate([np.sin(angle), 1 - np.cos(angle)], -1)
+    loop = np.concatenate([loop[:45], [[10.0, 20.0], [-10.0, 10.0], [-5.0, 0.0], [0.0, 0.0]]])
+    graph = LaneGraph(make_road([street, onward, loop], successors=[(0, 1), (0, 2), (2, 0)]))
+    found = routes(graph, [(0, 2.0)], horizon=250.0, lane_change=False)
+    assert (0, 1) in found
+    assert any(route[:3] == (0, 2, 0) and 1 in route for route in found)
+    valid = np.ones(25, bool)
+    direct = np.stack([np.linspace(2.0, 50.0, 25), np.full(25, 0.2)], -1)
+    right = ground_truth_routes(graph, found, direct, valid)
+    assert {found[k][:2] for k in np.flatnonzero(right)} == {(0, 1)}
+    # Who goes around does not take the direct way, and as long as nobody has turned off, all are right.
+    round_once = np.concatenate([street[1::2], loop[1::2], street[1::2], onward[::2]])
+    right = ground_truth_routes(graph, found, round_once, np.ones(len(round_once), bool))
+    assert {found[k][:4] for k in np.flatnonzero(right)} == {(0, 2, 0, 1)}
+    assert ground_truth_routes(graph, found, direct[:10], valid[:10]).all()

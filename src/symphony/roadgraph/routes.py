@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from symphony.geometry.stations import stations_along
 from symphony.roadgraph.assign import starting_lanes
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Reals
@@ -26,6 +27,8 @@ LIMIT = 200
 MAX_LANES = 500
 """Most lanes of a route."""
 
+_AROUND = 10.0
+"""Metres along a route around a vehicle within which its lanes are those that it is on."""
 _TIE = 1e-3
 
 Path = tuple[float, Route]
@@ -141,15 +144,36 @@ def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], 
 def route_errors(
     graph: LaneGraph, choices: Sequence[Route], trajectory: NDArray[Any], valid: NDArray[np.bool_]
 ) -> Reals:
-    """Mean distance [G] in metres of a trajectory's valid points [T, 2] to each route (NaN if there are none)."""
-    points = shapely.points(np.asarray(trajectory, dtype=np.float64)[np.asarray(valid, dtype=bool)])
+    """Mean distance [G] in metres of a trajectory's valid points [T, 2] to each route (NaN if there are none).
+
+    Of a route that comes by twice only the pass counts that the trajectory is on: else one that goes around the block
+    first would be as right as the direct one.
+    """
+    path = np.asarray(trajectory, dtype=np.float64)[np.asarray(valid, dtype=bool)]
+    points = shapely.points(path)
     if len(points) == 0:
         return np.full(len(choices), np.nan)
     lanes = sorted({lane for route in choices for lane in route})
     row = {lane: k for k, lane in enumerate(lanes)}
     lines = np.array([shapely.LineString(graph.lines[lane]) for lane in lanes], dtype=object)
     distance = shapely.distance(lines[:, None], points[None])
-    return np.array([distance[[row[lane] for lane in route]].min(0).mean() for route in choices])
+    errors = np.empty(len(choices))
+    for k, route in enumerate(choices):
+        away = distance[[row[lane] for lane in route]]
+        if len(set(route)) < len(route):
+            away = np.where(_passed(graph, route, path), away, np.inf)
+        errors[k] = away.min(0).mean()
+    return errors
+
+
+def _passed(graph: LaneGraph, route: Route, path: Reals) -> NDArray[np.bool_]:
+    """[lanes, T] which of a route's lanes are near the place along it to which a path [T, 2] has come."""
+    line = np.concatenate([graph.lines[lane] for lane in route])
+    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
+    ends = np.cumsum([len(graph.lines[lane]) for lane in route])
+    begin, end = arc[np.concatenate([[0], ends[:-1]])], arc[ends - 1]
+    station = stations_along(line[None], path[None], np.ones((1, len(path)), bool))[0]
+    return (begin[:, None] <= station + _AROUND) & (end[:, None] >= station - _AROUND)
 
 
 def ground_truth_routes(

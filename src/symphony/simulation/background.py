@@ -88,7 +88,7 @@ class CarFollower(TensorDictModuleBase):
         everyone = self.env.objects(row, at, state, valid)
         size = scenes.box_size[row[m], scenes.interactive[row[m], n]]
         own, line = state[m, n], _Lines(*(part[row[m], n] for part in self.routes))
-        station = _own_station(line, own)
+        station = _own_station(line, own, self._driven(row[m], at[m], n, own[:, 3]))
         front = station + 0.5 * size[:, 0]
         gap, speed = self._leader(line, everyone, m, scenes.interactive[row[m], n], own, size, station)
         red = self._red(line, row[m], at[m], front, own[:, 3])
@@ -99,6 +99,13 @@ class CarFollower(TensorDictModuleBase):
         )
         moved = state.index_put((m, n), after)
         return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
+
+    def _driven(self, row: Tensor, at: Tensor, n: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
+        """About how far agents have come since they entered: by the mean of their speeds then and now."""
+        scenes = self.env.scenes
+        enter = scenes.enter[row, n]
+        before = scenes.log_state[row, enter, scenes.interactive[row, n], 3:].norm(dim=-1)
+        return (at - enter).clamp_min(0) * self.env.dt * 0.5 * (before + speed)
 
     def _acceleration(self, speed: Tensor, free: Tensor, gap: Tensor, other: Tensor) -> Float[Tensor, " P"]:
         driver = self.driver
@@ -264,15 +271,15 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
     return out
 
 
-def _own_station(line: _Lines, own: Float[Tensor, "P 4"]) -> Float[Tensor, " P"]:
-    """Metres along of agents that follow the lines: of the places nearly nearest the earliest one that leads their
-    way, as routes lead around blocks.
+def _own_station(line: _Lines, own: Float[Tensor, "P 4"], driven: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+    """Metres along of agents that follow the lines: of the places nearly nearest that lead their way the one that
+    fits the way driven best, as routes lead around blocks.
     """
     way = line.points.diff(dim=1)
     heading = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
     with_it = (way * heading[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
     with_it = with_it | ~with_it.any(-1, keepdim=True)
-    return _project(line, own[:, None, :2], with_it)[0][:, 0]
+    return _project(line, own[:, None, :2], with_it, driven)[0][:, 0]
 
 
 def _within(line: _Lines, low: Float[Tensor, " P"], length: Tensor | float) -> Bool[Tensor, "P pieces"]:
@@ -284,9 +291,10 @@ def _project(
     line: _Lines,
     places: Float[Tensor, "P J 2"],
     pieces: Bool[Tensor, "P pieces"] | None = None,
+    about: Float[Tensor, " P"] | None = None,
 ) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J"]]:
     """Metres along, metres to the left, and heading of the line, at its places nearest to some: of several passes of
-    the pieces that count the earliest, see :mod:`symphony.geometry.stations`.
+    the pieces that count the earliest (see :mod:`symphony.geometry.stations`), or the nearest to so many metres.
     """
     start, length = line.points[:, :-1], line.arc.diff(dim=-1)
     ahead = line.points.diff(dim=1) / length.clamp_min(1e-6)[..., None]
@@ -301,6 +309,9 @@ def _project(
     lowest = (distance <= beside[..., :-2]) & (distance <= beside[..., 2:])
     lowest &= distance <= distance.amin(-1, keepdim=True) + NEAR
     which = lowest.to(torch.uint8).argmax(-1, keepdim=True)
+    if about is not None:
+        off = (line.arc[:, None, :-1] + share - about[:, None, None]).abs()
+        which = off.masked_fill(~lowest, torch.inf).argmin(-1, keepdim=True)
 
     def of(values: Tensor) -> Tensor:
         return values.expand_as(squared).gather(-1, which)[..., 0]
