@@ -231,6 +231,13 @@ def test_damage_is_found_and_named(tmp_path: Path) -> None:
         load_rollouts(tmp_path / "sim")
 
 
+def test_a_shape_that_nothing_could_hold_is_damage(tmp_path: Path) -> None:
+    header = json.dumps({"state": {"dtype": "F32", "shape": [0, 2**62, 8], "data_offsets": [0, 0]}}).encode()
+    header += b" " * (-len(header) % 8)
+    with pytest.raises(DataError, match=r"one\.safetensors, segment one: damaged"):
+        read_tensors(len(header).to_bytes(8, "little") + header, tmp_path / "one.safetensors", "one")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

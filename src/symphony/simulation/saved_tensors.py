@@ -90,9 +90,13 @@ def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
             the segment and the field.
     """
     try:
-        arrays, facts = load(data), _facts(data)
+        arrays = load(data)
+    except (SafetensorError, ValueError) as error:  # the latter of NumPy, for shapes like 0 x 2^62 x 8
+        raise DataError(f"damaged ({error})", file=file, segment=segment_id) from error
+    try:
+        facts = _facts(data)
         return _checked(_assembled(arrays, facts), facts, segment_id)
-    except (SafetensorError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise DataError(f"damaged ({error})", file=file, segment=segment_id) from error
     except DataError as error:
         raise DataError(error.message, file=file, segment=segment_id, field=error.field) from error
