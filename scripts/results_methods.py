@@ -11,7 +11,6 @@ import numpy as np
 from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, mean_of, means, paired, records
 from results_users import NAMES
 from symphony.evaluation.comparison import Entry
-from symphony.evaluation.paired import clustered_mean
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
 
@@ -96,7 +95,7 @@ EIGHT = {
     "mgail_ts": "MGAIL+TS",
     "mgail_ts_h": "MGAIL+TS+H",
 }
-"""The eight methods, trained anew alike: records `eight/PLACE-METHOD-SEED`."""
+"""The methods, trained anew alike: records `eight/PLACE-METHOD-SEED`."""
 SEEDS = (("BC+TS+H without its search", "driving/{}-none*"), ("BC+TS+H", "driving/{}-replace-branch*"))
 """The included agent (seed 0) and those trained likewise of two more seeds."""
 NGSIM = (
@@ -111,25 +110,23 @@ NGSIM = (
 
 
 def eight(place: str) -> Grid:
-    """The eight methods on one test part: means over seeds, ± standard error over recordings of what the seeds
-    together give a segment; for collisions also that over seeds.
+    """The methods on one test part, as far as there are records: means over seeds, ± standard error over recordings
+    (of one seed, the mean of these); for collisions also that over seeds.
     """
     names = ("collision_rate", "collision_with_playback", "offroad_time", "ade", "min_sade")
     head = ["collisions %", "± over seeds", "with playback %", *(COLUMNS[name][0] for name in names[2:])]
     grid = [["", *head, COLUMNS["curvature_jsd"][0], "CPU s", "seeds"]]
-    baselines = records(f"eight/{place}-bc-*")[0]
+    baselines = records(f"eight/{place}-bc-[0-9]*")[0]
     rows = [(PLAYBACK, [baselines], "playback"), ("constant velocity", [baselines], "constant_velocity")]
-    rows += [(label, records(f"eight/{place}-{method}-*"), "") for method, label in EIGHT.items()]
+    for method, label in EIGHT.items():
+        if any(RECORDS.glob(f"eight/{place}-{method}-[0-9]*.json")):
+            rows.append((label, records(f"eight/{place}-{method}-[0-9]*"), ""))
     for label, found, part in rows:
         line = [label]
         for name in names:
             digits = COLUMNS[name][1] if name in COLUMNS else 1
-            if part:
-                mean, error = found[0][part][name], found[0][part][f"{name}_se"]
-            else:
-                each = np.mean([[row[name] for row in record["per_segment"]] for record in found], 0)
-                groups = np.unique([row["group"] for row in found[0]["per_segment"]], return_inverse=True)[1]
-                mean, error = clustered_mean(each, groups)
+            rows_of = [record[part] if part else record for record in found]
+            mean, error = (np.mean([row[key] for row in rows_of]) for key in (name, f"{name}_se"))
             shown = name != "collision_with_playback"
             line.append(f"{mean:.{digits}f}" + (f" ± {error:.{digits}f}" if shown else ""))
             if name == "collision_rate":
@@ -139,6 +136,25 @@ def eight(place: str) -> Grid:
         jsd = [(record[part] if part else record)["curvature_jsd"] for record in found]
         cost = "" if part else f"{np.mean([r['cost']['simulation'] / r['segments'] for r in found]):.2f}"
         grid.append([*line, f"{np.mean(jsd):.3f}", cost, "" if part else str(len(found))])
+    return grid
+
+
+def roadside() -> Grid:
+    """The included agent, and the same after it learned from parked cars and people beside the road."""
+    places = {"": "beside parked cars", "town-": "towns", "ngsim-": "NGSIM"}
+    shown = ("collision_rate", "min_sade")
+    grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in shown)]]
+    for way, word in (("none", ", no search"), ("replace-branch", "")):
+        for name, label in (("included", "included"), ("roadside", "learned on with a roadside")):
+            line = [label + word]
+            for place in places:
+                elsewhere = f"driving/{place}{way}" if name == "included" and place else ""
+                (record,) = records(elsewhere or f"roadside/{name}-{place}{way}")
+                line += [
+                    f"{record[key]:.{COLUMNS[key][1]}f} ± {record[f'{key}_se']:.{COLUMNS[key][1]}f}"
+                    for key in shown
+                ]
+            grid.append(line)
     return grid
 
 

@@ -22,7 +22,6 @@ from results_base import ROOT, Grid, beside, means, records
 from results_methods import (
     BC,
     DRIVEN,
-    EIGHT,
     FEATURES,
     FOREST,
     HALVING,
@@ -35,6 +34,7 @@ from results_methods import (
     eight,
     held,
     included,
+    roadside,
     searched,
     setting,
     sweep,
@@ -60,8 +60,9 @@ PAGES = (
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
     "methods": lambda: means((*BC, *MGAIL)),
-    "relations": lambda: held([f"eight/town-{method}-*" for method in EIGHT]),
-    "relations-before": lambda: held([pattern for _, pattern in (*BC, *MGAIL)]),
+    "relations": lambda: held([pattern for _, pattern in (*BC, *MGAIL)]),
+    "relations-newer": lambda: held(["eight/town-*"]),
+    "roadside": roadside,
     "eight-town": lambda: eight("town"),
     "eight-ngsim": lambda: eight("ngsim"),
     "features": lambda: means(FEATURES),
