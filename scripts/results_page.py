@@ -47,6 +47,7 @@ from results_users import (
     flattered,
     mixed,
     personas,
+    trained_with,
     wosac,
     wosac_log,
     wosac_parity,
@@ -96,6 +97,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "crowd-town": lambda: crowd("town"),
     "crowd-ngsim": lambda: crowd("ngsim"),
     "mixed": mixed,
+    "trained-with": trained_with,
     "personas-town": lambda: personas("town"),
     "personas-ramp": lambda: personas("ramp"),
 }

@@ -73,6 +73,26 @@ def mixed() -> Grid:
     return grid
 
 
+def trained_with() -> Grid:
+    """Agents that learned with two or with eight agents in their searches, in open traffic with more."""
+    counts, arms = ("16", "32", "all"), {"two": "2", "n8": "8"}
+    shown = {key: AGENTS[key] for key in ("agent_collision_rate", "agent_offroad_time", "agent_progress")}
+    head = [f"{heading}, {count} driven" for heading, _ in shown.values() for count in counts]
+    grid = [["", "searched", "learned with", *head]]
+    for data, place in (("town", "towns"), ("ngsim", "NGSIM")):
+        for search, word in (("none", "no"), ("tree", "yes")):
+            for name, label in arms.items():
+                found = [records(f"mixed/{name}-{data}-{count}-{search}")[0] for count in counts]
+                cells = [
+                    f"{record[key]:.{digits}f}"
+                    + (f" ± {record[f'{key}_se']:.1f}" if "collision" in key else "")
+                    for key, (_, digits) in shown.items()
+                    for record in found
+                ]
+                grid.append([place, word, label, *cells])
+    return grid
+
+
 def personas(place: str) -> Grid:
     """Whether agents drive in the style that they are told."""
     (record,) = records(f"personas/{place}")
