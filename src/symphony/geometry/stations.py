@@ -36,20 +36,22 @@ def stations_along(
         path: in the order of time.
         valid: which of its points exist.
     """
-    length = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
+    way = np.diff(lines, axis=1)
+    length = np.linalg.norm(way, axis=-1)
+    direction = way / np.maximum(length, np.finfo(np.float64).tiny)[..., None]
     arc = np.concatenate([np.zeros_like(length[:, :1]), length.cumsum(1)], 1)
     row, found = np.arange(len(lines)), np.full(valid.shape, np.nan)
     station, last = np.full(len(lines), np.nan), np.zeros((len(lines), 2))
     for step in range(path.shape[1]):
         point = path[:, step]
-        distance, along = _to_pieces(lines, length, arc, point)
+        share, _, distance = to_pieces(lines[:, :-1], direction, length, point[:, None])
         reach = (_CUT * np.linalg.norm(point - last, axis=-1) + _SLACK)[:, None]
         began = ~np.isnan(station)[:, None]
         with np.errstate(invalid="ignore"):
             inside = (arc[:, 1:] >= station[:, None] - reach) & (arc[:, :-1] <= station[:, None] + reach)
         piece = np.where(began[:, 0], np.where(inside, distance, np.inf).argmin(1), earliest_pass(distance))
         here = valid[:, step]
-        station = np.where(here, along[row, piece], station)
+        station = np.where(here, arc[row, piece] + share[row, piece], station)
         last = np.where(here[:, None], point, last)
         found[here, step] = station[here]
     return found
@@ -62,10 +64,19 @@ def earliest_pass(distance: Float[NDArray[np.float64], "*b pieces"]) -> NDArray[
     return (lowest & (distance <= distance.min(-1, keepdims=True) + NEAR)).argmax(-1)
 
 
-def _to_pieces(lines: Reals, length: Reals, arc: Reals, point: Reals) -> tuple[Reals, Reals]:
-    """Distances [R, P - 1] of points [R, 2] from the pieces of lines, and metres along at their nearest places."""
-    start, way = lines[:, :-1], np.diff(lines, axis=1)
-    away = point[:, None] - start
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(length > 0, (away * way).sum(-1) / length**2, 0.0).clip(0.0, 1.0)
-    return np.linalg.norm(away - share[..., None] * way, axis=-1), arc[:, :-1] + share * length
+def to_pieces(
+    start: Reals, direction: Reals, length: Reals, point: NDArray[np.floating]
+) -> tuple[Reals, Reals, Reals]:
+    """Metres along each piece of a line to its place nearest to a point, what lies between the two [..., 2], and how
+    far that is.
+
+    Args:
+        start: [..., 2] of each piece, in metres.
+        direction: [..., 2] unit vectors; zero for pieces of no length.
+        length: [...] metres.
+        point: [..., 2] metres.
+    """
+    offset = point - start
+    share = (offset * direction).sum(-1).clip(0.0, length)
+    away = offset - share[..., None] * direction
+    return share, away, np.linalg.norm(away, axis=-1)

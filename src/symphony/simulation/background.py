@@ -25,20 +25,22 @@ from symphony.geometry.frames import wrap
 from symphony.geometry.nearest import nearest
 from symphony.geometry.stations import NEAR
 from symphony.simulation.planner import MAX_BRAKING, MAX_STEERING
-from symphony.simulation.planners import AMBER, RED, IDMPlanner
+from symphony.simulation.planners import (
+    AMBER,
+    AT_STOP,
+    BACK,
+    BEFORE,
+    BEYOND,
+    RED,
+    STOP_CHORD,
+    VIEW,
+    IDMPlanner,
+)
 
-_BEFORE, _BEYOND = 50.0, 10_000.0
-"""Metres by which a route goes straight on before its start and past its end."""
-_VIEW = 100.0
-"""Metres ahead within which the route's bends and limits, and others, are looked at."""
 _LEADERS = 16
 """Nearest others ahead of which one is followed."""
-_BACK = 5.0
-"""Metres along around the rear axle's place within which it is looked for."""
 _WITH = 0.25
 """Cosine of the largest angle between a vehicle and the part of its route that it is on."""
-_STOP_ASIDE, _STOP_CHORD = 1.5, 15.0
-"""Metres of a stop point from a route that it is on, and metres behind it at which the way of its lane is told."""
 
 
 class ConstantSpeed(TensorDictModuleBase):
@@ -116,7 +118,7 @@ class CarFollower(TensorDictModuleBase):
 
     def _free_speed(self, line: _Lines, station: Tensor) -> Float[Tensor, " P"]:
         away = line.arc - station[:, None]
-        ahead = (away > -SPACING) & (away < _VIEW)
+        ahead = (away > -SPACING) & (away < VIEW)
         allowed = (line.limit.square() + 2.0 * self.driver.braking * away.clamp_min(0.0)).sqrt()
         free = torch.where(ahead, allowed, torch.inf).amin(-1)
         return torch.where(ahead.any(-1), free, self.driver.speed)
@@ -138,12 +140,12 @@ class CarFollower(TensorDictModuleBase):
         # Behind is what is behind on any bend that a vehicle can take within its own length.
         behind = (delta * forward[:, None]).sum(-1) < -size[:, :1]
         other = torch.arange(squared.shape[1], device=m.device) != agent[:, None]
-        hidden = ~everyone.valid[m] | ~other | behind | (squared > _VIEW**2)
+        hidden = ~everyone.valid[m] | ~other | behind | (squared > VIEW**2)
         chosen, there = nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS)
         chosen, there = chosen[:, 0], there[:, 0]
         pick = (m[:, None], chosen)
         pose, box = everyone.state[pick], everyone.size[pick]
-        along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], _VIEW))
+        along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], VIEW))
         turn = pose[..., 2] - way
         cos, sin = turn.cos().abs(), turn.sin().abs()
         reach = 0.5 * (cos * box[..., 0] + sin * box[..., 1])
@@ -171,7 +173,7 @@ class CarFollower(TensorDictModuleBase):
         base, (x, y, heading, speed) = WHEELBASE * length, own.unbind(-1)
         rear = torch.stack([x - 0.5 * base * heading.cos(), y - 0.5 * base * heading.sin()], -1)
         ahead = (3.0 + 0.5 * speed.abs()).clamp_max(20.0)
-        near = _within(line, station - base - _BACK, base + 2 * _BACK)
+        near = _within(line, station - base - BACK, base + 2 * BACK)
         to = _at(line, _project(line, rear[:, None], near)[0][:, 0] + ahead) - rear
         angle = torch.atan2(to[:, 1], to[:, 0]) - heading
         found = torch.atan(2.0 * base * angle.sin() / to.norm(dim=-1).clamp_min(0.1))
@@ -212,15 +214,15 @@ def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
     first = _unit(points[:, :, 1] - points[:, :, 0])
     points = torch.cat(
         [
-            (points[:, :, 0] - _BEFORE * first)[:, :, None],
+            (points[:, :, 0] - BEFORE * first)[:, :, None],
             points,
-            (points[:, :, -1] + _BEYOND * onward)[:, :, None],
+            (points[:, :, -1] + BEYOND * onward)[:, :, None],
         ],
         2,
     )
     pieces = points.diff(dim=2)
     length = pieces.norm(dim=-1)
-    arc = torch.cat([torch.zeros_like(length[..., :1]), length.cumsum(-1)], -1) - _BEFORE
+    arc = torch.cat([torch.zeros_like(length[..., :1]), length.cumsum(-1)], -1) - BEFORE
     angle = torch.atan2(pieces[..., 1], pieces[..., 0])
     near = length.clamp_max(SPACING)
     bend = wrap(angle.diff(dim=-1)).abs() / (0.5 * (near[..., 1:] + near[..., :-1])).clamp_min(1e-3)
@@ -261,9 +263,9 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
         point, way = scenes.point[b, which], scenes.point_direction[b, which]
         line = _Lines(*(part[b] for part in lines))
         station, aside, _ = _project(line, point.expand(len(line.arc), -1, -1))
-        beyond = torch.stack([_at(line, station[:, q] + _STOP_CHORD) for q in range(len(which))], 1)
+        beyond = torch.stack([_at(line, station[:, q] + STOP_CHORD) for q in range(len(which))], 1)
         along = (_unit(beyond - point) * way).sum(-1)
-        along = along.masked_fill((aside.abs() > _STOP_ASIDE) | (station < -5.0), -torch.inf)
+        along = along.masked_fill((aside.abs() > AT_STOP) | (station < -5.0), -torch.inf)
         same = (point[:, None] - point[None]).norm(dim=-1) < 1.0
         best = torch.where(same, along[:, None, :], -torch.inf).amax(-1)
         mine = (along > 0.0) & (along >= best)

@@ -9,21 +9,21 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import SignalState
 from symphony.envs.dynamics import WHEELBASE
-from symphony.geometry.stations import earliest_pass
+from symphony.geometry.stations import earliest_pass, to_pieces
 from symphony.simulation.planner import MAX_BRAKING, Control, Pose, Reals, Scenario, Traffic
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
-_BEFORE, _BEYOND = 50.0, 10_000.0
+BEFORE, BEYOND = 50.0, 10_000.0
 """Metres by which a route goes straight on before its start and past its end."""
-_VIEW = 100.0
+VIEW = 100.0
 """Metres ahead within which the route's bends and limits, and others, are looked at."""
-_BACK, _ON = 5.0, 15.0
+BACK, _ON = 5.0, 15.0
 """Metres of the route around where the ego last was, within which it is now. The nearest place of all may be another
 pass: routes lead around blocks.
 """
-_AT_STOP = 1.5
-"""Metres of a stop point from a route that it is on."""
+AT_STOP, STOP_CHORD = 1.5, 15.0
+"""Metres of a stop point from a route that it is on, and metres behind it for which the route follows its lane."""
 
 
 class LogPlanner:
@@ -96,7 +96,7 @@ class IDMPlanner:
     def plan(self, traffic: Traffic) -> Control:
         """Speed by the leader, steering by the route."""
         x, y, heading, speed = traffic.state.tolist()
-        within = self.station - _BACK, self.station + _ON
+        within = self.station - BACK, self.station + _ON
         self.station = station = float(self.route.project(np.array([[x, y]]), *within)[0][0])
         pull = self._acceleration(speed, self._free_speed(station), self._leader(traffic, station, speed))
         return Control(pull, self._steering(x, y, heading, speed))
@@ -111,7 +111,7 @@ class IDMPlanner:
     def _free_speed(self, station: float) -> float:
         """v0, from which the slower places ahead can be reached at comfortable braking."""
         away = self.route.arc - station
-        ahead = (away > -self.route.spacing) & (away < _VIEW)
+        ahead = (away > -self.route.spacing) & (away < VIEW)
         allowed = np.sqrt(self.limit[ahead] ** 2 + 2.0 * self.braking * np.maximum(away[ahead], 0.0))
         return float(allowed.min(initial=self.speed if not ahead.any() else np.inf))
 
@@ -120,7 +120,7 @@ class IDMPlanner:
         front = station + 0.5 * self.length
         others = traffic.valid.copy()
         others[traffic.ego] = False
-        within = station - self.length, station + _VIEW
+        within = station - self.length, station + VIEW
         centre, aside, direction = self.route.project(traffic.position[others], *within)
         reach = 0.5 * self.width + self.margin
         # Only boxes that could reach into the corridor are looked at by their corners.
@@ -147,7 +147,7 @@ class IDMPlanner:
         base = WHEELBASE * self.length
         rear = np.array([x - 0.5 * base * math.cos(heading), y - 0.5 * base * math.sin(heading)])
         ahead = min(3.0 + 0.5 * abs(speed), 20.0)
-        within = self.station - base - _BACK, self.station + _BACK
+        within = self.station - base - BACK, self.station + BACK
         goal = self.route.at(float(self.route.project(rear[None], *within)[0][0]) + ahead)
         dx, dy = (goal - rear).tolist()
         angle = math.atan2(dy, dx) - heading
@@ -173,11 +173,11 @@ class RouteLine:
             raise ValueError("a route needs two points that differ")
         steps = np.linalg.norm(np.diff(line, axis=0), axis=-1)
         first, last = (line[1] - line[0]) / steps[0], (line[-1] - line[-2]) / steps[-1]
-        self.points = np.concatenate([line[:1] - _BEFORE * first, line, line[-1:] + _BEYOND * last])
+        self.points = np.concatenate([line[:1] - BEFORE * first, line, line[-1:] + BEYOND * last])
         pieces = np.diff(self.points, axis=0)
         self._length = np.linalg.norm(pieces, axis=-1)
         self.direction = pieces / self._length[:, None]
-        self.arc = np.concatenate([[0.0], self._length.cumsum()]) - _BEFORE
+        self.arc = np.concatenate([[0.0], self._length.cumsum()]) - BEFORE
         angle = np.arctan2(self.direction[:, 1], self.direction[:, 0])
         turn = np.abs((np.diff(angle) + np.pi) % (2 * np.pi) - np.pi)
         self.spacing = float(steps.max())
@@ -211,11 +211,7 @@ class RouteLine:
         return (self.arc[:-1] + share[0])[lowest].tolist()
 
     def _to_pieces(self, points: NDArray[np.floating]) -> tuple[Reals, Reals, Reals]:
-        """Metres [M, P' - 1] along each piece to its place nearest to points [M, 2], and from there to the points."""
-        offset = points[:, None] - self.points[None, :-1]
-        share = ((offset * self.direction).sum(-1)).clip(0.0, self._length)
-        away = offset - share[..., None] * self.direction
-        return share, away, np.linalg.norm(away, axis=-1)
+        return to_pieces(self.points[:-1], self.direction, self._length, points[:, None])
 
 
 def _corners(
@@ -245,10 +241,10 @@ def _stops_along(scenario: Scenario, route: RouteLine, light: int) -> list[float
     lane = scenario.road.lanes[int(scenario.signal_lane[light])][:, :2].astype(np.float64)
     nearest = int(np.linalg.norm(lane - stop, axis=-1).argmin())
     path = lane[nearest:]
-    path = np.concatenate([stop[None], path[np.linalg.norm(path - stop, axis=-1) < 15.0]])
+    path = np.concatenate([stop[None], path[np.linalg.norm(path - stop, axis=-1) < STOP_CHORD]])
     found = []
-    for station in route.passes(stop, _AT_STOP):
-        along, aside, _ = route.project(path, station - _BACK, station + 25.0)
-        if (np.abs(aside) < _AT_STOP).all() and station > -_BACK and along[-1] - along[0] > -1.0:
+    for station in route.passes(stop, AT_STOP):
+        along, aside, _ = route.project(path, station - BACK, station + STOP_CHORD + 2 * BACK)
+        if (np.abs(aside) < AT_STOP).all() and station > -BACK and along[-1] - along[0] > -1.0:
             found.append(station)
     return found
