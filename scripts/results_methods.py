@@ -139,22 +139,33 @@ def eight(place: str) -> Grid:
     return grid
 
 
+ROADSIDE = (
+    ("included, no search", "roadside/included-none", "driving/{}-none"),
+    ("learned on with a roadside, no search", "roadside/roadside-none", "roadside/roadside-{}-none"),
+    ("included", "roadside/included-replace-branch", "driving/{}-replace-branch"),
+    ("two other seeds of it, mean", "roadside/seed-*", "driving/{}-replace-branch-[12]0"),
+    (
+        "learned on with a roadside",
+        "roadside/roadside-replace-branch",
+        "roadside/roadside-{}-replace-branch",
+    ),
+)
+"""Labels, and records among parked cars and on the two test parts."""
+
+
 def roadside() -> Grid:
     """The included agent, and the same after it learned from parked cars and people beside the road."""
-    places = {"": "beside parked cars", "town-": "towns", "ngsim-": "NGSIM"}
-    shown = ("collision_rate", "min_sade")
-    grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in shown)]]
-    for way, word in (("none", ", no search"), ("replace-branch", "")):
-        for name, label in (("included", "included"), ("roadside", "learned on with a roadside")):
-            line = [label + word]
-            for place in places:
-                elsewhere = f"driving/{place}{way}" if name == "included" and place else ""
-                (record,) = records(elsewhere or f"roadside/{name}-{place}{way}")
-                line += [
-                    f"{record[key]:.{COLUMNS[key][1]}f} ± {record[f'{key}_se']:.{COLUMNS[key][1]}f}"
-                    for key in shown
-                ]
-            grid.append(line)
+    columns = ("collision_rate", "min_sade")
+    places = {"": "beside parked cars", **DRIVEN}
+    grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in columns)]]
+    for label, parked, plain in ROADSIDE:
+        line = [label]
+        for place in places:
+            found = records(plain.format(place) if place else parked)
+            for key in columns:
+                mean, error = (np.mean([record[name] for record in found]) for name in (key, f"{key}_se"))
+                line.append(f"{mean:.{COLUMNS[key][1]}f} ± {error:.{COLUMNS[key][1]}f}")
+        grid.append(line)
     return grid
 
 
