@@ -56,7 +56,16 @@ def test_values_and_gradients_equal_an_elementwise_reference(mode, dtype, tolera
     torch.testing.assert_close(again, pooled.detach(), rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("network", [nn.Linear(3, 4), nn.Sequential(nn.Linear(3, 4, bias=False), nn.Tanh())])
+@pytest.mark.parametrize(
+    "network",
+    [
+        nn.Linear(3, 4),
+        nn.Sequential(nn.Linear(3, 4, bias=False), nn.Tanh()),
+        mlp((3, 4)),
+        mlp((3, 5, 4)),
+        mlp((3, 4, 6, 4)),
+    ],
+)
 @pytest.mark.parametrize("mode", ["dense", "winner"])
 def test_gradcheck_for_any_row_wise_function(network, mode):
     torch.manual_seed(1)

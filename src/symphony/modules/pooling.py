@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal
 
 import torch
@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from symphony.geometry.nearest import on_host
-from symphony.modules.rows import reusing
+from symphony.modules.rows import plain_layers, reusing
+from symphony.modules.winners import own_channel, won
 
 PoolMode = Literal["auto", "dense", "winner"]
 ROWS = 2048
@@ -97,6 +98,27 @@ def _first_valid(valid: Bool[Tensor, "n K"]) -> Int[Tensor, " n"]:
     return valid.to(torch.uint8).argmax(1)
 
 
+def _blocks(
+    sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], size: int
+) -> Iterator[tuple[Float[Tensor, "sK F"], int]]:
+    """The elements of ``size`` sets at a time, and how many of these there are; the last block is filled up."""
+    n, count, features = sets.shape
+    flat = sets.reshape(n * count, features)
+    order = None
+    if not (on_host(valid) and bool(valid.all())):
+        # A masked element repeats a valid one: cheaper than masking the H-wide outputs, and the maximum is the same.
+        place = torch.arange(n * count, device=sets.device).view(n, count)
+        order = torch.where(valid, place, place.gather(1, _first_valid(valid)[:, None])).view(-1)
+    for start in range(0, n * count, size * count):
+        stop = start + size * count
+        block = flat[start:stop] if order is None else flat.index_select(0, order[start:stop])
+        missing = size * count - block.shape[0]
+        if missing:
+            # A fixed number of rows fixes the kernel, hence the rounding, of every matrix product.
+            block = torch.cat([block, block.new_zeros(missing, features)])
+        yield block, size - missing // count
+
+
 def _in_chunks(
     function: Callable[[Tensor], Tensor],
     sets: Float[Tensor, "n K F"],
@@ -106,25 +128,13 @@ def _in_chunks(
     index: bool,
 ) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"] | None]:
     """Maxima `[n, H]`, and on request the element `[n, H]` of each; arbitrary for sets without valid elements."""
-    n, count, features = sets.shape
+    count = sets.shape[1]
     size = max(1, rows // count)
-    flat = sets.reshape(n * count, features)
-    order = None
-    if not (on_host(valid) and bool(valid.all())):
-        # A masked element repeats a valid one: cheaper than masking the H-wide outputs, and the maximum is the same.
-        place = torch.arange(n * count, device=sets.device).view(n, count)
-        order = torch.where(valid, place, place.gather(1, _first_valid(valid)[:, None])).view(-1)
     # Elsewhere there is no cache to stay in, and layers may be anything.
     function = reusing(function) if on_host(sets) else function
     maxima, winners = [], []
-    for start in range(0, n * count, size * count):
-        stop = start + size * count
-        block = flat[start:stop] if order is None else flat.index_select(0, order[start:stop])
-        missing = size * count - block.shape[0]
-        if missing:
-            # A fixed number of rows fixes the kernel, hence the rounding, of every matrix product.
-            block = torch.cat([block, block.new_zeros(missing, features)])
-        encoded = function(block).reshape(size, count, -1)[: size - missing // count]
+    for block, sets_in_it in _blocks(sets, valid, size):
+        encoded = function(block).reshape(size, count, -1)[:sets_in_it]
         if index:
             best, where = encoded.max(1)
             winners.append(where)
@@ -134,18 +144,53 @@ def _in_chunks(
     return torch.cat(maxima), torch.cat(winners) if index else None
 
 
+def _by_channel(
+    linears: Sequence[nn.Linear], sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], rows: int
+) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"]]:
+    """The same of an :func:`symphony.modules.mlp` on the CPU: outputs lie channel by channel, where the place of a
+    maximum is found five times as fast.
+    """
+    count = sets.shape[1]
+    size = max(1, rows // count)
+    *before, (weight, bias) = ((layer.weight, layer.bias[:, None]) for layer in linears)
+    # Written to the same memory for each block, which stays in the cache.
+    between = [weight.new_empty(size * count, len(inner)) for inner, _ in before]
+    out = weight.new_empty(len(weight), size * count)
+    maxima, winners = [], []
+    for block, sets_in_it in _blocks(sets, valid, size):
+        hidden = block
+        for (inner, shift), place in zip(before, between, strict=True):
+            hidden = torch.addmm(shift[:, 0], hidden, inner.t(), out=place).relu_()
+        encoded = torch.addmm(bias, weight, hidden.t(), out=out).view(-1, size, count)[:, :sets_in_it]
+        where = torch.from_numpy(encoded.numpy().argmax(-1))
+        winners.append(where.t())
+        maxima.append(encoded.gather(-1, where[..., None])[..., 0].t())
+    return torch.cat(maxima), torch.cat(winners)
+
+
 def _through_winners(
     function: Callable[[Tensor], Tensor], sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], rows: int
 ) -> Float[Tensor, "n H"]:
+    linears = plain_layers(function) if on_host(sets) else []
     with torch.no_grad():
-        _, winners = _in_chunks(function, sets, valid, rows, index=True)
-        if winners is None:  # pragma: no cover - asked for just above
-            raise RuntimeError("no winners were returned")
+        if linears:
+            best, winners = _by_channel(linears, sets.detach(), valid, rows)
+        else:
+            best, found = _in_chunks(function, sets, valid, rows, index=True)
+            if found is None:  # pragma: no cover - asked for just above
+                raise RuntimeError("no winners were returned")
+            winners = found
         occupied = valid.any(1, keepdim=True)
         # A winning masked element is a copy of the first valid one.
         winners = torch.where(valid.gather(1, winners), winners, _first_valid(valid)[:, None])
-    chosen = sets.gather(1, winners[..., None].expand(-1, -1, sets.shape[-1]))
-    chosen = torch.where(occupied[..., None], chosen, 0.0)
+    n, count, features = sets.shape
+    # Of a place [n, H] in a set the one among the elements of all sets.
+    place = (winners + torch.arange(0, n * count, count, device=sets.device)[:, None]).flatten()
+    chosen = sets.reshape(n * count, features).index_select(0, place).view(n, -1, features)
+    if not (on_host(occupied) and bool(occupied.all())):
+        chosen = torch.where(occupied[..., None], chosen, 0.0)
+    if linears:
+        return torch.where(occupied, won(best, chosen, linears), 0.0)
     return torch.where(occupied, _own_channel(function, chosen), 0.0)
 
 
@@ -153,12 +198,7 @@ def _own_channel(
     function: Callable[[Tensor], Tensor], chosen: Float[Tensor, "n H F"]
 ) -> Float[Tensor, "n H"]:
     """Output channel c of element c: `[n, H, F] -> [n, H]`."""
-    last = function[-1] if isinstance(function, nn.Sequential) and len(function) else None
-    if not isinstance(function, nn.Sequential) or not isinstance(last, nn.Linear):
-        return function(chosen.flatten(0, 1)).unflatten(0, chosen.shape[:2]).diagonal(dim1=1, dim2=2)
-    # Of the last layer one output in H is needed, so only that one is computed.
-    hidden = chosen
-    for layer in list(function)[:-1]:
-        hidden = layer(hidden)
-    out = (hidden * last.weight).sum(-1)
-    return out if last.bias is None else out + last.bias
+    linears = plain_layers(function)
+    if linears:
+        return own_channel(chosen, [(layer.weight, layer.bias) for layer in linears])
+    return function(chosen.flatten(0, 1)).unflatten(0, chosen.shape[:2]).diagonal(dim1=1, dim2=2)

@@ -55,19 +55,24 @@ def in_blocks(
     return out.reshape(*x.shape[:-1], out.shape[-1])
 
 
+def plain_layers(function: Callable[[Tensor], Tensor]) -> list[nn.Linear]:
+    """The linear layers of an :func:`mlp`; of anything else none."""
+    layers = list(function) if isinstance(function, nn.Sequential) else []
+    linears = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
+    plain = bool(linears) and layers[::2] == linears and layers[-1] is linears[-1]
+    return linears if plain and all(type(layer) is nn.ReLU for layer in layers[1::2]) else []
+
+
 def reusing(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """The same row-wise function, for a loop over blocks of one size without gradients on the CPU.
 
     What it gives is only valid until it is called again: the layers of an :func:`mlp` write to the same memory each
     time, which stays in the cache, where fresh memory would take almost as long as the products.
     """
-    layers = list(function) if isinstance(function, nn.Sequential) else []
-    linear = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
-    plain = bool(linear) and layers[::2] == linear and layers[-1] is linear[-1]
-    plain = plain and all(type(layer) is nn.ReLU for layer in layers[1::2])
-    if not plain or torch.compiler.is_compiling() or transformed():
+    linears = plain_layers(function)
+    if not linears or torch.compiler.is_compiling() or transformed():
         return function
-    parts = [(layer.bias.detach(), layer.weight.detach().t()) for layer in linear]
+    parts = [(layer.bias.detach(), layer.weight.detach().t()) for layer in linears]
     kept: list[Tensor] = []
 
     def apply(block: Float[Tensor, "n F"]) -> Float[Tensor, "n H"]:

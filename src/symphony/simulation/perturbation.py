@@ -104,11 +104,10 @@ def perturbed(
         config: how many and how far.
         rng: for all draws.
     """
-    chosen = torch.rand(len(state), generator=rng) < config.share
-    start = displaced(logged, config, rng)
-    target = way_back(start, logged, following, size[:, 0], dt)
-    pair = torch.stack([start, target], 1)
+    chosen = (torch.rand(len(state), generator=rng) < config.share).nonzero()[:, 0]
+    moved, before, size = displaced(logged, config, rng)[chosen], logged[chosen], size[chosen]
+    target = way_back(moved, before, following[chosen], size[:, 0], dt)
+    pair = torch.stack([moved, target], 1)
     known = torch.ones(pair.shape[:2], dtype=torch.bool)
     label, _ = dynamics.fit(pair[..., :2], pair[..., 2], pair[..., 3], known, size, dt)
-    wide = chosen if action.ndim == 1 else chosen[:, None]
-    return torch.where(chosen[:, None], start, state), torch.where(wide, label[:, 0].to(action.dtype), action)
+    return state.index_copy(0, chosen, moved), action.index_copy(0, chosen, label[:, 0].to(action.dtype))
