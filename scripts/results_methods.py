@@ -73,11 +73,12 @@ FOREST = (
 """Of the included agent on every fifth test segment of towns."""
 DRIVEN = {"town": "towns", "ngsim": "real roads"}
 INCLUDED = (
-    ("log playback", "none", "playback"),
-    ("constant velocity", "none", "constant_velocity"),
-    ("BC", "bc", ""),
-    ("BC+TS+H without its search", "none", ""),
-    ("BC+TS+H", "replace-branch", ""),
+    ("log playback", "driving/{}-none", "playback"),
+    ("constant velocity", "driving/{}-none", "constant_velocity"),
+    ("BC", "driving/{}-bc", ""),
+    ("BC that observes as much", "eight/{}-bc-40", ""),
+    ("BC+TS+H without its search", "driving/{}-none", ""),
+    ("BC+TS+H", "driving/{}-replace-branch", ""),
 )
 LABELS = (
     ("BC+H, one route taught (seed 0)", "bc/bc_h-0-none"),
@@ -136,6 +137,28 @@ def eight(place: str) -> Grid:
         jsd = [(record[part] if part else record)["curvature_jsd"] for record in found]
         cost = "" if part else f"{np.mean([r['cost']['simulation'] / r['segments'] for r in found]):.2f}"
         grid.append([*line, f"{np.mean(jsd):.3f}", cost, "" if part else str(len(found))])
+    return grid
+
+
+RATES = tuple((rate, f"rates/{{}}-{rate}") for rate in ("0.001", "0.003", "0.006", "0.01", "0.02"))
+"""Learning rates of BC, and their records on the validation parts."""
+
+
+def driven(
+    rows: Sequence[tuple[str, str]],
+    places: dict[str, str] = DRIVEN,
+    columns: Sequence[str] = ("collision_rate", "offroad_time", "ade", "min_sade"),
+) -> Grid:
+    """One record per row and place (its name stands for ``{}``), with errors over recordings."""
+    grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in columns)]]
+    for label, pattern in rows:
+        line = [label]
+        for place in places:
+            (record,) = records(pattern.format(place))
+            for key in columns:
+                digits = COLUMNS[key][1]
+                line.append(f"{record[key]:.{digits}f} ± {record[f'{key}_se']:.{digits}f}")
+        grid.append(line)
     return grid
 
 
@@ -242,10 +265,10 @@ def included() -> Grid:
     """The agent that comes with the package beside baselines, on simulated towns and on real roads."""
     columns = ("collision_rate", "ade", "min_sade")
     grid = [["", *(f"{where}: {COLUMNS[key][0]}" for where in DRIVEN.values() for key in columns)]]
-    for label, name, part in INCLUDED:
+    for label, pattern, part in INCLUDED:
         line = [label]
         for data in DRIVEN:
-            (record,) = records(f"driving/{data}-{name}")
+            (record,) = records(pattern.format(data))
             row = record[part] if part else record
             line += [
                 f"{row[key]:.{COLUMNS[key][1]}f} ± {row[f'{key}_se']:.{COLUMNS[key][1]}f}" for key in columns

@@ -12,6 +12,7 @@ from symphony.evaluation.paired import clustered_mean
 REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
 ROAD_BASELINES = (("log playback", "playback"), ("constant velocity", "constant_velocity"), ("IDM", "idm"))
 ROAD_AGENTS = {
+    "paper": "BC, the paper's inputs",
     "bc": "BC",
     "bc_h": "BC+H",
     "bc_ts": "BC+TS",
@@ -24,12 +25,14 @@ LEARNED_FROM = {
     "ngsim": "NGSIM",
     "both": "SUMO, NGSIM",
     "included": "SUMO, NGSIM, longer",
+    "rate": "SUMO, NGSIM, rate 0.01",
 }
 ELSEWHERE = {
     "2-constant_velocity": "driving/ngsim-constant-velocity",
-    "2-included-bc": "driving/ngsim-bc",
     "2-included-none": "driving/ngsim-none",
     "2-included-bc_ts_h": "driving/ngsim-replace-branch",
+    "2-rate-paper": "driving/ngsim-bc",
+    **{f"2-rate-{method}": f"eight/ngsim-{method}-40" for method in ("bc", "bc_h", "bc_ts", "bc_ts_h")},
 }
 """Records of the table on real roads that other tables have, too."""
 UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
@@ -63,8 +66,7 @@ def road_rows(count: int) -> list[tuple[str, str, Record]]:
     names = [("", label, name) for label, name in ROAD_BASELINES]
     for data, source in LEARNED_FROM.items():
         for method, label in ROAD_AGENTS.items():
-            plain = data == "included" and method == "bc"
-            names.append((source, f"{label}, the paper's inputs" if plain else label, f"{data}-{method}"))
+            names.append((source, label, f"{data}-{method}"))
     found = []
     for source, label, name in names:
         path = RECORDS / f"roads/{count}-{name}.json"

@@ -222,7 +222,7 @@ class TrainConfig(RunConfig):
     """Run segments and expert states drawn more often than others."""
     goals: int = 128
     """Expert routes per update of the goal policy (methods with H)."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 1e-2
     """Of Adam, falling to a tenth along a cosine."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """The beam search (methods with TS; MGAIL without TS simulates as many rollouts and keeps all)."""
