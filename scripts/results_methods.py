@@ -142,6 +142,17 @@ def eight(place: str) -> Grid:
 
 RATES = tuple((rate, f"rates/{{}}-{rate}") for rate in ("0.001", "0.003", "0.006", "0.01", "0.02"))
 """Learning rates of BC, and their records on the validation parts."""
+PARTS = (
+    ("BC with the paper's inputs", "driving/{}-bc"),
+    ("BC", "eight/{}-bc-40"),
+    ("BC, 500 updates more", "parts/{}-bc500"),
+    ("BC+TS without its search", "parts/{}-bc_ts_none"),
+    ("BC+TS, the paper's discriminator, halved every 2 s", "parts/{}-paperd"),
+    ("BC+TS", "eight/{}-bc_ts-40"),
+    ("BC+TS+H without its search", "parts/{}-bc_ts_h_none"),
+    ("BC+TS+H", "eight/{}-bc_ts_h-40"),
+)
+"""What inputs, further updates, distillation and search each do, of one seed."""
 
 
 def driven(
