@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from symphony.data.context import relations
 from symphony.metrics import order_statistics, passing_gap
+from symphony.metrics.order import REACH
 from test_context import CASES, scene
 
 STEPS, DT = 60, 0.2
@@ -95,6 +96,7 @@ def test_both_at_once() -> None:
 
 
 @given(st.floats(1, 11), st.floats(1, 11), st.floats(2, 20), st.floats(2, 20), st.floats(-4, 4))
+@example(1.0, 1.0, 2.0, 3.0, 1.0)
 def test_swapping_turning_and_moving(
     mine: float, theirs: float, speed: float, other: float, angle: float
 ) -> None:
@@ -103,7 +105,10 @@ def test_swapping_turning_and_moving(
     assert gap(b, a) == pytest.approx(-plain)
     turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]).double()
     moved = torch.tensor([30.0, -7.0]).double()
-    assert gap(a @ turn + moved, b @ turn + moved) == pytest.approx(plain, abs=2 * DT / 4)
+    # A place that lies just as far as the paths reach may be counted or not, after a turn.
+    found = [passing_gap(a, b, EVERY, EVERY, DT, REACH + margin).item() for margin in (-1e-6, 0, 1e-6)]
+    turned = gap(a @ turn + moved, b @ turn + moved)
+    assert any(turned == pytest.approx(value, abs=2 * DT / 4, nan_ok=True) for value in found)
 
 
 def test_batches() -> None:
