@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -110,12 +110,24 @@ NGSIM = (
 )
 
 
+def cells(found: Sequence[Record], columns: Iterable[str], part: str = "") -> list[str]:
+    """Figures ± standard errors over recordings (of several records, the mean of either); `part` names a baseline's
+    row in them.
+    """
+    rows = [record[part] if part else record for record in found]
+    line = []
+    for key in columns:
+        mean, error = (np.mean([row[name] for row in rows]) for name in (key, f"{key}_se"))
+        line.append(f"{mean:.{COLUMNS[key][1]}f} ± {error:.{COLUMNS[key][1]}f}")
+    return line
+
+
 def eight(place: str) -> Grid:
     """The methods on one test part, as far as there are records: means over seeds, ± standard error over recordings
     (of one seed, the mean of these); for collisions also that over seeds.
     """
-    names = ("collision_rate", "collision_with_playback", "offroad_time", "ade", "min_sade")
-    head = ["collisions %", "± over seeds", "with playback %", *(COLUMNS[name][0] for name in names[2:])]
+    last = ("offroad_time", "ade", "min_sade")
+    head = ["collisions %", "± over seeds", "with playback %", *(COLUMNS[name][0] for name in last)]
     grid = [["", *head, COLUMNS["curvature_jsd"][0], "CPU s", "seeds"]]
     baselines = records(f"eight/{place}-bc-[0-9]*")[0]
     rows = [(PLAYBACK, [baselines], "playback"), ("constant velocity", [baselines], "constant_velocity")]
@@ -123,20 +135,16 @@ def eight(place: str) -> Grid:
         if any(RECORDS.glob(f"eight/{place}-{method}-[0-9]*.json")):
             rows.append((label, records(f"eight/{place}-{method}-[0-9]*"), ""))
     for label, found, part in rows:
-        line = [label]
-        for name in names:
-            digits = COLUMNS[name][1] if name in COLUMNS else 1
-            rows_of = [record[part] if part else record for record in found]
-            mean, error = (np.mean([row[key] for row in rows_of]) for key in (name, f"{name}_se"))
-            shown = name != "collision_with_playback"
-            line.append(f"{mean:.{digits}f}" + (f" ± {error:.{digits}f}" if shown else ""))
-            if name == "collision_rate":
-                values = [record[name] for record in found]
-                several = len(values) > 1
-                line.append(f"{np.std(values, ddof=1) / len(values) ** 0.5:.1f}" if several else "")
-        jsd = [(record[part] if part else record)["curvature_jsd"] for record in found]
+        rates = [record["collision_rate"] for record in found]
+        playback, jsd = (
+            np.mean([(record[part] if part else record)[key] for record in found])
+            for key in ("collision_with_playback", "curvature_jsd")
+        )
+        line = [label, *cells(found, ["collision_rate"], part)]
+        line += [f"{np.std(rates, ddof=1) / len(rates) ** 0.5:.1f}" if len(rates) > 1 else ""]
+        line += [f"{playback:.1f}", *cells(found, last, part), f"{jsd:.3f}"]
         cost = "" if part else f"{np.mean([r['cost']['simulation'] / r['segments'] for r in found]):.2f}"
-        grid.append([*line, f"{np.mean(jsd):.3f}", cost, "" if part else str(len(found))])
+        grid.append([*line, cost, "" if part else str(len(found))])
     return grid
 
 
@@ -156,20 +164,15 @@ PARTS = (
 
 
 def driven(
-    rows: Sequence[tuple[str, str]],
+    rows: Sequence[tuple[str, str] | tuple[str, str, str]],
     places: dict[str, str] = DRIVEN,
     columns: Sequence[str] = ("collision_rate", "offroad_time", "ade", "min_sade"),
 ) -> Grid:
-    """One record per row and place (its name stands for ``{}``), with errors over recordings."""
+    """One record per row and place (its name stands for ``{}``); a third entry names a baseline's row in it."""
     grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in columns)]]
-    for label, pattern in rows:
-        line = [label]
-        for place in places:
-            (record,) = records(pattern.format(place))
-            for key in columns:
-                digits = COLUMNS[key][1]
-                line.append(f"{record[key]:.{digits}f} ± {record[f'{key}_se']:.{digits}f}")
-        grid.append(line)
+    for label, pattern, *part in rows:
+        found = [records(pattern.format(place)) for place in places]
+        grid.append([label, *(cell for one in found for cell in cells(one, columns, *part))])
     return grid
 
 
@@ -193,13 +196,8 @@ def roadside() -> Grid:
     places = {"": "beside parked cars", **DRIVEN}
     grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in columns)]]
     for label, parked, plain in ROADSIDE:
-        line = [label]
-        for place in places:
-            found = records(plain.format(place) if place else parked)
-            for key in columns:
-                mean, error = (np.mean([record[name] for record in found]) for name in (key, f"{key}_se"))
-                line.append(f"{mean:.{COLUMNS[key][1]}f} ± {error:.{COLUMNS[key][1]}f}")
-        grid.append(line)
+        found = [records(plain.format(place) if place else parked) for place in places]
+        grid.append([label, *(cell for one in found for cell in cells(one, columns))])
     return grid
 
 
@@ -263,26 +261,11 @@ def searched(folder: str, data: str, rows: Sequence[tuple[str, str, str]] = SEAR
     grid = [["", *(heading for heading, _ in COLUMNS.values()), "CPU s"]]
     for label, name, part in rows:
         (record,) = records(f"{folder}/{data}-{name}")
-        row = record[part] if part else record
-        cells = [
-            f"{row[key]:.{digits}f} ± {row[f'{key}_se']:.{digits}f}" for key, (_, digits) in COLUMNS.items()
-        ]
         cost = "" if part else f"{record['cost']['simulation'] / record['segments']:.2f}"
-        grid.append([label, *cells, cost])
+        grid.append([label, *cells([record], COLUMNS, part), cost])
     return grid
 
 
 def included() -> Grid:
     """The agent that comes with the package beside baselines, on simulated towns and on real roads."""
-    columns = ("collision_rate", "ade", "min_sade")
-    grid = [["", *(f"{where}: {COLUMNS[key][0]}" for where in DRIVEN.values() for key in columns)]]
-    for label, pattern, part in INCLUDED:
-        line = [label]
-        for data in DRIVEN:
-            (record,) = records(pattern.format(data))
-            row = record[part] if part else record
-            line += [
-                f"{row[key]:.{COLUMNS[key][1]}f} ± {row[f'{key}_se']:.{COLUMNS[key][1]}f}" for key in columns
-            ]
-        grid.append(line)
-    return grid
+    return driven(INCLUDED, columns=("collision_rate", "ade", "min_sade"))
