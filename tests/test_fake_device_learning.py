@@ -24,8 +24,9 @@ from symphony.roadgraph import LaneGraph
 from symphony.simulation.rollouts import simulate, start_states
 from symphony.simulation.search import search
 
+LOGGED = 4  # a search of them prunes once
 SCENES = collate(
-    [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=6), crossing(6, steps=6))]
+    [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=LOGGED), crossing(6, steps=LOGGED))]
 )
 ROWS = 4
 
@@ -63,7 +64,7 @@ def test_simulations_stay_on_the_device(space: Any) -> None:
         run()
         device.waits.clear()
         found = run()
-        assert found.state.shape == (2, 2, 1, 6, 2, 4)
+        assert found.state.shape == (2, 2, 1, LOGGED, 2, 4)
         assert {part.device.type for part in found} == {NAME}
         assert device.waits == []
 
@@ -79,7 +80,7 @@ def test_searches_stay_on_the_device(rule: PruningRule) -> None:
         run()
         device.waits.clear()
         found = run()
-        assert found.trajectories.shape == (2, 1, 4, 5)
+        assert found.trajectories.shape == (2, 1, 4, LOGGED - 1)
         assert found.totals.device.type == NAME
         assert device.waits == []
 
