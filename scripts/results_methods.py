@@ -161,6 +161,37 @@ PARTS = (
     ("BC+TS+H", "eight/{}-bc_ts_h-40"),
 )
 """What inputs, further updates, distillation and search each do, of one seed."""
+INPUTS = (
+    ("the paper's inputs", "inputs/{}-paper"),
+    ("+ gaps to others", "inputs/{}-gaps"),
+    ("+ displaced states", "inputs/{}-perturb"),
+    ("+ lights of their own", "inputs/{}-lights"),
+    ("+ 21 levels of acceleration", "inputs/{}-levels"),
+    ("all four", "rates/{}-0.01"),
+    ("all four, the nearest 128 points", "inputs/{}-p128"),
+    ("all four, the nearest 512 points", "inputs/{}-p512"),
+)
+"""What each change of the paper's inputs does alone, and their records on the validation parts."""
+ADVERSARIAL = (
+    ("2 000 updates of regression at 0.01", "adversarial/{}-short"),
+    ("6 000 at 0.01", "adversarial/{}-faster"),
+    ("6 000 at 0.003", "adversarial/{}-regression"),
+    ("and 300 adversarial updates", "adversarial/{}-detached"),
+    ("and 300 at a rate five times as high", "adversarial/{}-fast"),
+    ("and 300 with the gradient through reactions, too", "adversarial/{}-react"),
+)
+"""MGAIL before and after adversarial updates, and their records on the validation parts."""
+SETTINGS = {"many": "8 agents", "long": "20 s"}
+FORESTS = tuple(
+    (f"{label}, {way}", f"{method}-{name}", "")
+    for method, label in (("bc_ts", "BC+TS"), ("bc_ts_h", "BC+TS+H"))
+    for way, name in (
+        ("no search", "none"),
+        ("the leaves of one tree of 16", "one"),
+        ("a leaf each of 16 trees of 16", "forest"),
+    )
+)
+"""Methods with TS by the paper's reading, on every fifth test segment of towns."""
 
 
 def driven(
@@ -188,6 +219,18 @@ ROADSIDE = (
     ),
 )
 """Labels, and records among parked cars and on the two test parts."""
+
+
+def settings() -> Grid:
+    """The methods in the paper's other settings: what they learned with two agents in 10 s, tried in these."""
+    baselines = [(PLAYBACK, "playback"), ("constant velocity", "constant_velocity")]
+    rows = [(label, "settings/{}-bc-40", part) for label, part in baselines]
+    rows += [
+        (label, f"settings/{{}}-{method}-[0-9]*", "")
+        for method, label in EIGHT.items()
+        if any(RECORDS.glob(f"settings/*-{method}-[0-9]*.json"))
+    ]
+    return driven(rows, SETTINGS)
 
 
 def roadside() -> Grid:

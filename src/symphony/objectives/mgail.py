@@ -47,7 +47,7 @@ class MGAILLoss(MaskedLoss):
         horizon: T, steps per rollout; given numbers decide it where there are any.
         cost: of a logit, see :data:`COSTS`.
         detach_keys: inputs of the actor through which no gradient flows back to earlier states. Without them
-            gradients pass through the actor's reactions too, and explode sooner.
+            gradients pass through the actor's reactions too.
         truncate: steps after which the gradient is cut; 0: never.
         checkpoint: steps that are simulated once more in the backward pass instead of being kept; 0: all are
             kept. Changes no result; memory then grows with T / checkpoint + checkpoint instead of T.
