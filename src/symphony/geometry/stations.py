@@ -19,6 +19,8 @@ _SLACK = 3.0
 """Metres along the line, besides the way driven, within which the next place is looked for."""
 _CUT = 1.5
 """Metres along the line to a metre driven: who cuts a corner gets on faster."""
+_TOGETHER = 1 << 15
+"""Distances of points to pieces that are found together."""
 
 
 def stations_along(
@@ -41,20 +43,35 @@ def stations_along(
     direction = way / np.maximum(length, np.finfo(np.float64).tiny)[..., None]
     arc = np.concatenate([np.zeros_like(length[:, :1]), length.cumsum(1)], 1)
     row, found = np.arange(len(lines)), np.full(valid.shape, np.nan)
-    station, last = np.full(len(lines), np.nan), np.zeros((len(lines), 2))
-    for step in range(path.shape[1]):
-        point = path[:, step]
-        share, _, distance = to_pieces(lines[:, :-1], direction, length, point[:, None])
-        reach = (_CUT * np.linalg.norm(point - last, axis=-1) + _SLACK)[:, None]
-        began = ~np.isnan(station)[:, None]
-        with np.errstate(invalid="ignore"):
-            inside = (arc[:, 1:] >= station[:, None] - reach) & (arc[:, :-1] <= station[:, None] + reach)
-        piece = np.where(began[:, 0], np.where(inside, distance, np.inf).argmin(1), earliest_pass(distance))
-        here = valid[:, step]
-        station = np.where(here, arc[row, piece] + share[row, piece], station)
-        last = np.where(here[:, None], point, last)
-        found[here, step] = station[here]
-    return found
+    first, reach = valid.argmax(1), _reach(path, valid)
+    station = np.zeros(len(lines))
+    block = max(1, _TOGETHER // max(1, length.size))
+    for a in range(0, path.shape[1], block):
+        part = path[:, a : a + block, None]
+        share, _, distance = to_pieces(lines[:, None, :-1], direction[:, None], length[:, None], part)
+        # Each step depends on the one before; all that does not is known by now.
+        for k in range(part.shape[1]):
+            step, near = a + k, distance[:, k]
+            low, high = (station - reach[:, step])[:, None], (station + reach[:, step])[:, None]
+            inside = (arc[:, 1:] >= low) & (arc[:, :-1] <= high)
+            piece = np.where(inside, near, np.inf).argmin(1)
+            begins = np.flatnonzero(valid[:, step] & (first == step))
+            if len(begins):
+                piece[begins] = earliest_pass(near[begins])
+            station = np.where(valid[:, step], arc[row, piece] + share[row, k, piece], station)
+            found[:, step] = station
+    return np.where(valid, found, np.nan)
+
+
+def _reach(
+    path: Float[NDArray[np.float64], "R U 2"], valid: Bool[NDArray[np.bool_], "R U"]
+) -> Float[NDArray[np.float64], "R U"]:
+    """Metres along the line within which the next place is looked for, from the last point that exists."""
+    steps = np.arange(path.shape[1])
+    before = np.maximum.accumulate(np.where(valid, steps, 0), 1)[:, :-1]
+    last = np.take_along_axis(path, before[..., None], 1)
+    driven = np.linalg.norm(path[:, 1:] - last, axis=-1)
+    return _CUT * np.pad(driven, ((0, 0), (1, 0))) + _SLACK
 
 
 def earliest_pass(distance: Float[NDArray[np.float64], "*b pieces"]) -> NDArray[np.int64]:
@@ -76,7 +93,9 @@ def to_pieces(
         length: [...] metres.
         point: [..., 2] metres.
     """
-    offset = point - start
-    share = (offset * direction).sum(-1).clip(0.0, length)
-    away = offset - share[..., None] * direction
-    return share, away, np.linalg.norm(away, axis=-1)
+    # Component by component: sums over a last dimension of 2 are slow.
+    x, y = (point[..., k] - start[..., k] for k in (0, 1))
+    along_x, along_y = direction[..., 0], direction[..., 1]
+    share = (x * along_x + y * along_y).clip(0.0, length)
+    x, y = x - share * along_x, y - share * along_y
+    return share, np.stack([x, y], -1), np.sqrt(x * x + y * y)
