@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from results_base import ROOT, Grid, beside, means, records
 from results_methods import (
+    ADVERSARIAL,
     BC,
     DRIVEN,
     FEATURES,
@@ -69,6 +70,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "roadside": roadside,
     "parts": lambda: driven(PARTS),
     "rates": lambda: driven(RATES),
+    "adversarial": lambda: driven(ADVERSARIAL),
     "eight-town": lambda: eight("town"),
     "eight-ngsim": lambda: eight("ngsim"),
     "features": lambda: means(FEATURES),
