@@ -271,16 +271,16 @@ def _entry(record: Record, pattern: str) -> Entry:
 
 
 def against_paper() -> Grid:
-    """Collisions, time off the road and ADE beside the paper's on WOMD."""
+    """Collisions, time off the road and ADE in towns beside the paper's on WOMD."""
     columns = ("collision_rate", "offroad_time", "ade")
     figures = paper_figures("main", "womd") or {}
     grid = [["", *(head for name in columns for head in (COLUMNS[name][0], "paper"))]]
-    for label, pattern in (*BC, *MGAIL):
+    for method, label in EIGHT.items():
         line = [label]
+        found = records(f"eight/town-{method}-[0-9]*")
         for name in columns:
-            line.append(mean_of([row[name] for row in records(pattern)], COLUMNS[name][1]))
-            mean, error = figures[Path(pattern).name.split("-")[0]][name]
-            line.append(f"{mean:.2f} ± {error:.2f}")
+            mean, error = figures[method][name]
+            line += [mean_of([row[name] for row in found], COLUMNS[name][1]), f"{mean:.2f} ± {error:.2f}"]
         grid.append(line)
     return grid
 
