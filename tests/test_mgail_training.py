@@ -85,7 +85,9 @@ def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> se
 def test_each_phase_changes_the_networks_it_is_for(
     store: Path, tmp_path: Path, method: str, checkpoint: int
 ) -> None:
-    trainer = build(config(method, store, tmp_path, mgail=replace(SHORT, checkpoint=checkpoint)))
+    trainer = build(
+        config(method, store, tmp_path, mgail=replace(SHORT, checkpoint=checkpoint, expert_weight=0.0))
+    )
     goals = {"goals"} if method.endswith("_h") else set()
     phases = ({"policy"}, {"policy"}, {"discriminator"}, {"discriminator"}) + (
         {"policy", "discriminator"},
@@ -173,6 +175,15 @@ def test_regression_beside_it_and_more_updates_of_the_discriminator(
     half, whole = found
     torch.testing.assert_close(2 * half["loss_regression"], whole["loss_regression"])
     assert half["loss_regression"] != 0
+
+
+def test_a_run_that_ends_before_its_adversarial_updates_says_so(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(config("mgail", store, tmp_path / "short", steps=4))
+    assert "warning: the run ends at update 4, before the first of adversarial" in capsys.readouterr().err
+    train(config("mgail", store, tmp_path / "long", steps=5))
+    assert "warning" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("method", METHODS)

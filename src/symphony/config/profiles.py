@@ -30,7 +30,16 @@ def paper(config: TrainConfig) -> TrainConfig:
             segments=16,
             updates=1,
         ),
-        mgail=replace(config.mgail, cost="log_d", regression=0, head_start=0, rollouts=64, react=True),
+        mgail=replace(
+            config.mgail,
+            cost="log_d",
+            regression=0,
+            head_start=0,
+            rollouts=64,
+            react=True,
+            expert_weight=0.0,
+            discriminator_updates=1,
+        ),
         validation=replace(config.validation, segments=200, rollouts=16),
     )
 
@@ -44,11 +53,6 @@ def laptop(config: TrainConfig) -> TrainConfig:
         agent=replace(config.agent, num_points=128),
         discriminator=replace(config.discriminator, features="foresight"),
         search=replace(config.search, survivors="best"),
-        # Without the log beside it the adversarial gradient finds that standing still is safe, and from a start
-        # that leaves the road it does so at once: most updates are the regression's.
-        mgail=replace(
-            config.mgail, regression=2700, head_start=30, expert_weight=0.2, discriminator_updates=2
-        ),
         validation=replace(config.validation, every=1000, segments=48, rollouts=4),
     )
 

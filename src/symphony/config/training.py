@@ -27,9 +27,10 @@ Cost = Literal["log_d", "non_saturating", "logit"]
 class MGAILConfig:
     """How a policy learns from the gradient of the discriminator (methods mgail*)."""
 
-    regression: int = 2000
-    """Updates of plain regression to the log before the adversarial ones (0: none, as in the paper)."""
-    head_start: int = 50
+    regression: int = 2700
+    """Updates of plain regression to the log before the adversarial ones, which need a start that stays on the road
+    (0: none, as in the paper)."""
+    head_start: int = 30
     """Updates of the discriminator alone after them."""
     rollouts: int = 16
     """Rollouts per update that the gradient goes through, drawn from those of the last search."""
@@ -38,9 +39,9 @@ class MGAILConfig:
     cost: Cost = "non_saturating"
     """What the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient vanishes
     in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
-    expert_weight: float = 0.0
-    """Weight of the regression to the log beside it."""
-    discriminator_updates: int = 1
+    expert_weight: float = 0.2
+    """Weight of the regression to the log beside it (the paper: 0, which here ends in standing still)."""
+    discriminator_updates: int = 2
     """Updates of the discriminator per update of the policy."""
     react: bool = False
     """Let the gradient also pass through the policy's reactions to what earlier actions changed."""

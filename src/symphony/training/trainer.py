@@ -8,6 +8,7 @@ import json
 import random
 import time
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,10 @@ class Trainer:
             except CheckpointError as error:
                 raise error.at(file=self.done / MANIFEST) from error
         self.alarms = Alarms()
+        for before, phase in pairwise(self.phases):
+            if before.until >= config.steps:
+                name = getattr(phase.update, "__name__", "the next phase")
+                self._warn(name, f"the run ends at update {config.steps}, before the first of {name}")
         others = [] if self.validator is None else [self.validator.dataset]
         for store in (dataset.store for dataset in (self.data, *others)):
             if store.unfinished is not None:
