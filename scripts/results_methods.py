@@ -152,6 +152,7 @@ RATES = tuple((rate, f"rates/{{}}-{rate}") for rate in ("0.001", "0.003", "0.006
 """Learning rates of BC, and their records on the validation parts."""
 PARTS = (
     ("BC with the paper's inputs", "driving/{}-bc"),
+    ("the same, half of the states displaced", "parts/{}-bcp"),
     ("BC", "eight/{}-bc-40"),
     ("BC, 500 updates more", "parts/{}-bc500"),
     ("BC+TS without its search", "parts/{}-bc_ts_none"),
@@ -165,13 +166,9 @@ INPUTS = (
     ("the paper's inputs", "inputs/{}-paper"),
     ("+ gaps to others", "inputs/{}-gaps"),
     ("+ displaced states", "inputs/{}-perturb"),
-    ("+ lights of their own", "inputs/{}-lights"),
-    ("+ 21 levels of acceleration", "inputs/{}-levels"),
-    ("all four", "rates/{}-0.01"),
-    ("all four, the nearest 128 points", "inputs/{}-p128"),
-    ("all four, the nearest 512 points", "inputs/{}-p512"),
+    ("both, lights of their own, 21 levels of acceleration", "rates/{}-0.01"),
 )
-"""What each change of the paper's inputs does alone, and their records on the validation parts."""
+"""What changes of the paper's inputs do alone, and their records on the validation parts."""
 ADVERSARIAL = (
     ("2 000 updates of regression at 0.01", "adversarial/{}-short"),
     ("6 000 at 0.01", "adversarial/{}-faster"),

@@ -26,6 +26,7 @@ from results_methods import (
     FEATURES,
     FOREST,
     HALVING,
+    INPUTS,
     LABELS,
     MGAIL,
     NGSIM,
@@ -41,6 +42,7 @@ from results_methods import (
     roadside,
     searched,
     setting,
+    settings,
     sweep,
 )
 from results_roads import by_kind, by_place, unseen
@@ -71,6 +73,8 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "parts": lambda: driven(PARTS),
     "rates": lambda: driven(RATES),
     "adversarial": lambda: driven(ADVERSARIAL),
+    "inputs": lambda: driven(INPUTS),
+    "settings": settings,
     "eight-town": lambda: eight("town"),
     "eight-ngsim": lambda: eight("ngsim"),
     "features": lambda: means(FEATURES),
