@@ -53,7 +53,7 @@ def laptop(config: TrainConfig) -> TrainConfig:
         agent=replace(config.agent, num_points=128),
         discriminator=replace(config.discriminator, features="foresight"),
         search=replace(config.search, survivors="best"),
-        # The one input beyond the paper's that halves collisions, and without which MGAIL ends standing still.
+        # Of all that goes beyond the paper's inputs, what lowers collisions most.
         perturb=replace(config.perturb, share=0.5, begin=1500),
         validation=replace(config.validation, every=1000, segments=48, rollouts=4),
     )
