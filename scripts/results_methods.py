@@ -70,7 +70,7 @@ FOREST = (
     ("the leaves of one tree of 16", "one", ""),
     ("a leaf each of 16 trees of 16 (the paper's reading)", "forest", ""),
 )
-"""Of the included agent on every fifth test segment of towns."""
+"""On every fifth test segment of towns: of the included agent, and of BC+TS+H among the methods."""
 DRIVEN = {"town": "towns", "ngsim": "real roads"}
 INCLUDED = (
     ("log playback", "driving/{}-none", "playback"),
@@ -166,7 +166,9 @@ INPUTS = (
     ("the paper's inputs", "inputs/{}-paper"),
     ("+ gaps to others", "inputs/{}-gaps"),
     ("+ displaced states", "inputs/{}-perturb"),
-    ("both, lights of their own, 21 levels of acceleration", "rates/{}-0.01"),
+    ("+ lights of their own", "inputs/{}-lights"),
+    ("+ 21 levels of acceleration", "inputs/{}-levels"),
+    ("all four", "rates/{}-0.01"),
 )
 """What changes of the paper's inputs do alone, and their records on the validation parts."""
 ADVERSARIAL = (
@@ -179,16 +181,6 @@ ADVERSARIAL = (
 )
 """MGAIL before and after adversarial updates, and their records on the validation parts."""
 SETTINGS = {"many": "8 agents", "long": "20 s"}
-FORESTS = tuple(
-    (f"{label}, {way}", f"{method}-{name}", "")
-    for method, label in (("bc_ts", "BC+TS"), ("bc_ts_h", "BC+TS+H"))
-    for way, name in (
-        ("no search", "none"),
-        ("the leaves of one tree of 16", "one"),
-        ("a leaf each of 16 trees of 16", "forest"),
-    )
-)
-"""Methods with TS by the paper's reading, on every fifth test segment of towns."""
 
 
 def driven(

@@ -90,6 +90,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "driving-town": lambda: searched("driving", "town"),
     "driving-ngsim": lambda: searched("driving", "ngsim"),
     "driving-forest": lambda: searched("driving", "part", FOREST),
+    "forest": lambda: searched("forest", "town-bc_ts_h", FOREST),
     "driving-places": lambda: by_place(2),
     "roads-places-many": lambda: by_place(8),
     "roads": lambda: by_kind(2),
