@@ -83,3 +83,13 @@ def test_turning_the_world_padding_and_company_change_nothing(turn: float) -> No
     np.testing.assert_allclose(stations_along(padded[None], path[None], valid), alone, atol=1e-12)
     both = stations_along(np.stack([line, straight]), np.stack([path, other]), valid.repeat(2, 0))
     np.testing.assert_array_equal(both[:1], alone)
+
+
+def test_how_much_is_found_together_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    lines, path = rng.normal(0.0, 2.0, (3, 40, 2)).cumsum(1), rng.normal(0.0, 2.0, (3, 21, 2)).cumsum(1)
+    valid = rng.random((3, 21)) < 0.8
+    whole = stations_along(lines, path, valid)
+    for distances in (1, 4 * 3 * 39):
+        monkeypatch.setattr("symphony.geometry.stations._TOGETHER", distances)
+        np.testing.assert_array_equal(stations_along(lines, path, valid), whole)

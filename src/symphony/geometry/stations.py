@@ -55,7 +55,7 @@ def stations_along(
             low, high = (station - reach[:, step])[:, None], (station + reach[:, step])[:, None]
             inside = (arc[:, 1:] >= low) & (arc[:, :-1] <= high)
             piece = np.where(inside, near, np.inf).argmin(1)
-            begins = np.flatnonzero(valid[:, step] & (first == step))
+            begins = np.flatnonzero(first == step)
             if len(begins):
                 piece[begins] = earliest_pass(near[begins])
             station = np.where(valid[:, step], arc[row, piece] + share[row, k, piece], station)
