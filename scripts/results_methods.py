@@ -168,6 +168,7 @@ INPUTS = (
     ("+ displaced states", "inputs/{}-perturb"),
     ("+ lights of their own", "inputs/{}-lights"),
     ("+ 21 levels of acceleration", "inputs/{}-levels"),
+    ("+ gaps, displaced states, lights", "inputs/{}-seven"),
     ("all four", "rates/{}-0.01"),
 )
 """What changes of the paper's inputs do alone, and their records on the validation parts."""
