@@ -189,7 +189,7 @@ def driven(
     places: dict[str, str] = DRIVEN,
     columns: Sequence[str] = ("collision_rate", "offroad_time", "ade", "min_sade"),
 ) -> Grid:
-    """One record per row and place (its name stands for ``{}``); a third entry names a baseline's row in it."""
+    """Records per row and place (its name stands for ``{}``); a third entry names a baseline's row in them."""
     grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in columns)]]
     for label, pattern, *part in rows:
         found = [records(pattern.format(place)) for place in places]

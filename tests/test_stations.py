@@ -93,3 +93,10 @@ def test_how_much_is_found_together_changes_nothing(monkeypatch: pytest.MonkeyPa
     for distances in (1, 4 * 3 * 39):
         monkeypatch.setattr("symphony.geometry.stations._TOGETHER", distances)
         np.testing.assert_array_equal(stations_along(lines, path, valid), whole)
+
+
+def test_a_point_that_is_not_finite_is_refused_by_its_place() -> None:
+    path = np.zeros((2, 5, 2))
+    path[1, 3, 0] = np.nan
+    with pytest.raises(ValueError, match="path 1, step 3"):
+        stations_along(np.stack([bend(0.0)] * 2), path, np.ones((2, 5), bool))

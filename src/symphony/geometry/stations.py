@@ -37,7 +37,13 @@ def stations_along(
         lines: shorter ones end with their last point again.
         path: in the order of time.
         valid: which of its points exist.
+
+    Raises:
+        ValueError: a point that exists is not finite; names line and step.
     """
+    wrong = np.argwhere(valid & ~np.isfinite(path).all(-1))
+    if len(wrong):
+        raise ValueError(f"path {wrong[0, 0]}, step {wrong[0, 1]}: a point that exists is not finite")
     way = np.diff(lines, axis=1)
     length = np.linalg.norm(way, axis=-1)
     direction = way / np.maximum(length, np.finfo(np.float64).tiny)[..., None]
