@@ -249,3 +249,10 @@ def test_going_around_the_block_first_is_not_the_way_of_the_log():
     right = ground_truth_routes(graph, found, round_once, np.ones(len(round_once), bool))
     assert {found[k][:4] for k in np.flatnonzero(right)} == {(0, 2, 0, 1)}
     assert ground_truth_routes(graph, found, direct[:10], valid[:10]).all()
+    # Routes that can't be best are left out; those that can have the same errors.
+    for path in (direct, direct[:10], round_once):
+        there = np.ones(len(path), bool)
+        errors, quick = (route_errors(graph, found, path, there, within=within) for within in (np.inf, 0.5))
+        np.testing.assert_array_equal(quick[np.isfinite(quick)], errors[np.isfinite(quick)])
+        assert (errors[np.isinf(quick)] > errors.min() + 0.5).all()
+    assert np.isinf(route_errors(graph, found, direct, valid, within=0.5)).any()

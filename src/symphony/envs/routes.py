@@ -16,6 +16,7 @@ from torch import Tensor
 from symphony.data.segment import RunSegment
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
+from symphony.geometry.nearest import first_smallest
 from symphony.roadgraph import (
     LaneGraph,
     feasible_routes,
@@ -111,7 +112,7 @@ def route_ahead(
     with torch.no_grad():
         squared = (points - position[..., None, :]).square().sum(-1)
         # The last point has nothing ahead of it, so the one before gives the direction.
-        nearest = squared.masked_fill(~exists, torch.inf).argmin(-1)
+        nearest = first_smallest(squared.masked_fill(~exists, torch.inf))
         nearest = nearest.minimum((count - 2).clamp_min(0))
         which = nearest[..., None] + constant(AHEAD, torch.int64, points.device)
         there = which < count[..., None]
@@ -160,8 +161,8 @@ def along_route(
         exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
         # |p - q|^2 less |p|^2, about the agent so that numbers stay small: [M, N, 1 + O, K]
         here, line = place - place[..., :1, :], points - place[..., :1, :]
-        squared = line.square().sum(-1)[..., None, :] - 2.0 * here @ line.mT
-        nearest = squared.masked_fill(~exists[..., None, :], torch.inf).argmin(-1)
+        own_part = line.square().sum(-1).masked_fill(~exists, torch.inf)
+        nearest = first_smallest(own_part[..., None, :] - 2.0 * here @ line.mT)
         start = nearest.minimum((count[..., None] - 2).clamp_min(0))
     first, second = (
         points.gather(2, index[..., None].expand(*index.shape, 2))

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.geometry.nearest import on_host
+from symphony.geometry.nearest import first_smallest, on_host
 
 NO_BOUNDARY = -1e6
 """Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
@@ -20,9 +20,6 @@ CLOSED_WITHIN = 1e-3
 
 _BLOCK = 1 << 18
 """Distances held at a time on the CPU, so that the temporaries stay in the cache."""
-
-_FOLD = 16
-"""Parts into which a row is folded to find its smallest element."""
 
 _FAR = 1e15
 """Offset of a segment that is not there."""
@@ -183,31 +180,13 @@ def _nearest_segment(
             torch.addcmul(along, x[rows], unit_x, out=beyond).addcmul_(y[rows], unit_y)
             beyond.abs_().sub_(half).clamp_(min=0).square_()
             torch.addcmul(across, x[rows], unit_y, out=side).addcmul_(y[rows], unit_x, value=-1)
-            smallest, index = _argmin(beyond.addcmul_(side, side))
+            distance = beyond.addcmul_(side, side)
+            index = first_smallest(distance)
+            smallest = distance.gather(-1, index[..., None])[..., 0]
             better = smallest < best
             result[rows] = torch.where(better, index + e, result[rows] if e else index)
             best = torch.where(better, smallest, best)
     return result
-
-
-def _argmin(values: Float[Tensor, "*b E"]) -> tuple[Float[Tensor, "*b"], Int[Tensor, "*b"]]:
-    """Minimum over the last dimension and where it is.
-
-    In two levels, because on the CPU the index costs ten times as much as the minimum itself.
-    """
-    size = values.shape[-1]
-    fold = size // _FOLD
-    if fold < 2 or values.device.type != "cpu":
-        return values.min(-1)
-    body = values[..., : fold * _FOLD].unflatten(-1, (_FOLD, fold))
-    smallest, column = body.amin(-2).min(-1)
-    lane = body.gather(-1, column[..., None, None].expand(*column.shape, _FOLD, 1))[..., 0].min(-1).indices
-    # Its place before the fold, [_FOLD, fold].
-    index = lane * fold + column
-    if fold * _FOLD == size:
-        return smallest, index
-    rest, tail = values[..., fold * _FOLD :].min(-1)
-    return torch.minimum(rest, smallest), torch.where(rest < smallest, tail + fold * _FOLD, index)
 
 
 def _segment_axes(

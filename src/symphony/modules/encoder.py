@@ -131,7 +131,8 @@ class _Join(nn.Module):
             parts = [elements, *(next(waiting) for _ in range(more))]
             # A gap without a dimension of times gives three features, one with H times 3 H.
             parts += [gap_features(next(waiting)).flatten(elements.ndim - 1) for _ in range(gaps)]
-            joined += [torch.cat(parts, -1), mask]
+            # To concatenate a single part would copy it.
+            joined += [torch.cat(parts, -1) if len(parts) > 1 else elements, mask]
         return self.network(*joined, *waiting)
 
 
