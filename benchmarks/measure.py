@@ -67,7 +67,7 @@ class Row:
 
     Args:
         work: makes a round of it.
-        warm: rounds before the first that counts. Maps get their grids once they have been asked often enough.
+        warm: rounds before the first that counts.
         rounds: that count, if no fewer are asked for.
         parts: functions whose share of the time is told, by their import paths; the rest is "the rest".
         unit: of what a round does many of.

@@ -278,7 +278,7 @@ class Measured:
 
     Args:
         name: of the workload.
-        warm: rounds before the first that counts. Maps get their grids once they have been asked often enough.
+        warm: rounds before the first that counts.
     """
 
     def __init__(self, name: str, warm: int) -> None:

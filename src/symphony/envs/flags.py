@@ -93,21 +93,21 @@ def offroad_flags(
     """
     if tables is None or not on_host(position) or scenes.edge_start.shape[1] == 0:
         return road_distance(scenes, scene, position, tables) > 0
-    cells = tables.edge_grids(position.shape[0] * position.shape[1])
-    if cells is None:
-        return road_distance(scenes, scene, position) > 0
-    where, row = position.detach().numpy(), scene.numpy()[:, None]
-    cell = cells.locate(row, where[..., 0], where[..., 1]).ravel()
-    sign = cells.sign.take(cell, mode="clip") if len(cells.sign) else np.zeros(len(cell), np.int8)
+    cells = tables.edge_cells
+    where, row = position.detach().numpy(), np.repeat(scene.numpy(), position.shape[1])
+    x, y = np.ascontiguousarray(where.reshape(-1, 2).T)
+    cell = cells.locate(row, x, y)
+    inside = cell >= 0
+    cells.listed(row[inside], cell[inside])
+    sign = np.zeros(len(cell), np.int8)
+    sign[inside] = cells.sign[cell[inside]]
     off = sign > 0
-    asked = np.flatnonzero((sign == 0) | (cell < 0))
+    asked = np.flatnonzero(sign == 0)
     if len(asked):
-        inside = cell[asked] >= 0
-        near, far = asked[inside], asked[~inside]
+        near, far = asked[inside[asked]], asked[~inside[asked]]
         if len(near):
-            x, y = np.ascontiguousarray(where.reshape(-1, 2).take(near, axis=0).T)
-            owner, edges = row[near // position.shape[1], 0], tables.segments
-            off[near] = edges.right_of(cells.nearest_edge(owner, cell[near], x, y, edges), x, y)
+            nearest = cells.nearest_edge(cell[near], x[near], y[near])
+            off[near] = cells.edges.right_of(nearest, x[near], y[near])
         if len(far):
             rows, places = torch.from_numpy(far // position.shape[1]), torch.from_numpy(far)
             outside = road_distance(scenes, scene[rows], position.reshape(-1, 1, 2)[places])

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
+from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
 from symphony.geometry.nearest import nearest, on_host, smallest
 
@@ -77,15 +78,14 @@ def nearest_points(
     here = origin.reshape(-1, 2).numpy()
     here_x, here_y = np.ascontiguousarray(here[:, 0]), np.ascontiguousarray(here[:, 1])
     flat = torch.empty(len(row), count, dtype=torch.int64)
-    cells = tables.point_grids(len(row))
-    rest = np.arange(len(row))
-    if cells is not None:
-        cell = cells.locate(row, here_x, here_y)
-        rest, known = np.flatnonzero(cell < 0), np.flatnonzero(cell >= 0)
-        points = x.view(-1).numpy(), y.view(-1).numpy()
-        found = cells.nearest_points(row[known], cell[known], here_x[known], here_y[known], points, count)
-        flat[torch.from_numpy(known)] = torch.from_numpy(found)
-    _among_all(flat.numpy(), rest, row, here_x, here_y, x.numpy(), y.numpy())
+    cells = tables.point_cells
+    cell = cells.locate(row, here_x, here_y)
+    known = cell >= 0
+    known[known] = cells.listed(row[known], cell[known], REPAID)
+    at, rest = np.flatnonzero(known), np.flatnonzero(~known)
+    found = flat.numpy()
+    found[at] = cells.nearest_points(cell[at], here_x[at], here_y[at])
+    _among_all(found, rest, row, here_x, here_y, x.numpy(), y.numpy())
     flat = flat.view(*origin.shape[:2], count)
     return flat, _exist(tables, flat)
 

@@ -8,15 +8,14 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from symphony.data.segment import AgentType, SignalState
-from symphony.envs.grids import Arrays, GridSource
 from symphony.envs.scene import PointType, SceneBatch
-from symphony.geometry.cells import Edges
+from symphony.geometry.cells import EdgeCells, PointCells
+from symphony.geometry.edges import Edges
 from symphony.geometry.polylines import has_length
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ LIGHT_COLUMN = 6 + len(PointType)
 
 
 class Tables:
-    """Rows of features, flat indices and grids of the scenes of a batch, each made when first used.
+    """Rows of features, flat indices and cells of the scenes of a batch, each made when first used.
 
     Args:
         scenes: the static part; must not change afterwards.
@@ -129,26 +128,12 @@ class Tables:
         return Edges.of(*(self.edges[name][0].numpy() for name in names))
 
     @cached_property
-    def point_grids(self) -> GridSource:
-        """Grids for the nearest points (CPU)."""
-        scenes = self.scenes
-        maps = [_leading(valid, point) for valid, point in _arrays(scenes.point_valid, scenes.point)]
-        return GridSource.points(maps, self.config.num_points, scenes.point.shape[1])
+    def point_cells(self) -> PointCells:
+        """Cells for the nearest points (CPU)."""
+        x, y = self.position
+        return PointCells(x.numpy(), y.numpy(), self.config.num_points)
 
     @cached_property
-    def edge_grids(self) -> GridSource:
-        """Grids for the nearest edge of the road (CPU)."""
-        scenes = self.scenes
-        fields = scenes.edge_start, scenes.edge_end, scenes.edge_previous, scenes.edge_following
-        maps = [_leading(valid, *parts) for valid, *parts in _arrays(scenes.edge_valid, *fields)]
-        return GridSource.edges(maps, scenes.edge_start.shape[1])
-
-
-def _arrays(*fields: Tensor) -> list[Arrays]:
-    return list(zip(*(field.numpy() for field in fields), strict=True))
-
-
-def _leading(valid: np.ndarray, *fields: np.ndarray) -> Arrays | None:
-    """The valid elements of one scene if they come first, else None."""
-    count = int(valid.sum())
-    return tuple(field[:count] for field in fields) if count and valid[:count].all() else None
+    def edge_cells(self) -> EdgeCells:
+        """Cells for the nearest edge of the road (CPU)."""
+        return EdgeCells(self.segments, self.edges["valid"].view(self.scenes.edge_valid.shape).numpy())

@@ -1,55 +1,96 @@
-"""The grids of several maps end to end, and exact queries of many positions at once. For the CPU only."""
+"""Square cells over the maps of a batch, with lists of the only elements that can matter to a position inside.
+
+A position q in a cell lies within half the cell's diagonal h of its centre c, so any distance from q differs by at
+most h from that from c: what is more than 2 h farther from c than the k-th nearest element is not among the k
+nearest of q. A list is made when somebody is in its cell. For the CPU only.
+
+Shapes: B maps of P points or E edges, R positions. Element i of map b is number ``b * P + i`` of all.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import math
+from abc import ABC, abstractmethod
+from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.geometry.grid import CellGrid
+from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
 from symphony.geometry.nearest import smallest
 
-Reals = NDArray[np.floating[Any]]
-Indices = NDArray[np.int64]
-
+POINT_CELL = 8.0
+"""Metres of a cell's side, for points."""
+EDGE_CELL = 4.0
+"""Metres of a cell's side, for the edges of the road."""
+REPAID = 2
+"""Positions in a cell that repay a list of its points."""
 ROWS = 64
 """Positions whose candidates are looked at together, so that they stay in the cache."""
 
+_MARGIN = 8.0
+"""Metres of cells beyond the outermost element."""
+_SLACK = 0.02
+"""Metres by which lists reach farther than they need to, far above the rounding of float32."""
+_CELLS = 1 << 14
+"""Most cells of a map; larger maps get larger cells."""
+_BLOCK = 1 << 17
+"""Distances held at a time while lists are made."""
+_MANY = 256
+"""Neighbours above which most of them lie far away, where the size of a cell matters less."""
+_WORTH = 3
+"""Elements of a map for each that is looked for, below which a list saves nothing."""
+_FILLING = Lock()
 
-class Cells:
-    """Grids of B maps; one without a grid has no cells.
 
-    Args:
-        grids: one per map.
-        stride: elements per map, padding included: element i of map b is number ``b * stride + i`` of all.
+class Lists(NamedTuple):
+    """What can be nearest to a position in each of C cells.
+
+    Attributes:
+        length: [C] elements of each list.
+        items: all lists, one after the other, ascending within each.
+        sign: [C] 1 or -1 where every position of the cell is off or on the road, 0 where it depends on the position.
     """
 
-    def __init__(self, grids: Sequence[CellGrid | None], stride: int) -> None:
-        self.stride = stride
-        self.x, self.y = (np.array([0.0 if g is None else g.origin[k] for g in grids]) for k in (0, 1))
+    length: Indices
+    items: Indices
+    sign: NDArray[np.int8]
+
+
+class Cells(ABC):
+    """The cells of B maps, and lists for those that somebody has been in.
+
+    Args:
+        low: [B, 2] metres of the lower left corner of what is on each map.
+        high: [B, 2] metres of the upper right one.
+        some: [B] whether a map has cells at all.
+        size: least side of a cell, metres.
+    """
+
+    def __init__(self, low: Reals, high: Reals, some: Bools, size: float) -> None:
+        low, high = (np.where(some[:, None], value, 0.0).astype(np.float64) for value in (low, high))
+        low = np.floor(low - _MARGIN)
+        extent, side = high + _MARGIN - low, np.full(len(low), size)
+        while (large := np.ceil(extent / side[:, None]).prod(1) > _CELLS).any():
+            side[large] *= 2.0
+        self.x, self.y = np.ascontiguousarray(low.T)
         # Sides are powers of two, so to multiply is to divide.
-        self.per_metre = np.array([1.0 if g is None else 1.0 / g.size for g in grids])
-        self.columns, self.rows = (
-            np.array([0.0 if g is None else g.shape[k] for g in grids]) for k in (0, 1)
-        )
-        some = [grid for grid in grids if grid is not None]
-        cells = [0 if g is None else len(g.sign) for g in grids]
-        items = np.cumsum([0] + [len(grid.items) for grid in some])
-        self.first = np.cumsum([0, *cells])[:-1]
-        none = np.zeros(0, np.int64)
-        self.items: NDArray[Any] = np.concatenate([grid.items for grid in some]) if some else none
-        self.begin: Indices = np.concatenate(
-            [grid.begin[:-1] + offset for grid, offset in zip(some, items, strict=False)] or [none]
-        )
-        self.count: Indices = np.concatenate([np.diff(grid.begin) for grid in some] or [none]).astype(
-            np.int64
-        )
-        self.sign = np.concatenate([grid.sign for grid in some] or [np.zeros(0, np.int8)])
+        self.side, self.per_metre = side, 1.0 / side
+        self.columns, self.rows = np.where(some, np.ceil(extent / side[:, None]).T, 0.0)
+        ends = (self.columns * self.rows).cumsum().astype(np.int64)
+        self.first, total = np.concatenate([[0], ends[:-1]]), int(ends[-1]) if len(ends) else 0
+        # Where a cell's list begins; -1 while it has none.
+        self.begin, self.count = np.full(total, -1), np.zeros(total, np.int64)
+        self.sign, self._asked = np.zeros(total, np.int8), np.zeros(total, np.int64)
+        self.items, self._used = np.zeros(1 << 12, np.int32), 0
+
+    @abstractmethod
+    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
+        """Lists of cells with the centres x and y [C], as long as ``side`` [C]."""
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
-        """Number of the cell in which each position of map ``scene`` lies, -1 outside of its grid.
+        """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells.
 
         Args:
             scene: any shape that broadcasts against the positions.
@@ -62,118 +103,167 @@ class Cells:
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < self.rows.take(scene))
         return np.where(inside, row * columns + column + self.first.take(scene), -1.0).astype(np.int64)
 
-    def nearest_points(
-        self, scene: Indices, cell: Indices, x: Reals, y: Reals, points: tuple[Reals, Reals], count: int
-    ) -> Indices:
-        """Numbers [R, count] of the points nearest to positions [R], ascending.
+    def listed(self, scene: Indices, cell: Indices, repaid: int = 1) -> Bools:
+        """Whether the cells [R] of maps [R] have lists: those do that so many positions have been in by now."""
+        new = np.flatnonzero(self.begin.take(cell) < 0)
+        if len(new) == 0:
+            return np.ones(len(cell), np.bool_)
+        with _FILLING:
+            number, place, times = np.unique(cell[new], return_index=True, return_counts=True)
+            self._asked[number] += times
+            due = (self._asked[number] >= repaid) & (self.begin[number] < 0)
+            if due.any():
+                self._fill(scene[new[place[due]]], number[due])
+        return self.begin.take(cell) >= 0
 
-        Args:
-            scene: [R].
-            cell: [R], none of them -1.
-            x: [R] of the positions.
-            y: [R].
-            points: x and y of all points of all maps.
-            count: at most what the grids were made for.
-        """
-        found = np.empty((len(cell), count), np.int64)
+    def _fill(self, scene: Indices, number: Indices) -> None:
+        column, row = (f(number - self.first[scene], self.columns[scene]) for f in (np.mod, np.floor_divide))
+        side = self.side[scene]
+        x, y = self.x[scene] + (column + 0.5) * side, self.y[scene] + (row + 0.5) * side
+        lists = self._lists(scene, x, y, side)
+        end = self._used + len(lists.items)
+        if end > len(self.items):
+            # Never shorter than what somebody may be reading.
+            more = np.zeros(2 * end - len(self.items), np.int32)
+            self.items = np.concatenate([self.items, more])
+        self.items[self._used : end] = lists.items
+        self.count[number], self.sign[number] = lists.length, lists.sign
+        self.begin[number] = self._used + lists.length.cumsum() - lists.length
+        self._used = end
+
+
+class PointCells(Cells):
+    """Cells for the nearest points.
+
+    Args:
+        x: [B, P] of the points; infinity where there is none.
+        y: [B, P].
+        count: K, how many are looked for. A map with few more has no cells.
+    """
+
+    def __init__(self, x: Reals, y: Reals, count: int) -> None:
+        exists = np.isfinite(x)
+        low, high = (
+            np.stack([bound(v, 1, where=exists, initial=start) for v in (x, y)], -1)
+            for bound, start in ((np.min, np.inf), (np.max, -np.inf))
+        )
+        some = exists.sum(1) >= max(_WORTH * count, 1)
+        super().__init__(low, high, some, POINT_CELL if count <= _MANY else 2 * POINT_CELL)
+        self.points, self.wanted = (x, y), count
+
+    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
+        total, counts, items = self.points[0].shape[1], [], []
+        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
+        for a in range(0, len(scene), max(1, _BLOCK // total)):
+            rows = slice(a, a + max(1, _BLOCK // total))
+            away = (
+                points.take(scene[rows], 0) - centre[rows, None].astype(np.float32)
+                for points, centre in zip(self.points, (x, y), strict=True)
+            )
+            squared = sum(np.square(each) for each in away)
+            last = np.partition(squared, self.wanted - 1, axis=-1)[:, self.wanted - 1 : self.wanted]
+            near = squared <= np.square(np.sqrt(last) + reach[rows])
+            row, point = near.nonzero()
+            counts.append(near.sum(1))
+            items.append(scene[rows][row] * total + point)
+        count = np.concatenate(counts)
+        return Lists(count, np.concatenate(items), np.zeros(len(count), np.int8))
+
+    def nearest_points(self, cell: Indices, x: Reals, y: Reals) -> Indices:
+        """Numbers [R, K] of the points nearest to positions [R] in cells that have lists, ascending."""
+        points_x, points_y = (points.ravel() for points in self.points)
+        found = np.empty((len(cell), self.wanted), np.int64)
         for a in range(0, len(cell), ROWS):
             rows = slice(a, a + ROWS)
             held = self.count[cell[rows], None]
             place = np.arange(held.max())
-            listed = self.begin[cell[rows], None] + place
-            candidate = self.items.take(listed, mode="clip").astype(np.int64)
-            candidate += (self.stride * scene[rows])[:, None]
-            squared, across = points[0].take(candidate), points[1].take(candidate)
+            candidate = self.items.take(self.begin[cell[rows], None] + place, mode="clip")
+            squared, across = points_x.take(candidate), points_y.take(candidate)
             squared -= x[rows, None]
             across -= y[rows, None]
             np.square(squared, out=squared)
             squared += np.square(across, out=across)
             np.copyto(squared, np.inf, where=place >= held)
-            found[rows] = candidate.ravel()[smallest(squared, count)].reshape(-1, count)
+            found[rows] = candidate.ravel()[smallest(squared, self.wanted)].reshape(-1, self.wanted)
         return found
 
-    def nearest_edge(self, scene: Indices, cell: Indices, x: Reals, y: Reals, edges: Edges) -> Indices:
-        """Number [R] of the edge nearest to each position [R]; arguments as for :meth:`nearest_points`."""
+
+class EdgeCells(Cells):
+    """Cells for the nearest edge of the road.
+
+    Args:
+        edges: of all maps.
+        exists: [B, E] which of them there are.
+    """
+
+    def __init__(self, edges: Edges, exists: Bools) -> None:
+        shape = exists.shape
+        ends = [
+            (v, v + 2 * edges.half * unit) for v, unit in ((edges.x, edges.unit_x), (edges.y, edges.unit_y))
+        ]
+        low, high = (
+            np.stack(
+                [bound(of_two(*two).reshape(shape), 1, where=exists, initial=start) for two in ends],
+                -1,
+            )
+            for bound, of_two, start in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
+        )
+        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL)
+        self.edges, self.exists = edges, exists
+
+    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
+        total, counts, items = self.exists.shape[1], [], []
+        per_map = self.edges.rows.reshape(-1, total, 5)
+        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
+        for a in range(0, len(scene), max(1, _BLOCK // total)):
+            rows = slice(a, a + max(1, _BLOCK // total))
+            centre = (value[rows, None].astype(np.float32) for value in (x, y))
+            squared = squared_to(per_map.take(scene[rows], 0), *centre)
+            squared[~self.exists[scene[rows]]] = np.inf
+            near = squared <= np.square(np.sqrt(squared.min(1, keepdims=True)) + reach[rows])
+            row, edge = near.nonzero()
+            counts.append(near.sum(1))
+            items.append(scene[rows][row] * total + edge)
+        count, item = np.concatenate(counts), np.concatenate(items)
+        return Lists(count, item, self._signs(x, y, count, item, 0.5 * side))
+
+    def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
+        """1 or -1 for cells [C] on one side of every edge listed and of each neighbour that decides at a corner."""
+        cell = np.repeat(np.arange(len(x)), count)
+        side, before, past = self._sides(x[cell], y[cell], item, half[cell])
+        lowest, highest = side.copy(), side.copy()
+        for neighbor, decides in ((self.edges.previous, before), (self.edges.following, past)):
+            other = neighbor[item]
+            pair = np.flatnonzero(decides & (other >= 0))
+            at = cell[pair]
+            beside, _, _ = self._sides(x[at], y[at], other[pair], half[at])
+            lowest[pair] = np.minimum(lowest[pair], beside)
+            highest[pair] = np.maximum(highest[pair], beside)
+        first = count.cumsum() - count
+        lowest, highest = np.minimum.reduceat(lowest, first), np.maximum.reduceat(highest, first)
+        return np.where(lowest == highest, lowest, 0).astype(np.int8)
+
+    def _sides(self, x: Reals, y: Reals, edge: Indices, half: Reals) -> tuple[NDArray[np.int8], Bools, Bools]:
+        """Side of an edge on which a whole cell lies (0: on both), and whether any of it lies before or past it."""
+        edges = self.edges
+        away_x, away_y = x - edges.x[edge], y - edges.y[edge]
+        unit_x, unit_y = edges.unit_x[edge], edges.unit_y[edge]
+        along, across = away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x
+        # The normal has the same components as the direction, so the cell spreads as far across as along.
+        spread = half * (np.abs(unit_x) + np.abs(unit_y)) + _SLACK
+        side = (across > spread).astype(np.int8) - (across < -spread)
+        return side, along < spread, along > 2 * edges.half[edge] - spread
+
+    def nearest_edge(self, cell: Indices, x: Reals, y: Reals) -> Indices:
+        """Number [R] of the edge nearest to each position [R] in a cell that has a list."""
         held = self.count.take(cell)
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
-        candidate = np.arange(len(cell) and first[-1] + held[-1]) + np.repeat(
-            self.begin.take(cell) - first, held
-        )
-        candidate = self.items.take(candidate) + np.repeat(self.stride * scene, held)
-        start_x, start_y, unit_x, unit_y, half = edges.rows.take(candidate, axis=0).T
-        away_x, away_y = np.repeat(x, held) - start_x, np.repeat(y, held) - start_y
-        beyond = away_x * unit_x
-        beyond += away_y * unit_y
-        beyond -= half
-        np.abs(beyond, out=beyond)
-        beyond -= half
-        np.maximum(beyond, 0, out=beyond)
-        away_x *= unit_y
-        away_y *= unit_x
-        away_x -= away_y
-        squared = np.square(beyond, out=beyond) + np.square(away_x, out=away_x)
+        place = np.arange(held.sum()) + np.repeat(self.begin.take(cell) - first, held)
+        candidate = self.items.take(place)
+        squared = squared_to(self.edges.rows.take(candidate, axis=0), np.repeat(x, held), np.repeat(y, held))
         hit = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), held))[::-1]
         nearest = candidate[first]
         # Written from the last to the first, so the first of equally near ones stays.
         nearest[np.repeat(np.arange(len(cell)), held)[hit]] = candidate[hit]
-        return nearest
-
-
-class Edges(NamedTuple):
-    """All edges of all maps, component by component [B * E].
-
-    Attributes:
-        rows: [B * E, 5] the first five of these side by side, for what reads all of them.
-        x: of the start.
-        y: of the start.
-        unit_x: direction.
-        unit_y: direction.
-        half: half the length.
-        previous: number of the edge that ends where this one starts, -1 if none that has a length.
-        following: number of the edge that starts where this one ends, likewise.
-    """
-
-    rows: Reals
-    x: Reals
-    y: Reals
-    unit_x: Reals
-    unit_y: Reals
-    half: Reals
-    previous: Indices
-    following: Indices
-
-    def right_of(self, nearest: Indices, x: Reals, y: Reals) -> NDArray[np.bool_]:
-        """Whether positions [R] lie to the right of their nearest edges: the sign of
-        :func:`symphony.geometry.signed_distance` without the distance.
-        """
-        along, right = self._side(nearest, x, y)
-        corners = (self.previous, along < 0, False), (self.following, along > 2 * self.half[nearest], True)
-        result = right.copy()
-        for neighbor, beyond, ahead in corners:
-            at = np.flatnonzero(beyond)
-            at = at[neighbor[nearest[at]] >= 0]
-            here, other = nearest[at], neighbor[nearest[at]]
-            _, beside = self._side(other, x[at], y[at])
-            first, second = (here, other) if ahead else (other, here)
-            turn = self.unit_x[first] * self.unit_y[second] - self.unit_y[first] * self.unit_x[second]
-            result[at] = np.where(turn > 0, right[at] | beside, right[at] & beside)
-        return result
-
-    def _side(self, edge: Indices, x: Reals, y: Reals) -> tuple[Reals, NDArray[np.bool_]]:
-        away_x, away_y = x - self.x[edge], y - self.y[edge]
-        unit_x, unit_y = self.unit_x[edge], self.unit_y[edge]
-        return away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x > 0
-
-    @classmethod
-    def of(
-        cls, start: Reals, end: Reals, valid: NDArray[np.bool_], previous: Indices, following: Indices
-    ) -> Edges:
-        """From first and last points [B * E, 2], which edges exist and have a length, and their neighbours."""
-        along = end - start
-        length = np.hypot(along[:, 0], along[:, 1])
-        unit = along / np.where(length > 0, length, 1)[:, None]
-        parts = (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
-        x, y, unit_x, unit_y, half = (np.ascontiguousarray(part, dtype=start.dtype) for part in parts)
-        before, after = (np.where((link >= 0) & valid[link], link, -1) for link in (previous, following))
-        return cls(np.stack([x, y, unit_x, unit_y, half], -1), x, y, unit_x, unit_y, half, before, after)
+        return nearest.astype(np.int64)

@@ -178,7 +178,7 @@ def route_errors(
         if errors[k] > best + within:
             errors[k] = np.inf
             continue
-        errors[k] = np.where(_passed(graph, choices[k], path), away[k], np.inf).min(0).mean()
+        errors[k] = np.where(_passed(graph, choices[int(k)], path), away[k], np.inf).min(0).mean()
         best = min(best, errors[k])
     return errors
 

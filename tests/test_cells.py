@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,32 +15,24 @@ import helpers_oracle as oracle
 from helpers_segments import crossing, straight_road
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
-from symphony.envs import ObservationConfig, SceneBatch, collate, grids, scene
+from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.grids import GridCache
 from symphony.envs.observation import objects_at
 from symphony.envs.points import nearest_points, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.tables import Tables
 from symphony.geometry import NO_BOUNDARY, segments_of
-from symphony.geometry.grid import edge_grid, point_grid
+from symphony.geometry.cells import EdgeCells, PointCells
+from symphony.geometry.edges import Edges
 from symphony.geometry.nearest import nearest, smallest
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
 
 
-@pytest.fixture(autouse=True)
-def fresh_cache(monkeypatch: pytest.MonkeyPatch) -> GridCache:
-    cache = GridCache()
-    monkeypatch.setattr(grids, "CACHE", cache)
-    return cache
-
-
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Grids are made at the first query."""
-    monkeypatch.setattr(grids, "POINT_QUERIES", 0)
-    monkeypatch.setattr(grids, "EDGE_QUERIES", 0)
+    """Lists of points are made at the first query."""
+    monkeypatch.setattr(points, "REPAID", 1)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +66,8 @@ def test_the_nearest_points_are_those_among_all(scenes: SceneBatch, count: int) 
     flat, mask = nearest_points(tables, row, where)
     total = scenes.point.shape[1]
     if count < total:
-        assert (tables.point_grids(1) is None) == (count == 5000)
+        cells = tables.point_cells
+        assert (cells.begin >= 0).any() == bool((scenes.point_valid.sum(1) >= 3 * count).any())
         expected = oracle.nearest_points(scenes, row, where, count)
         exist = scenes.point_valid[row[:, None, None], expected]
         assert torch.equal(mask, exist)
@@ -117,9 +110,9 @@ def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) 
     assert torch.equal(flags[sure], (expected > 0)[sure])
     assert 0.2 < flags.float().mean() < 0.8
     assert (distance[row == len(scenes) - 1] == NO_BOUNDARY).all()
-    cells = tables.edge_grids(1)
-    assert cells is not None
-    assert 0.3 < (cells.sign != 0).mean() < 1
+    visited = tables.edge_cells.begin >= 0
+    assert 0.01 < visited.mean() < 0.5
+    assert 0.3 < (tables.edge_cells.sign[visited] != 0).mean() < 1
 
 
 @pytest.mark.usefixtures("at_once")
@@ -166,9 +159,7 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     expected = oracle.road_distance(batch, row, where)
     sure = expected.abs() > 1e-3
     assert torch.equal(offroad_flags(batch, row, where, tables)[sure], (expected > 0)[sure])
-    cells = tables.edge_grids(1)
-    assert cells is not None
-    assert (cells.sign != 0).any()
+    assert (tables.edge_cells.sign != 0).any()
 
 
 @pytest.mark.usefixtures("at_once")
@@ -205,42 +196,32 @@ def test_padding_batch_and_order_change_nothing(scenes: SceneBatch) -> None:
         assert torch.equal(road_distance(lone, zero, where[mine].flip(1), alone).flip(1), distance[mine])
 
 
-def test_answers_stay_when_a_map_gets_its_grid(scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(grids, "POINT_QUERIES", 100)
-    monkeypatch.setattr(grids, "EDGE_QUERIES", 100)
+def test_answers_stay_when_cells_get_their_lists(scenes: SceneBatch) -> None:
     row, where = places(scenes, 6, seed=5)
-    tables, seen = Tables(scenes, FEW), []
-    for _ in range(6):
+    tables, seen, lists = Tables(scenes, FEW), [], []
+    for _ in range(3):
         flat, _ = nearest_points(tables, row, where)
+        lists.append((tables.point_cells.begin >= 0).sum())
         seen.append(
             (flat, road_distance(scenes, row, where, tables), offroad_flags(scenes, row, where, tables))
         )
-    assert tables.point_grids.complete
-    assert tables.edge_grids.complete
+    assert lists[0] < lists[1] == lists[2]
     for flat, distance, flag in seen[1:]:
         assert torch.equal(flat, seen[0][0])
-        torch.testing.assert_close(distance, seen[0][1], atol=1e-5, rtol=1e-6)
+        assert torch.equal(distance, seen[0][1])
         assert torch.equal(flag, seen[0][2])
 
 
-@pytest.mark.usefixtures("at_once")
-def test_scenes_on_one_map_share_a_grid_and_old_ones_make_room(fresh_cache: GridCache) -> None:
-    one, two = scene(crossing(6), [0, 1]), scene(crossing(6), [2, 3])
-    Tables(collate([one, two, one]), FEW).point_grids(1)
-    alone = fresh_cache.used
-    assert alone > 0
-    Tables(one, FEW).point_grids(1)
-    assert fresh_cache.used == alone
-    fresh_cache.memory = alone
-    Tables(scene(straight_road(8), [0]), FEW).point_grids(1)
-    assert 0 < fresh_cache.used <= alone
-
-
-def test_maps_asked_for_once_are_forgotten_in_time(fresh_cache: GridCache, monkeypatch: Any) -> None:
-    monkeypatch.setattr(grids, "MAPS", 3)
-    for seed in range(6):
-        assert fresh_cache.get((np.full((2, 2), seed),), "points 1", 1, 10, point_grid) is None
-    assert len(fresh_cache._kept) == 3
+def test_threads_that_ask_at_once_get_the_same(scenes: SceneBatch) -> None:
+    tables, asked = Tables(scenes, FEW), [places(scenes, 6, seed=seed) for seed in range(12)]
+    with ThreadPoolExecutor(6) as pool:
+        found = list(
+            pool.map(lambda at: (nearest_points(tables, *at), road_distance(scenes, *at, tables)), asked)
+        )
+    for at, ((flat, _), distance) in zip(asked, found, strict=True):
+        alone = Tables(scenes, FEW)
+        assert torch.equal(flat, nearest_points(alone, *at)[0])
+        assert torch.equal(distance, road_distance(scenes, *at, alone))
 
 
 def test_collisions_are_those_of_all_pairs() -> None:
@@ -287,34 +268,45 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
 @pytest.mark.parametrize("shift", [0.0, 3e4])
 def test_lists_hold_every_element_that_can_be_nearest(shift: float) -> None:
     rng = np.random.default_rng(7)
-    points = np.cumsum(rng.normal(0, 2, (900, 2)), 0) + shift
-    grid, k = point_grid(points, 20), 20
-    assert grid is not None
-    start, end = points[:-1], points[1:]
-    number = np.arange(len(start))
-    edges = edge_grid(start, end, number - 1, np.where(number + 1 < len(start), number + 1, -1))
-    assert edges is not None
-    for made in (grid, edges):
-        columns, rows = made.shape
-        cell = rng.integers(0, columns * rows, 300)
+    line = (np.cumsum(rng.normal(0, 2, (900, 2)), 0) + shift).astype(np.float32)
+    start, end, number, k = line[:-1], line[1:], np.arange(899), 20
+    edges = Edges.of(start, end, np.ones(899, bool), number - 1, np.where(number < 898, number + 1, -1))
+    near_points = PointCells(*line.T.copy()[:, None], k)
+    near_edges = EdgeCells(edges, np.ones((1, 899), bool))
+    for cells in (near_points, near_edges):
+        columns, count = int(cells.columns[0]), len(cells.begin)
+        cell = rng.integers(0, count, 300)
+        assert cells.listed(np.zeros_like(cell), cell).all()
         corner = np.stack([cell % columns, cell // columns], -1) + rng.integers(0, 2, (300, 2)) * (1 - 1e-9)
-        place = np.array(made.origin) + made.size * corner
+        place = np.array([cells.x[0], cells.y[0]]) + cells.side[0] * corner
         for c, where in zip(cell, place, strict=True):
-            listed = set(made.items[made.begin[c] : made.begin[c + 1]].tolist())
-            if made is grid:
-                wanted = np.argsort(np.linalg.norm(points - where, axis=-1))[:k]
+            listed = set(cells.items[cells.begin[c] : cells.begin[c] + cells.count[c]].tolist())
+            if cells is near_points:
+                wanted = np.argsort(np.linalg.norm(line.astype(float) - where, axis=-1))[:k]
             else:
-                along = end - start
+                along = (end - start).astype(float)
                 share = np.clip(((where - start) * along).sum(-1) / (along**2).sum(-1), 0, 1)
                 wanted = [np.linalg.norm(start + share[:, None] * along - where, axis=-1).argmin()]
             assert listed.issuperset(np.asarray(wanted).tolist())
-    assert len(grid.items) < 0.5 * len(grid.sign) * len(points)
+        assert cells.count[cell].mean() < 0.5 * len(line)
 
 
-def test_maps_without_elements_have_no_grid() -> None:
-    none: Any = np.zeros((0, 2))
-    assert point_grid(none, 5) is None
-    assert point_grid(np.random.default_rng(0).normal(size=(9, 2)), 9) is None
-    assert edge_grid(none, none, np.zeros(0, int), np.zeros(0, int)) is None
-    same = np.ones((3, 2))
-    assert edge_grid(same, same, np.full(3, -1), np.full(3, -1)) is None
+def test_maps_without_elements_have_no_cells() -> None:
+    none, three = np.full((2, 3), np.inf, np.float32), np.zeros((1, 3), np.float32)
+    assert len(PointCells(none, none, 1).begin) == len(PointCells(three, three, 2).begin) == 0
+    assert len(PointCells(three, three, 1).begin) > 0
+    ends = np.zeros((4, 2), np.float32)
+    nowhere = Edges.of(ends, ends, np.zeros(4, bool), np.full(4, -1), np.full(4, -1))
+    cells = EdgeCells(nowhere, np.zeros((2, 2), bool))
+    assert (cells.locate(np.array([0, 1]), np.zeros(2), np.zeros(2)) == -1).all()
+
+
+def test_huge_maps_have_larger_cells() -> None:
+    x, y = (np.array([[0.0, end, 5.0]], np.float32) for end in (9000.0, 7000.0))
+    cells = PointCells(x, y, 1)
+    assert len(cells.begin) <= 1 << 14
+    assert cells.side[0] > 8
+    where = np.array([8999.0]), np.array([6999.0])
+    cell = cells.locate(np.array([0]), *where)
+    assert cells.listed(np.array([0]), cell).all()
+    assert cells.nearest_points(cell, *where).tolist() == [[1]]
