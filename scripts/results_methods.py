@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, mean_of, means, paired, records
+from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, mean_of, paired, records
 from results_users import NAMES
 from symphony.evaluation.comparison import Entry
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
 
-BC = (
-    ("BC", "bc/bc-*-none"),
-    ("BC+H", "bc/bc_h-*-none"),
-    ("BC+TS", "bc/bc_ts-*-often"),
-    ("BC+TS+H", "bc/bc_ts_h-*-often"),
-)
-MGAIL = (
-    ("MGAIL", "mgail/mgail-*-none"),
-    ("MGAIL+H", "mgail/mgail_h-*-none"),
-    ("MGAIL+TS", "mgail/mgail_ts-*-often"),
-    ("MGAIL+TS+H", "mgail/mgail_ts_h-*-often"),
-)
 FEATURES = (
     ("`paper`: positions, headings, speeds, sizes, map points", "features/paper/bc_ts_h-0-often"),
     (
@@ -41,10 +28,6 @@ HALVING = (
     ("BC+TS+H, halved every 2 s", "bc/bc_ts_h-*-tree"),
     ("BC+TS+H, resampled every 2 s", "bc/bc_ts_h-*-systematic"),
     ("BC+TS+H, resampled every 0.4 s", "bc/bc_ts_h-*-often"),
-    ("MGAIL+TS, halved every 2 s", "mgail/mgail_ts-*-tree"),
-    ("MGAIL+TS, resampled every 0.4 s", "mgail/mgail_ts-*-often"),
-    ("MGAIL+TS+H, halved every 2 s", "mgail/mgail_ts_h-*-tree"),
-    ("MGAIL+TS+H, resampled every 0.4 s", "mgail/mgail_ts_h-*-often"),
 )
 WAYS = (
     ("one tree of 16, halved every 2 s", "bc/bc_ts_h-0-tree"),
@@ -232,12 +215,6 @@ def roadside() -> Grid:
         found = [records(plain.format(place) if place else parked) for place in places]
         grid.append([label, *(cell for one in found for cell in cells(one, columns))])
     return grid
-
-
-def setting(folder: str) -> Grid:
-    """The eight methods in one of the paper's other settings."""
-    rows = [(label, f"{folder}/{Path(pattern).name.replace('*', '0')}") for label, pattern in (*BC, *MGAIL)]
-    return means(rows)
 
 
 def held(patterns: Sequence[str]) -> Grid:

@@ -21,14 +21,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from results_base import ROOT, Grid, beside, means, records
 from results_methods import (
     ADVERSARIAL,
-    BC,
     DRIVEN,
     FEATURES,
     FOREST,
     HALVING,
     INPUTS,
     LABELS,
-    MGAIL,
     NGSIM,
     PARTS,
     RATES,
@@ -41,7 +39,6 @@ from results_methods import (
     included,
     roadside,
     searched,
-    setting,
     settings,
     sweep,
 )
@@ -62,13 +59,14 @@ from results_users import (
 
 PAGES = (
     "README.md",
-    *(f"docs/{name}.md" for name in ("results", "roads", "appendix", "wosac", "planners", "rollouts")),
+    *(
+        f"docs/{name}.md"
+        for name in ("results", "ablations", "roads", "appendix", "wosac", "planners", "rollouts")
+    ),
 )
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
-    "methods": lambda: means((*BC, *MGAIL)),
-    "relations": lambda: held([pattern for _, pattern in (*BC, *MGAIL)]),
-    "relations-newer": lambda: held(["eight/town-*"]),
+    "relations": lambda: held(["eight/town-*"]),
     "roadside": roadside,
     "parts": lambda: driven(PARTS),
     "rates": lambda: driven(RATES),
@@ -81,8 +79,6 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "ngsim": lambda: beside(NGSIM, PLACES, THREE),
     "halving": lambda: means(HALVING),
     "ways": lambda: means(WAYS),
-    "long": lambda: setting("long"),
-    "many": lambda: setting("many"),
     "paper": against_paper,
     "sweep": sweep,
     "search-town": lambda: searched("search", "town"),
