@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers_runs import build, tiny
 from helpers_segments import straight_road
 from symphony.config import METHODS, EvaluateConfig
-from symphony.data.store import StoreWriter
+from symphony.data.store_writer import StoreWriter
 from symphony.evaluation import evaluate
 
 MIB = 1 << 20

@@ -21,7 +21,8 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.data.sources.sumo import generate_run
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.evaluation.logs import measure
 from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
 

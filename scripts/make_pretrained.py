@@ -37,7 +37,7 @@ from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, t
 from symphony.data.generate import PRESETS
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, SymphonyError
-from symphony.evaluation.comparison import choose_evaluation, method_name
+from symphony.evaluation.entries import choose_evaluation, method_name
 from symphony.evaluation.records import FOLDER as EVALUATIONS
 from symphony.evaluation.records import evaluation_name, kept_evaluations, read_evaluation
 from symphony.files import write_json

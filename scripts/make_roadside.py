@@ -12,7 +12,8 @@ import argparse
 from pathlib import Path
 
 from symphony.data.roadside import Roadside, add_roadside
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 
 MOST = 250
 """Agents of a segment."""

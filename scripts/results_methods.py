@@ -9,7 +9,7 @@ import numpy as np
 
 from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, mean_of, paired, records
 from results_users import NAMES
-from symphony.evaluation.comparison import Entry
+from symphony.evaluation.entries import Entry
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import grid, relations
 

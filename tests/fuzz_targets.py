@@ -93,7 +93,8 @@ def _use(segment: RunSegment, folder: Path) -> None:
     from symphony.data.parts import Preparation
     from symphony.data.sources import get_reader
     from symphony.data.sources.base import UnexpectedError
-    from symphony.data.store import SegmentStore, StoreWriter
+    from symphony.data.store import SegmentStore
+    from symphony.data.store_writer import StoreWriter
     from symphony.errors import DataError
     from symphony.simulation.demonstrations import SceneDataset
 
@@ -276,7 +277,7 @@ BY_SUFFIX: Mapping[str, Callable[[Rng, bytes], bytes]] = {
 
 def _store() -> Files:
     from helpers_segments import crossing, straight_road
-    from symphony.data.store import StoreWriter
+    from symphony.data.store_writer import StoreWriter
 
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "store"

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from helpers_segments import random_segment
 from symphony.data.segment import RunSegment, content_hash
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 
 
 def fill(path: Path, found: list[RunSegment], *, append: bool = False) -> None:

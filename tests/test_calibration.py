@@ -16,7 +16,8 @@ from symphony import keys
 from symphony.agents import Agent, load_agent
 from symphony.cli import main
 from symphony.config import SearchConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import DrivingEnv
 from symphony.errors import ConfigError
 from symphony.recipes import train

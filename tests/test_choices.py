@@ -139,6 +139,9 @@ def test_who_stands_is_said_of_agents_whose_log_lasts(seed: int) -> None:
         assert numbers["standing_log"] == pytest.approx(100 * found.log[there].float().mean().item())
     else:
         assert math.isnan(numbers["standing"])
+    for row, mine, slow in zip(metrics.rows(), there, found.rollouts, strict=True):
+        expected = 100 * slow[:, mine].float().mean().item() if mine.any() else math.nan
+        assert row["standing"] == pytest.approx(expected, nan_ok=True)
 
 
 # --- goals ---

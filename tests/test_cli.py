@@ -18,7 +18,8 @@ from symphony.cli import main
 from symphony.cli.data import Info
 from symphony.data.segment import RunSegment
 from symphony.data.sources import Reader
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 
 HEAVY = {"torch", "torchrl", "tensordict", "wandb", "matplotlib", "numpy", "shapely", "google.protobuf"}

@@ -20,7 +20,8 @@ from helpers_sources import (
 from helpers_sources import convert_xml as convert
 from symphony.data.segment import AgentType, RunSegment, SignalState, content_hash
 from symphony.data.sources import get_reader
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 
 VERSIONS = ["2018b", "2020a"]

@@ -13,7 +13,8 @@ from helpers_segments import crossing, straight_road
 from symphony.cli import main
 from symphony.config import Method
 from symphony.data.builtin import builtin_store
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 
 
 def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,8 @@ import torch
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
 from symphony.config import EvaluateConfig, Method, MGAILConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.evaluation import evaluate
 from symphony.recipes import train
 from symphony.training.logging import read_metrics

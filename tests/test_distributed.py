@@ -17,7 +17,7 @@ from helpers_distributed import LOSSES, TRAINED
 from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import checkpoints, latest, load_checkpoint
-from symphony.data.store import StoreWriter
+from symphony.data.store_writer import StoreWriter
 from symphony.training.logging import read_metrics
 from symphony.training.processes import Processes, processes
 

@@ -22,7 +22,8 @@ from symphony.cli import main
 from symphony.data.convert import convert
 from symphony.data.sources.base import Item
 from symphony.data.sources.sumo import process
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError, printable
 from symphony.files import replacing, write_file, write_json
 

@@ -24,7 +24,8 @@ from symphony.config import (
     SearchConfig,
     ValidationConfig,
 )
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import SymphonyError
 from symphony.evaluation import evaluate
 from symphony.simulation.finite import NotFiniteError

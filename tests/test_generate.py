@@ -42,7 +42,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents, travel, usable
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import demand, networks, roads
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.logs import measure, shortfalls
 

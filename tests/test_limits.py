@@ -21,7 +21,8 @@ from symphony.data.sources import get_reader, tfrecord, womd
 from symphony.data.sources.base import Item
 from symphony.data.sources.lines import drivable_rings
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.data.unfinished import folder_of
 from symphony.errors import ConfigError, DataError
 

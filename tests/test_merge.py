@@ -15,7 +15,8 @@ from symphony.data.builtin import builtin_store
 from symphony.data.convert import convert
 from symphony.data.merge import merge
 from symphony.data.segment import content_hash
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 
 PARTS = [builtin_store("train"), builtin_store("test")]

@@ -22,7 +22,8 @@ from symphony.agents.checkpoint import CheckpointError, checkpoints
 from symphony.cli import main
 from symphony.collectors import BeamSearchCollector
 from symphony.config import DiscriminatorConfig, SearchConfig, TrainConfig, read_json, to_json
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.envs.routes import POINTS
 from symphony.errors import ConfigError

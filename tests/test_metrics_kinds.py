@@ -334,6 +334,15 @@ def test_in_the_table_kinds_sum_to_the_collision_rate():
     )
 
 
+def test_the_first_kind_is_counted_like_the_others():
+    inputs = stage(EGO, (12, 0, 0, 2))
+    found = collision_kinds(**inputs)
+    kinds = CollisionKinds(*(value[None, None] for value in found))
+    metrics = RolloutMetrics()
+    update(metrics, "a", {"collided": inputs["collided"][None, None]}, kinds)
+    assert metrics.compute()["collision_into_leader"] == 100
+
+
 def test_the_table_refuses_kinds_of_other_collisions_or_for_a_part():
     inputs, metrics = crowd(3), RolloutMetrics()
     kinds = collision_kinds(**inputs)

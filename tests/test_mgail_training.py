@@ -18,7 +18,8 @@ from symphony import keys
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import latest
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import Displacement
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate

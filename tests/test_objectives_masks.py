@@ -19,7 +19,8 @@ from symphony.agents.networks import (
     policy_network,
 )
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
 from symphony.simulation.demonstrations import SceneDataset

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from symphony.errors import ConfigError
-from symphony.evaluation.comparison import Entry, compare
+from symphony.evaluation.comparison import compare
+from symphony.evaluation.entries import Entry
 from symphony.evaluation.formats import as_markdown
 from symphony.evaluation.paired import PAIRED, clustered_mean, differences
 from test_table import make_entry, row_of

@@ -20,7 +20,8 @@ from symphony.agents import Agent, load_agent
 from symphony.agents.checkpoint import CheckpointError
 from symphony.config import METHODS, AgentConfig, EvaluateConfig
 from symphony.data.segment import RunSegment
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 from symphony.recipes import train
 from symphony.roadgraph import LaneGraph

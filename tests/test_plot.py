@@ -23,7 +23,8 @@ from symphony.cli import main
 from symphony.cli.plot import run_names
 from symphony.collectors.result import BeamSearchResult, lineage
 from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 from symphony.recipes import train
 from symphony.render import SearchTree, plot_genealogy, plot_search, plot_tree

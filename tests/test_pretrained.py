@@ -25,7 +25,7 @@ from symphony.cli import main
 from symphony.cli.train import Train
 from symphony.config import AgentSpec, EvaluateConfig, MGAILConfig, ValidationConfig, to_json
 from symphony.data.generate import PRESETS
-from symphony.data.store import StoreWriter
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 from symphony.recipes import train
 

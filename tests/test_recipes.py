@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from helpers_segments import crossing, straight_road
-from symphony.data.store import StoreWriter
+from symphony.data.store_writer import StoreWriter
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
 TINY = [

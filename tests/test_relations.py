@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from symphony.cli import main
 from symphony.config import Method, TableColumns
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.comparison import ASKED, Entry, collect, compare
+from symphony.evaluation.comparison import ASKED, compare
+from symphony.evaluation.entries import Entry, collect
 from symphony.evaluation.formats import FORMATS, as_json
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import RELATION_FORMATS, STATEMENTS, Relation, grid, relations

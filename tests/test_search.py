@@ -22,7 +22,8 @@ from symphony.agents import Agent, build_agent
 from symphony.collectors import BeamSearchResult, KeepAll, KeepBest
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, DrivingEnv, scene
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError

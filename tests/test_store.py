@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from helpers_segments import crossing, random_segment, segments, straight_road
 from helpers_store import files, fill, hashes, unlike
 from symphony.data.segment import RunSegment, content_hash
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 
 

@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 from helpers_segments import random_segment
 from helpers_store import files, fill, hashes, unlike
 from symphony.data.segment import RunSegment, content_hash
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 
 
@@ -132,7 +133,7 @@ WRITE = """
 import sys
 sys.path.insert(0, sys.argv[2])
 from helpers_segments import random_segment
-from symphony.data.store import StoreWriter
+from symphony.data.store_writer import StoreWriter
 with StoreWriter(sys.argv[1], append=True) as writer:
     for k in range(len(writer), 100_000):
         writer.append(random_segment(f"r{k}", seed=k))

@@ -14,8 +14,9 @@ from helpers_segments import crossing, straight_road
 from helpers_store import files, fill, unlike
 from symphony.cli import main
 from symphony.data.segment import RunSegment
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
 from symphony.data.store_format import MAPS, SEGMENTS
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 
 

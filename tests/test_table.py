@@ -19,20 +19,12 @@ from rich.console import Console
 from helpers_segments import crossing, straight_road
 from symphony.cli import main
 from symphony.config import AgentConfig, EvaluateConfig, Method, TrainConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.evaluation.comparison import (
-    COLUMNS,
-    ROWS,
-    SETTINGS,
-    Comparison,
-    Entry,
-    collect,
-    compare,
-    family,
-    method_name,
-)
+from symphony.evaluation.comparison import COLUMNS, Comparison, compare
+from symphony.evaluation.entries import ROWS, SETTINGS, Entry, collect, family, method_name
 from symphony.evaluation.formats import ABSENT, FORMATS, as_json, as_latex, as_markdown, as_text, print_text
 from symphony.evaluation.paper import METRICS, paper_figures
 from symphony.evaluation.records import evaluation_name, find_runs, keep_evaluation, kept_evaluations

@@ -12,7 +12,8 @@ from helpers_segments import crossing, straight_road
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.resample import resample
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate

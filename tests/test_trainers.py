@@ -27,7 +27,8 @@ from symphony.config import (
     read_json,
     to_json,
 )
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate

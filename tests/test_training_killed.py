@@ -19,7 +19,7 @@ from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
 from symphony.agents.choice import choose
 from symphony.cli import main
-from symphony.data.store import StoreWriter
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.files import write_file
 from symphony.recipes import train

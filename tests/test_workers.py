@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.config import EvaluateConfig
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle
 from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import EvaluatedBatch, Evaluation, evaluate

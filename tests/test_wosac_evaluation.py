@@ -20,7 +20,8 @@ from symphony.data.rollouts import STATES, RolloutArrays
 from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.comparison import WOSAC, Entry, compare
+from symphony.evaluation.comparison import WOSAC, compare
+from symphony.evaluation.entries import Entry
 from symphony.evaluation.formats import as_markdown
 from symphony.evaluation.passing import order_of, passing_gaps, passing_pairs
 from symphony.evaluation.wosac import THINNED, _thinned, evaluate_wosac, simulated_how

@@ -49,7 +49,7 @@ class Curvature:
 
         from symphony.agents.included import run_folder
         from symphony.cli.plot import run_names
-        from symphony.evaluation.comparison import method_name
+        from symphony.evaluation.entries import method_name
         from symphony.evaluation.records import read_run
         from symphony.metrics import jensen_shannon
         from symphony.render import plot_curvature
@@ -76,7 +76,7 @@ class Curvature:
             raise ConfigError(str(error)) from error
 
     def _record(self, run: Path, folder: Path) -> dict[str, Any]:
-        from symphony.evaluation.comparison import choose_evaluation
+        from symphony.evaluation.entries import choose_evaluation
         from symphony.evaluation.records import kept_evaluations
 
         if self.data is None:

@@ -62,7 +62,8 @@ class Table:
         """Collect, compare and write."""
         from rich.console import Console
 
-        from symphony.evaluation.comparison import collect, compare
+        from symphony.evaluation.comparison import compare
+        from symphony.evaluation.entries import collect
         from symphony.evaluation.formats import FORMATS, print_text
         from symphony.evaluation.paired import differences
         from symphony.evaluation.relations import RELATION_FORMATS, relations

@@ -17,7 +17,8 @@ import numpy as np
 from symphony.data.plausibility import implausible, measure
 from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.data.sources.base import Item, Reader, UnexpectedError
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 
 CUTS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)

@@ -32,7 +32,8 @@ from symphony.data.parts import (
 from symphony.data.report import Report, Skip
 from symphony.data.resample import MAX_SIGMA
 from symphony.data.sources import Reader, get_reader
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.data.unfinished import STORE, Draft, Job, folder_of, read_journal
 from symphony.errors import ConfigError, DataError
 

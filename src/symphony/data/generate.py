@@ -25,7 +25,8 @@ from symphony.data.roadside import Roadside, add_roadside
 from symphony.data.segment import RunSegment
 from symphony.data.selection import usable
 from symphony.data.sources.sumo import KINDS, crop_rule, generate_run, sumo_version
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 
 Split = Literal["train", "validation", "test"]

@@ -25,7 +25,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
 from symphony.data.sources import Reader
 from symphony.data.sources.base import unexpected
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 
 PART_BYTES, PART_FILES = 8 << 20, 64

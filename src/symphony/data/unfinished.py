@@ -23,7 +23,8 @@ from typing import Any, BinaryIO
 
 from symphony.data import store_format
 from symphony.data.report import Report, Skip
-from symphony.data.store import SegmentStore, StoreWriter
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.files import locating
 

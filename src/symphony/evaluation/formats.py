@@ -13,7 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from symphony.config import TableFormat
-from symphony.evaluation.comparison import SETTINGS, Cell, Column, Comparison, Row, family, method_name
+from symphony.evaluation.comparison import Cell, Column, Comparison, Row
+from symphony.evaluation.entries import SETTINGS, family, method_name
 from symphony.files import json_text
 
 NOTHING = "–"

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.comparison import COLUMNS, Column, Entry, method_name
+from symphony.evaluation.comparison import COLUMNS, Column
+from symphony.evaluation.entries import Entry, method_name
 
 PAIRED: tuple[Column, ...] = tuple(column for column in COLUMNS if column.key != "curvature_jsd")
 """What every run segment has a number of."""

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from symphony.config import PaperData, Setting, TableFormat
 from symphony.errors import ConfigError
-from symphony.evaluation.comparison import METHOD_COLUMNS, ROWS, Entry, method_name, number
+from symphony.evaluation.comparison import METHOD_COLUMNS
+from symphony.evaluation.entries import ROWS, Entry, method_name, number
 from symphony.evaluation.paired import clustered_mean, mean_rows
 from symphony.evaluation.paper import paper_figures
 from symphony.files import json_text

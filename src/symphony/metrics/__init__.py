@@ -13,8 +13,9 @@ from symphony.metrics.curvature import (
 )
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
+from symphony.metrics.rates import SegmentResult
 from symphony.metrics.realism import collisions, displacement, offroad
-from symphony.metrics.summary import RolloutMetrics, SegmentResult
+from symphony.metrics.summary import RolloutMetrics
 
 __all__ = [
     "AgentResult",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.metrics.agents import AgentResult, AgentSteps, agent_rates, agent_results, speed_distance
+from symphony.metrics.agents import AgentSteps, agent_rates, agent_results, speed_distance
 from symphony.metrics.choices import Choice, Standing, choice_numbers
 from symphony.metrics.curvature import (
     BINS,
@@ -25,49 +24,19 @@ from symphony.metrics.curvature import (
     sampled_divergence,
     sampling_floor,
 )
-from symphony.metrics.kinds import CollisionKind, CollisionKinds
-
-
-@dataclass(frozen=True)
-class SegmentResult:
-    """What one run segment adds to the table.
-
-    Attributes:
-        collided: rollouts in which an interactive agent collided at some step.
-        rollouts: K.
-        offroad: agent-steps off the road, over all rollouts.
-        steps: agent-steps simulated, over all rollouts.
-        error: [K] displacement error summed over agents and steps, metres.
-        logged: agent-steps at which the log is valid, of one rollout.
-        histogram: [201] curvatures of the branching regions visited by the rollouts.
-        histogram_log: [201] likewise by the log.
-        kinds: [kinds, 2] rollouts by the :class:`CollisionKind` of their first collision, with an interactive agent
-            and with a playback agent; None where not asked for.
-        agents: [2, kinds] agents of all rollouts by the kind of their first collision: egos, other interactive
-            agents; None where kinds are.
-        simulated: egos, and other interactive agents, in all rollouts.
-        group: the recording the segment is part of; None where not given.
-        single: what became of single agents while their log exists; None where not asked for.
-        standing: agents that stand at the end, of all rollouts and of the log, and agents whose log lasts that long;
-            None where not given.
-        choice: what the search made of the goals; None without search or goals.
-    """
-
-    collided: int
-    rollouts: int
-    offroad: int
-    steps: int
-    error: NDArray[np.float64]
-    logged: int
-    histogram: NDArray[np.int64]
-    histogram_log: NDArray[np.int64]
-    kinds: NDArray[np.int64] | None = None
-    agents: NDArray[np.int64] | None = None
-    simulated: tuple[int, int] = (0, 0)
-    group: str | None = None
-    single: AgentResult | None = None
-    standing: tuple[int, int, int] | None = None
-    choice: Choice | None = None
+from symphony.metrics.kinds import CollisionKinds
+from symphony.metrics.rates import (
+    SegmentResult,
+    count_agents,
+    count_kinds,
+    count_standing,
+    group_numbers,
+    kind_rates,
+    ratio,
+    role_rates,
+    standing_rates,
+    summed,
+)
 
 
 class RolloutMetrics:
@@ -129,13 +98,13 @@ class RolloutMetrics:
             bad = segment_ids[int(np.argwhere(~np.isfinite(error))[0, 0])]
             raise ValueError(f"segment {bad}: displacement is not finite")
         hit = (collided & simulated).flatten(2).any(-1)
-        counts = None if kinds is None else _count_kinds(segment_ids, kinds, hit)
-        by_agent = None if kinds is None else _count_agents(kinds)
+        counts = None if kinds is None else count_kinds(segment_ids, kinds, hit)
+        by_agent = None if kinds is None else count_agents(kinds)
         there = simulated.any(-1).sum(1)
         if groups is not None and len(groups) != len(segment_ids):
             raise ValueError(f"{len(groups)} groups for {len(segment_ids)} segments")
         singles = None if single is None else agent_results(single)
-        ends = None if standing is None else _count_standing(standing)
+        ends = None if standing is None else count_standing(standing)
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
         # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
@@ -203,12 +172,12 @@ class RolloutMetrics:
     def curvature_divergence(self) -> tuple[Divergence, list[str]]:
         """The divergence, and the names of its samples: the groups, or without any the segments."""
         found = [self.segments[name] for name in sorted(self.segments)]
-        member = _groups(found)
+        member = group_numbers(found)
         names = sorted(self.segments) if member is None else sorted({str(s.group) for s in found})
         counts = (
             np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True)
         )
-        return sampled_divergence(*(_summed(each, member) for each in counts)), names
+        return sampled_divergence(*(summed(each, member) for each in counts)), names
 
     def compute(self) -> dict[str, Any]:
         """The table row.
@@ -258,15 +227,15 @@ class RolloutMetrics:
             "offroad_time": (100 * column([s.offroad for s in found]), column([s.steps for s in found])),
             "ade": (column([s.error.mean() for s in found]), logged),
             "min_sade": (column([s.error.min() for s in found]), logged),
-            **_kind_rates(found),
-            **_agent_rates(found),
+            **kind_rates(found),
+            **role_rates(found),
             **(agent_rates(single) if single else {}),
-            **_standing_rates(found),
+            **standing_rates(found),
         }
-        member = _groups(found)
+        member = group_numbers(found)
         out: dict[str, Any] = {}
         for name, (total, weight) in parts.items():
-            out[name], out[f"{name}_se"] = _ratio(total, weight, member)
+            out[name], out[f"{name}_se"] = ratio(total, weight, member)
         divergence, _ = self.curvature_divergence()
         out["curvature_jsd"], out["curvature_jsd_se"] = divergence.value, divergence.error
         out["curvature_jsd_floor"] = sampling_floor(np.stack([s.histogram_log for s in found]))
@@ -282,82 +251,6 @@ class RolloutMetrics:
         return out
 
 
-def _count_kinds(
-    segment_ids: Sequence[str], kinds: CollisionKinds, hit: Bool[Tensor, "B K"]
-) -> NDArray[np.int64]:
-    """Rollouts [B, kinds, 2] by kind and whether the other is a playback agent."""
-    kind, playback = (value.cpu().numpy() for value in kinds.first())
-    if kind.shape != tuple(hit.shape):
-        raise ValueError(f"kinds are of {list(kind.shape)} rollouts, expected {list(hit.shape)}")
-    wrong = ((kind >= 0) != hit.cpu().numpy()).any(1)
-    if wrong.any():
-        raise ValueError(f"segment {segment_ids[int(wrong.argmax())]}: kinds are not those of its collisions")
-    both = np.stack([~playback, playback], -1)[..., None, :]
-    return ((kind[..., None] == np.array(CollisionKind))[..., None] & both).sum(1)
-
-
-def _kind_rates(
-    found: Sequence[SegmentResult],
-) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Percent times rollouts, and rollouts, of every segment."""
-    given = [s.kinds for s in found if s.kinds is not None]
-    if not given:
-        return {}
-    if len(given) < len(found):
-        raise ValueError(f"collision kinds were given for {len(given)} of {len(found)} segments")
-    counts = 100.0 * np.stack(given)
-    rollouts = np.array([s.rollouts for s in found], dtype=np.float64)
-    rates = {kind.name.lower(): counts[:, kind].sum(-1) for kind in CollisionKind}
-    rates["with_playback"] = counts[..., 1].sum(-1)
-    rates["rear_ended_by_playback"] = counts[:, CollisionKind.REAR_ENDED, 1]
-    return {f"collision_{name}": (total, rollouts) for name, total in rates.items()}
-
-
-def _count_agents(kinds: CollisionKinds) -> NDArray[np.int64]:
-    """Agents [B, 2, kinds] by kind: egos, other interactive agents, of all rollouts."""
-    same = kinds.kind.cpu().numpy()[..., None] == np.array(CollisionKind)
-    counts = same.sum(1)
-    return np.stack([counts[:, 0], counts[:, 1:].sum(1)], axis=1)
-
-
-def _agent_rates(
-    found: Sequence[SegmentResult],
-) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Percent times agents, and agents, of every segment: all kinds, then each."""
-    given = [s.agents for s in found if s.agents is not None]
-    if not given:
-        return {}
-    counts = 100.0 * np.stack(given)
-    weights = np.array([s.simulated for s in found], dtype=np.float64)
-    rates = {}
-    for k, who in enumerate(("ego", "others")):
-        rates[f"{who}_collision_rate"] = counts[:, k].sum(-1), weights[:, k]
-        for kind in CollisionKind:
-            rates[f"{who}_collision_{kind.name.lower()}"] = counts[:, k, kind], weights[:, k]
-    return rates
-
-
-def _count_standing(standing: Standing) -> list[tuple[int, int, int]]:
-    """Of every segment: agents that stand, of the rollouts and of the log, and agents that are compared."""
-    counted = standing.counted
-    slow = (standing.rollouts & counted[:, None]).sum((1, 2)).tolist()
-    return list(zip(slow, (standing.log & counted).sum(1).tolist(), counted.sum(1).tolist(), strict=True))
-
-
-def _standing_rates(
-    found: Sequence[SegmentResult],
-) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Percent times agents, and agents, of every segment: those of the rollouts, and of the log."""
-    given = [s.standing for s in found if s.standing is not None]
-    if not given:
-        return {}
-    if len(given) < len(found):
-        raise ValueError(f"who stands was given for {len(given)} of {len(found)} segments")
-    slow, slow_log, agents = np.array(given, dtype=np.float64).T
-    rollouts = np.array([s.rollouts for s in found], dtype=np.float64)
-    return {"standing": (100 * slow, agents * rollouts), "standing_log": (100 * slow_log, agents)}
-
-
 def _more(s: SegmentResult) -> dict[str, float]:
     """What a row has where it was asked for."""
     out: dict[str, float] = {}
@@ -370,40 +263,6 @@ def _more(s: SegmentResult) -> dict[str, float]:
     if s.choice is not None:
         out["goals_variation"] = s.choice.variation
     return out
-
-
-def _groups(found: Sequence[SegmentResult]) -> NDArray[np.int64] | None:
-    """[segments] number of the group each is in, from 0; None where none were given."""
-    given = [s.group for s in found if s.group is not None]
-    if not given:
-        return None
-    if len(given) < len(found):
-        raise ValueError(f"groups were given for {len(given)} of {len(found)} segments")
-    return np.unique(np.array(given), return_inverse=True)[1]
-
-
-def _summed(values: NDArray[Any], member: NDArray[np.int64] | None) -> NDArray[Any]:
-    """Sums over the segments of each group; the segments' own values without groups."""
-    if member is None:
-        return values
-    out = np.zeros((int(member.max()) + 1, *values.shape[1:]), values.dtype)
-    np.add.at(out, member, values)
-    return out
-
-
-def _ratio(
-    total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64] | None = None
-) -> tuple[float, float]:
-    """Ratio of sums and its standard error over segments or groups (linearised; NaN for a single one)."""
-    if weight.sum() == 0:
-        return math.nan, math.nan
-    ratio = total.sum() / weight.sum()
-    total, weight = _summed(total, member), _summed(weight, member)
-    count = len(total)
-    if count < 2:
-        return float(ratio), math.nan
-    residual = (total - ratio * weight) / weight.mean()
-    return float(ratio), float(np.sqrt((residual**2).sum() / (count - 1) / count))
 
 
 def _check_shapes(

@@ -13,7 +13,8 @@ import numpy as np
 from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.demand import write_demand
 from symphony.data.sources.sumo.extract import DT, STATES, CropRule, crop_rule, cut_segments
-from symphony.data.sources.sumo.networks import NETWORKS, RAMP_RADIUS, ramp
+from symphony.data.sources.sumo.freeways import RAMP_RADIUS, ramp
+from symphony.data.sources.sumo.networks import NETWORKS
 from symphony.data.sources.sumo.process import scratch, sumo_home, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.simulate import simulate_traffic

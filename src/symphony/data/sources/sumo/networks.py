@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.sources.sumo.freeways import ramp
+from symphony.data.sources.sumo.plain import COMMON, PlainNetwork, Point
 from symphony.data.sources.sumo.process import run_program
 from symphony.errors import DataError
 
-Point = NDArray[np.float64]
 SHARPEST_ANGLE = 1.05
 """Radians between two streets at a junction, at least where one of them is bent."""
 LATERAL_ACCELERATION = 3.0
@@ -25,89 +26,11 @@ LATERAL_ACCELERATION = 3.0
 _THROUGH = 0.75
 """Cosine of the sharpest bend of an arterial at a junction."""
 _FEWEST_STREETS = 8
-_COMMON = [
-    "--no-turnarounds",
-    "true",
-    "--junctions.corner-detail",
-    "8",
-    "--junctions.internal-link-detail",
-    "20",
-    "--junctions.limit-turn-speed",
-    "3.5",
-    "--default.connection.cont-pos",
-    "0",
-    "--tls.yellow.time",
-    "3",
-    "--tls.allred.time",
-    "2",
-    "--no-warnings",
-    "true",
-]
-
-
-@dataclass
-class PlainNetwork:
-    """Nodes, edges and explicit connections, as lines of SUMO's plain XML."""
-
-    nodes: list[str] = field(default_factory=list)
-    edges: list[str] = field(default_factory=list)
-    connections: list[str] = field(default_factory=list)
-
-    def node(self, name: str, point: Point, control: str, radius: float | None = None) -> None:
-        """Add a junction."""
-        size = "" if radius is None else f' radius="{radius:.2f}"'
-        self.nodes.append(f'<node id="{name}" x="{point[0]:.2f}" y="{point[1]:.2f}" type="{control}"{size}/>')
-
-    def edge(
-        self,
-        start: str,
-        end: str,
-        *,
-        lanes: int,
-        speed: float,
-        width: float,
-        priority: int,
-        shape: Point | None = None,
-        spread: str = "right",
-    ) -> str:
-        """Add a one-way edge and return its id."""
-        name = f"{start}_{end}"
-        points = "" if shape is None else " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
-        line = f' shape="{points}"' if points else ""
-        self.edges.append(
-            f'<edge id="{name}" from="{start}" to="{end}" numLanes="{lanes}" speed="{speed:.2f}" '
-            f'width="{width:.2f}" priority="{priority}" spreadType="{spread}"{line}/>'
-        )
-        return name
-
-    def connect(self, start: str, end: str, pairs: list[tuple[int, int]]) -> None:
-        """Allow exactly these lane-to-lane connections between two edges."""
-        self.connections += [
-            f'<connection from="{start}" to="{end}" fromLane="{i}" toLane="{j}"/>' for i, j in pairs
-        ]
-
-    def compile(self, folder: Path, options: list[str]) -> Path:
-        """Write the XML and run ``netconvert``; returns the network file."""
-        arguments = ["--output-file", "net.net.xml", *_COMMON, *options]
-        parts = (
-            ("node", "nodes", self.nodes),
-            ("edge", "edges", self.edges),
-            ("connection", "connections", self.connections),
-        )
-        for kind, root, lines in parts:
-            if lines:
-                (folder / f"net.{kind[:3]}.xml").write_text("\n".join([f"<{root}>", *lines, f"</{root}>"]))
-                arguments += [f"--{kind}-files", f"net.{kind[:3]}.xml"]
-        run_program("netconvert", arguments, folder)
-        return folder / "net.net.xml"
 
 
 def _signal_layout(rng: np.random.Generator) -> str:
     # "opposites" makes left turns wait for gaps; with it alone, dense junctions lock up.
     return "opposites" if rng.random() < 0.25 else "incoming"
-
-
-# Towns ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -309,9 +232,6 @@ def _add_nodes(
     return rings
 
 
-# Grids ----------------------------------------------------------------------------------------------------------
-
-
 def grid(rng: np.random.Generator, folder: Path) -> Path:
     """A perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
     controls = ["traffic_light", "priority", "allway_stop", "right_before_left"]
@@ -337,11 +257,8 @@ def grid(rng: np.random.Generator, folder: Path) -> Path:
     arguments += ["--default.speed", f"{rng.choice([11.18, 13.89]):.2f}"]
     arguments += ["--default.junctions.radius", f"{rng.uniform(5, 10):.2f}"]
     arguments += ["--tls.layout", _signal_layout(rng), "--seed", str(rng.integers(1, 2**30))]
-    run_program("netgenerate", [*arguments, "--output-file", "net.net.xml", *_COMMON], folder)
+    run_program("netgenerate", [*arguments, "--output-file", "net.net.xml", *COMMON], folder)
     return folder / "net.net.xml"
-
-
-# Random networks ------------------------------------------------------------------------------------------------
 
 
 def random(rng: np.random.Generator, folder: Path) -> Path:
@@ -411,115 +328,6 @@ def _through_road(
             road.add(pair)
             before, here = here, end  # noqa: PLW2901
     return road
-
-
-# Freeway ramps --------------------------------------------------------------------------------------------------
-
-
-RAMP_RADIUS = 190.0
-"""Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
-
-
-def ramp(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path:
-    """Two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
-
-    All ends, those of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
-    """
-    net = PlainNetwork()
-    width = rng.uniform(3.5, 3.75)
-    speed = float(rng.choice([24.6, 26.8, 29.1]))
-    direction = rng.uniform(0, 2 * np.pi)
-    # A longer road turns as much, not more.
-    curvature = rng.uniform(-1, 1) / 1500 * (600 / (600 + longer))
-    for side in range(2):
-        lanes = int(rng.integers(2, 4))
-        _carriageway(
-            net,
-            rng,
-            side,
-            (lanes, speed, width),
-            direction + side * np.pi,
-            curvature * (1 - 2 * side),
-            longer,
-        )
-    return net.compile(folder, ["--default.junctions.radius", "4", "--junctions.scurve-stretch", "1.5"])
-
-
-def _carriageway(
-    net: PlainNetwork,
-    rng: np.random.Generator,
-    side: int,
-    road: tuple[int, float, float],
-    direction: float,
-    curvature: float,
-    longer: float,
-) -> None:
-    """One direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
-    lanes, speed, width = road
-    weaving = rng.random() < 0.4
-    stations = np.cumsum([0, 300 + longer, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
-    stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
-    stations = np.append(stations, stations[-1] + 300 + longer)
-    shift = stations[-1] / 2
-    median = 5.0
-
-    def along(s: NDArray[np.float64], right: float | NDArray[np.float64]) -> Point:
-        """Points at stations s, so far to the right of the edge of the median."""
-        u = s - shift
-        x, y = u, curvature * u**2 / 2
-        normal = np.stack([curvature * u, -np.ones_like(u)], -1)
-        out = np.stack([x, y], -1) + normal * (median + np.asarray(right))[..., None]
-        spin = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
-        return out @ spin.T
-
-    def stretch(a: float, b: float, right: float = 0.0) -> Point:
-        return along(np.linspace(a, b, 12), right)
-
-    marks = [
-        stations[0],
-        stations[1],
-        stations[2],
-        *([] if weaving else [stations[3], stations[4]]),
-        stations[5],
-    ]
-    extra = [0, 1, 0] if weaving else [0, 1, 0, 1, 0]
-    names = [f"c{side}m{k}" for k in range(len(marks))]
-    for name, mark in zip(names, marks, strict=True):
-        net.node(name, along(np.array([mark]), 0.0)[0], "priority")
-    ids = []
-    for k, more in enumerate(extra):
-        total = lanes + more
-        # The line given to SUMO is the left edge of the carriageway (spread to the right).
-        ids.append(
-            net.edge(
-                names[k],
-                names[k + 1],
-                lanes=total,
-                speed=speed,
-                width=width,
-                priority=9,
-                shape=stretch(marks[k], marks[k + 1]),
-            )
-        )
-    for k in range(len(extra) - 1):
-        pairs = [(i + extra[k], i + extra[k + 1]) for i in range(lanes)]
-        net.connect(ids[k], ids[k + 1], pairs)
-
-    ramp_speed, edge = rng.uniform(15.5, 20), lanes * width
-    on, off = 1, len(extra) - 1
-    # Ramps are longer than a crop's radius, so that their ends are never on a map.
-    reach = np.linspace(1.7, 0, 20)
-    far = 150 + longer
-    gap = (3 * reach + 30 * reach**2) * (far / 150)
-    start = along(marks[on] - far * reach, edge + gap)
-    end = along(marks[off] + far * reach[::-1], edge + gap[::-1])
-    net.node(f"c{side}on", start[0], "priority")
-    net.node(f"c{side}off", end[-1], "priority")
-    options = {"lanes": 1, "width": width, "priority": 4}
-    first = net.edge(f"c{side}on", names[on], speed=ramp_speed, shape=start, **options)  # type: ignore[arg-type]
-    last = net.edge(names[off], f"c{side}off", speed=ramp_speed, shape=end, **options)  # type: ignore[arg-type]
-    net.connect(first, ids[on], [(0, 0)])
-    net.connect(ids[off - 1], last, [(0, 0)])
 
 
 NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
