@@ -143,6 +143,7 @@ PARTS = (
     ("BC+TS", "eight/{}-bc_ts-40"),
     ("BC+TS+H without its search", "parts/{}-bc_ts_h_none"),
     ("BC+TS+H", "eight/{}-bc_ts_h-40"),
+    ("BC+TS+H, 2 000 instead of 500 updates", "parts/{}-tsh2000"),
 )
 """What inputs, further updates, distillation and search each do, of one seed."""
 INPUTS = (
@@ -155,6 +156,11 @@ INPUTS = (
     ("all four", "rates/{}-0.01"),
 )
 """What changes of the paper's inputs do alone, and their records on the validation parts."""
+POINTS = (
+    ("BC+TS, 200 points", "inputs/{}-points-200"),
+    ("BC+TS, 512 points", "inputs/{}-points-512"),
+)
+"""What more points are for policy and discriminator, likewise."""
 ADVERSARIAL = (
     ("2 000 updates of regression at 0.01", "adversarial/{}-short"),
     ("6 000 at 0.01", "adversarial/{}-faster"),
