@@ -11,9 +11,9 @@ from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
+import shapely
 import torch
 from numpy.typing import NDArray
-from shapely import LineString
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -277,12 +277,9 @@ def _first_inside(segment: RunSegment, chosen: NDArray[np.int64], edge: MapEdge)
 
 
 def _edges(boundary: Polylines) -> tuple[NDArray[Any], ...]:
-    lines = [
-        np.asarray(LineString(boundary[k][:, :2].astype(np.float64)).simplify(BOUNDARY_TOLERANCE).coords)
-        for k in range(len(boundary))
-    ]
-    simple = Polylines.of(lines)
-    return segments_of(simple.points[:, :2], simple.offsets)
+    lines = shapely.linestrings(boundary.points[:, :2].astype(np.float64), indices=boundary.line_index)
+    points, line = shapely.get_coordinates(shapely.simplify(lines, BOUNDARY_TOLERANCE), return_index=True)
+    return segments_of(points.astype(np.float32), np.searchsorted(line, np.arange(len(boundary) + 1)))
 
 
 def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:

@@ -40,7 +40,7 @@ class LineIndex:
     """
 
     def __init__(self, lines: Sequence[Reals]) -> None:
-        self.geometry = np.array([shapely.LineString(line) for line in lines], dtype=object)
+        self.geometry = line_strings(lines)
         self._tree = shapely.STRtree(self.geometry)
         steps = [np.diff(line, axis=0) for line in lines]
         lengths = [np.hypot(*step.T) for step in steps]
@@ -67,6 +67,12 @@ class LineIndex:
         """Direction of lines [K] at ``along`` [K] metres from their start."""
         segment = np.searchsorted(self._begin, self._base[line] + along, side="right") - 1
         return self._heading[np.clip(segment, self._first[line], self._first[line + 1] - 1)]
+
+
+def line_strings(lines: Sequence[Reals]) -> NDArray[Any]:
+    """[lines] shapely geometries of polylines [P_k, 2], all made at once."""
+    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    return shapely.linestrings(np.concatenate([*lines, np.zeros((0, 2))]), indices=owner)
 
 
 def turn_between(a: Reals, b: Reals) -> Reals:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from symphony.geometry.stations import stations_along
 from symphony.roadgraph.assign import starting_lanes
 from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Reals
+from symphony.roadgraph.lines import Reals, line_strings
 
 Route = tuple[int, ...]
 """Lane indices in driving order."""
@@ -167,8 +167,7 @@ def route_errors(
         return np.full(len(choices), np.nan)
     lanes = sorted({lane for route in choices for lane in route})
     row = {lane: k for k, lane in enumerate(lanes)}
-    lines = np.array([shapely.LineString(graph.lines[lane]) for lane in lanes], dtype=object)
-    distance = shapely.distance(lines[:, None], points[None])
+    distance = shapely.distance(line_strings([graph.lines[lane] for lane in lanes])[:, None], points[None])
     away = [distance[[row[lane] for lane in route]] for route in choices]
     errors = np.array([each.min(0).mean() for each in away])
     again = np.array([len(set(route)) < len(route) for route in choices])
