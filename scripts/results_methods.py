@@ -154,6 +154,7 @@ INPUTS = (
     ("+ 21 levels of acceleration", "inputs/{}-levels"),
     ("+ gaps, displaced states, lights", "inputs/{}-seven"),
     ("all four", "rates/{}-0.01"),
+    ("all four, interactive agents' states four times as often", "inputs/{}-interactive"),
 )
 """What changes of the paper's inputs do alone, and their records on the validation parts."""
 POINTS = (
