@@ -210,7 +210,11 @@ def settings() -> Grid:
         for method, label in EIGHT.items()
         if any(RECORDS.glob(f"settings/*-{method}-[0-9]*.json"))
     ]
-    return driven(rows, SETTINGS)
+    grid = driven(rows, SETTINGS)
+    grid[0].append("seeds")
+    for line, (_, pattern, part) in zip(grid[1:], rows, strict=True):
+        line.append("" if part else str(len(records(pattern.format("many")))))
+    return grid
 
 
 def roadside() -> Grid:
