@@ -66,9 +66,14 @@ class Cells(ABC):
         high: [B, 2] metres of the upper right one.
         some: [B] whether a map has cells at all.
         size: least side of a cell, metres.
+        total: elements per map, padding included.
+        wanted: how many are looked for.
     """
 
-    def __init__(self, low: Reals, high: Reals, some: Bools, size: float) -> None:
+    def __init__(
+        self, low: Reals, high: Reals, some: Bools, size: float, *, total: int, wanted: int = 1
+    ) -> None:
+        self.total, self.wanted = total, wanted
         low, high = (np.where(some[:, None], value, 0.0).astype(np.float64) for value in (low, high))
         low = np.floor(low - _MARGIN)
         extent, side = high + _MARGIN - low, np.full(len(low), size)
@@ -79,15 +84,30 @@ class Cells(ABC):
         self.side, self.per_metre = side, 1.0 / side
         self.columns, self.rows = np.where(some, np.ceil(extent / side[:, None]).T, 0.0)
         ends = (self.columns * self.rows).cumsum().astype(np.int64)
-        self.first, total = np.concatenate([[0], ends[:-1]]), int(ends[-1]) if len(ends) else 0
+        self.first, cells = np.concatenate([[0], ends[:-1]]), int(ends[-1]) if len(ends) else 0
         # Where a cell's list begins; -1 while it has none.
-        self.begin, self.count = np.full(total, -1), np.zeros(total, np.int64)
-        self.sign, self._asked = np.zeros(total, np.int8), np.zeros(total, np.int64)
+        self.begin, self.count = np.full(cells, -1), np.zeros(cells, np.int64)
+        self.sign, self._asked = np.zeros(cells, np.int8), np.zeros(cells, np.int64)
         self.items, self._used = np.zeros(1 << 12, np.int32), 0
 
     @abstractmethod
+    def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
+        """Squared metres [C, elements of a map] from centres x and y [C, 1]; infinity where there is no element."""
+
     def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
         """Lists of cells with the centres x and y [C], as long as ``side`` [C]."""
+        counts, items, step = [], [], max(1, _BLOCK // self.total)
+        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
+        for a in range(0, len(scene), step):
+            rows = slice(a, a + step)
+            squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
+            last = np.partition(squared, self.wanted - 1, axis=-1)[:, self.wanted - 1 : self.wanted]
+            near = squared <= np.square(np.sqrt(last) + reach[rows])
+            row, element = near.nonzero()
+            counts.append(near.sum(1))
+            items.append(scene[rows][row] * self.total + element)
+        count = np.concatenate(counts)
+        return Lists(count, np.concatenate(items), np.zeros(len(count), np.int8))
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
         """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells.
@@ -148,26 +168,13 @@ class PointCells(Cells):
             for bound, start in ((np.min, np.inf), (np.max, -np.inf))
         )
         some = exists.sum(1) >= max(_WORTH * count, 1)
-        super().__init__(low, high, some, POINT_CELL if count <= _MANY else 2 * POINT_CELL)
-        self.points, self.wanted = (x, y), count
+        size = POINT_CELL if count <= _MANY else 2 * POINT_CELL
+        super().__init__(low, high, some, size, total=x.shape[1], wanted=count)
+        self.points = x, y
 
-    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
-        total, counts, items = self.points[0].shape[1], [], []
-        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
-        for a in range(0, len(scene), max(1, _BLOCK // total)):
-            rows = slice(a, a + max(1, _BLOCK // total))
-            away = (
-                points.take(scene[rows], 0) - centre[rows, None].astype(np.float32)
-                for points, centre in zip(self.points, (x, y), strict=True)
-            )
-            squared = sum(np.square(each) for each in away)
-            last = np.partition(squared, self.wanted - 1, axis=-1)[:, self.wanted - 1 : self.wanted]
-            near = squared <= np.square(np.sqrt(last) + reach[rows])
-            row, point = near.nonzero()
-            counts.append(near.sum(1))
-            items.append(scene[rows][row] * total + point)
-        count = np.concatenate(counts)
-        return Lists(count, np.concatenate(items), np.zeros(len(count), np.int8))
+    def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
+        away_x, away_y = (v.take(scene, 0) - c for v, c in zip(self.points, (x, y), strict=True))
+        return np.square(away_x) + np.square(away_y)
 
     def nearest_points(self, cell: Indices, x: Reals, y: Reals) -> Indices:
         """Numbers [R, K] of the points nearest to positions [R] in cells that have lists, ascending."""
@@ -208,24 +215,17 @@ class EdgeCells(Cells):
             )
             for bound, of_two, start in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
         )
-        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL)
+        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1])
         self.edges, self.exists = edges, exists
 
+    def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
+        squared = squared_to(self.edges.rows.reshape(-1, self.total, 5).take(scene, 0), x, y)
+        squared[~self.exists[scene]] = np.inf
+        return squared
+
     def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
-        total, counts, items = self.exists.shape[1], [], []
-        per_map = self.edges.rows.reshape(-1, total, 5)
-        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
-        for a in range(0, len(scene), max(1, _BLOCK // total)):
-            rows = slice(a, a + max(1, _BLOCK // total))
-            centre = (value[rows, None].astype(np.float32) for value in (x, y))
-            squared = squared_to(per_map.take(scene[rows], 0), *centre)
-            squared[~self.exists[scene[rows]]] = np.inf
-            near = squared <= np.square(np.sqrt(squared.min(1, keepdims=True)) + reach[rows])
-            row, edge = near.nonzero()
-            counts.append(near.sum(1))
-            items.append(scene[rows][row] * total + edge)
-        count, item = np.concatenate(counts), np.concatenate(items)
-        return Lists(count, item, self._signs(x, y, count, item, 0.5 * side))
+        lists = super()._lists(scene, x, y, side)
+        return lists._replace(sign=self._signs(x, y, lists.length, lists.items, 0.5 * side))
 
     def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
         """1 or -1 for cells [C] on one side of every edge listed and of each neighbour that decides at a corner."""
