@@ -69,6 +69,20 @@ def test_polygons_with_holes_agree_with_shapely(seed, corners, holes):
     np.testing.assert_array_equal(ours[clear] > 0, expected[clear] > 0)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("coordinate", [0, 1])
+def test_a_point_that_is_not_finite_has_no_finite_distance_and_changes_no_other(bad, coordinate):
+    square = segments([closed(np.array([[0.0, 0], [40, 0], [40, 30], [0, 30]]))])
+    points = torch.tensor([[[20.0, 3], [50, 20], [0, 0], [39, 31]]], dtype=torch.float64)
+    alone = signed_distance(points, *square)
+    broken = torch.cat([points[:, :2], points[:, :1], points[:, 2:]], 1)
+    broken[0, 2, coordinate] = bad
+    found = signed_distance(broken, *square)
+    assert not found[0, 2].isfinite()
+    torch.testing.assert_close(found[:, [0, 1, 3, 4]], alone, atol=1e-12, rtol=0)
+    assert not signed_distance(broken[:, 2:3], *square).isfinite().any()
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_open_lines_have_euclidean_distance(seed):

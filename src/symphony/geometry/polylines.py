@@ -37,7 +37,8 @@ def signed_distance(
 
     With the drivable side on the left (see ``RoadMap.boundary``) positive means off the road. The absolute
     value is the Euclidean distance. Segments of no length and those not valid are ignored; a scene without
-    segments gives :data:`NO_BOUNDARY`. Differentiable in ``points`` (the nearest segment is held fixed).
+    segments gives :data:`NO_BOUNDARY`. A point that is not finite has no finite distance and changes nothing for
+    others. Differentiable in ``points`` (the nearest segment is held fixed).
 
     Args:
         points: [B, M, 2] metres.
@@ -108,7 +109,7 @@ class _Side:
         x, y, along_x, along_y = self._away
         beyond = self.fraction > 0.5
         gap = (x - beyond * along_x).square() + (y - beyond * along_y).square()
-        apart = gap > 0
+        apart = gap != 0  # NaN stays NaN
         return torch.where(apart, torch.where(apart, gap, 1.0).sqrt(), 0.0)
 
     @property
@@ -160,7 +161,7 @@ def _nearest_segment(
     if batch == 0 or count == 0:
         return torch.zeros(batch, count, dtype=torch.long, device=points.device)
     # Coordinates relative to the points' centre keep float32 rounding well below a millimetre.
-    center = points.mean(1, keepdim=True)
+    center = points.where(points.isfinite(), torch.nan).nanmean(1, keepdim=True).nan_to_num()
     x, y = (points - center)[..., None].unbind(2)
     axes = _segment_axes(start, end, valid, center)
     width, group = edges, batch
