@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.observation import (
-    Objects,
-    Observation,
-    ObservationConfig,
-    objects_at,
-    observation_spec,
-    observe,
-)
+from symphony.envs.observation import Objects, Observation, ObservationConfig, objects_at, observe
 from symphony.envs.routes import pick_routes, route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
+from symphony.envs.specs import make_specs
 from symphony.envs.tables import Tables
 from symphony.envs.traffic import entering, without
 from symphony.errors import ConfigError
@@ -139,55 +132,14 @@ class DrivingEnv(EnvBase):
         """Whether agents enter and leave."""
 
     def _make_specs(self) -> None:
-        n, config, device = self.num_agents, self.observation, self.device
-
-        def floats(*shape: int) -> Unbounded:
-            return Unbounded(shape=shape, dtype=torch.float32, device=device)
-
-        def flags(*shape: int) -> Binary:
-            return Binary(shape=shape, dtype=torch.bool, device=device)
-
-        def numbers() -> Unbounded:
-            return Unbounded(shape=(1,), dtype=torch.int64, device=device)
-
         self._tables: Tables | None = None
-        seen = observation_spec(config, n, device)
-
-        def goals() -> Unbounded:
-            return Unbounded(shape=(n,), dtype=torch.int64, device=device)
-
-        state: dict[str, Callable[[], Any]] = {
-            "valid": lambda: flags(n),
-            "state": lambda: floats(n, 4),
-            "goal": goals,
-        }
-        optional: dict[str, Callable[[], Any]] = {
-            "waiting": lambda: flags(n),
-            "persona": lambda: floats(n, 2),
-        }
-        there = {"waiting": self.open_traffic, "persona": config.persona}
-        state |= {name: spec for name, spec in optional.items() if there[name]}
-        agents = {name: spec() for name, spec in state.items()}
-        if not seen.is_empty():
-            agents["observation"] = seen
-        outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
-        progress = {"scene": numbers(), "step": numbers(), "stream": numbers()}
-        self.observation_spec = Composite(
-            {**progress, "segment": numbers(), "agents": Composite({**agents, **outcome}, shape=(n,))}
+        specs = make_specs(self.observation, self.dynamics, self.num_agents, self.open_traffic, self.device)
+        self.observation_spec, self.state_spec, self.action_spec = (
+            specs.observation,
+            specs.state,
+            specs.action,
         )
-        self.state_spec = Composite(
-            {
-                **{name: spec.clone() for name, spec in progress.items()},
-                "agents": Composite({name: spec() for name, spec in state.items()}, shape=(n,)),
-            }
-        )
-        if self.dynamics.discrete:
-            action = Categorical(self.dynamics.num_actions, shape=(n,), dtype=torch.int64, device=device)
-        else:
-            action = floats(n, 2)
-        self.action_spec = Composite({"agents": Composite({"action": action}, shape=(n,))})
-        self.reward_spec = Composite({"agents": Composite({"reward": floats(n, 1)}, shape=(n,))})
-        self.done_spec = Composite({name: flags(1) for name in ("done", "terminated", "truncated")})
+        self.reward_spec, self.done_spec = specs.reward, specs.done
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
