@@ -30,7 +30,8 @@ from symphony.errors import ConfigError
 from symphony.recipes import train
 from symphony.render import curves
 from symphony.simulation import SearchReplay
-from symphony.simulation.demonstrations import SceneDataset, logged
+from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.logged import logged
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 

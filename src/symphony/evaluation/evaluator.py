@@ -36,9 +36,10 @@ from symphony.metrics import (
 )
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.simulation.crowd import crowd_dataset
-from symphony.simulation.demonstrations import SceneDataset, logged
+from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
+from symphony.simulation.logged import logged
 from symphony.simulation.rollouts import Rollouts
 from symphony.simulation.workers import batches, naming, shared
 

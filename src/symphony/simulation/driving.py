@@ -25,9 +25,9 @@ from symphony.metrics import collisions, offroad
 from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
 from symphony.simulation.control import Tempered, given_personas
-from symphony.simulation.demonstrations import logged
 from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.importance import Tilt
+from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
 from symphony.simulation.search import aggregate_of, pruning_rule, search

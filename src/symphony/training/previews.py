@@ -21,8 +21,9 @@ from symphony.files import naming
 from symphony.geometry.frames import wrap
 from symphony.render import animate_rollouts
 from symphony.simulation import SearchReplay
-from symphony.simulation.demonstrations import SceneDataset, evenly_spaced, logged
+from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
 from symphony.simulation.driving import simulated
+from symphony.simulation.logged import logged
 from symphony.simulation.rollouts import Rollouts
 from symphony.training.validation import undisturbed
 

@@ -1,0 +1,68 @@
+"""What a log says of agents: their states, the routes they took, and what an agent would observe among them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from tensordict import TensorDict
+from torch import Tensor
+
+from symphony import keys
+from symphony.envs.observation import ObservationConfig, objects_at, observe
+from symphony.envs.routes import POINTS, RouteTable
+from symphony.envs.scene import SceneBatch
+from symphony.geometry.frames import with_speed
+
+
+def logged_routes(
+    tables: Sequence[RouteTable], row: Int[Tensor, " M"]
+) -> tuple[Float[Tensor, "M K 2"], Int[Tensor, " M"]]:
+    """Points and their number (0 where there is none) of the routes that experts took."""
+    none = np.zeros((POINTS, 2), np.float32)
+    points = np.stack([table.points[table.logged] if table.logged >= 0 else none for table in tables])
+    count = np.array([table.count[table.logged] if table.logged >= 0 else 0 for table in tables])
+    return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
+
+
+def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
+    """What the interactive agents did in the log: states and validity."""
+    steps = scenes.log_valid.shape[1]
+    index = scenes.interactive[:, None].expand(-1, steps, -1)
+    log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
+    valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
+    return with_speed(log), valid
+
+
+def expert_batch(
+    scenes: SceneBatch,
+    scene_of: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    agent: Int[Tensor, " M"],
+    state: Float[Tensor, "M 4"],
+    observation: ObservationConfig,
+    *,
+    action: Tensor | None = None,
+    routes: tuple[Tensor, Tensor] | None = None,
+) -> TensorDict:
+    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and, from
+    points [M, K, 2] and counts [M], their routes, where given.
+    """
+    index, here = agent[:, None], state[:, None]
+    real = torch.ones_like(index, dtype=torch.bool)
+    objects = objects_at(scenes, scene_of, step, here, index, real)
+    known = None if routes is None else (routes[0][:, None], routes[1][:, None])
+    seen = observe(scenes, scene_of, step, objects, index, observation, routes=known)
+    batch = TensorDict({}, batch_size=[len(step)], device=state.device)
+    batch.set(keys.VALID, real)
+    batch.set(keys.STATE, here)
+    if observation.persona:
+        batch.set(keys.PERSONA, scenes.persona[scene_of, agent][:, None])
+    for name, value in seen._asdict().items():
+        if value is not None:
+            batch.set(("agents", "observation", name), value)
+    if action is not None:
+        batch.set(keys.ACTION, action[:, None])
+    return batch
