@@ -20,9 +20,11 @@ from kills_run import Target
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig, ValidationConfig
 from symphony.data import generate as generation
+from symphony.data import plans
 from symphony.data.builtin import builtin_store
 from symphony.data.convert import convert
-from symphony.data.generate import Harvest, Plan, Task
+from symphony.data.generate import Harvest
+from symphony.data.plans import Plan, Task
 from symphony.data.store import SegmentStore
 from symphony.evaluation import evaluate
 from symphony.evaluation.pictures import RolloutKeeper
@@ -67,7 +69,7 @@ def _generate(out: Path) -> None:
         return Harvest(task, made, accepted=len(made), reasons=Counter(overlap=1), seconds=0.0)
 
     generation.harvest = give
-    generation.sumo_version = lambda: "0.0"
+    plans.sumo_version = lambda: "0.0"
     generation.generate(Plan(60), out / "store")
 
 

@@ -22,22 +22,10 @@ from hypothesis import strategies as st
 
 from symphony.cli import main
 from symphony.data import generate as generation
+from symphony.data import plans as planning
 from symphony.data.builtin import builtin_store
-from symphony.data.generate import (
-    BARREN,
-    BLOCK,
-    MAX_SEED,
-    PER_NETWORK,
-    PRESETS,
-    SPLITS,
-    Generation,
-    Harvest,
-    Plan,
-    Split,
-    Task,
-    generate,
-    harvest,
-)
+from symphony.data.generate import BARREN, PER_NETWORK, Generation, Harvest, generate, harvest
+from symphony.data.plans import BLOCK, MAX_SEED, PRESETS, SPLITS, Plan, Split, Task
 from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents, travel, usable
 from symphony.data.sources import sumo
@@ -74,7 +62,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, segments: list[RunSegment]) -> None:
         return Harvest(task, made, accepted=count + 1, reasons=Counter(overlap=2), seconds=0.25)
 
     monkeypatch.setattr(generation, "harvest", give)
-    monkeypatch.setattr(generation, "sumo_version", lambda: "0.0")
+    monkeypatch.setattr(planning, "sumo_version", lambda: "0.0")
 
 
 # Plans ----------------------------------------------------------------------------------------------------------
@@ -230,7 +218,7 @@ def test_other_arguments_are_refused_by_name(tmp_path: Path, field: str, value: 
 @pytest.mark.usefixtures("fake")
 def test_another_version_of_sumo_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     generate(Plan(3), tmp_path)
-    monkeypatch.setattr(generation, "sumo_version", lambda: "0.1")
+    monkeypatch.setattr(planning, "sumo_version", lambda: "0.1")
     with pytest.raises(ConfigError, match=r"made with sumo 0\.0, not 0\.1"):
         generate(Plan(3), tmp_path)
 
@@ -377,13 +365,13 @@ def test_a_preset_makes_three_stores_and_warns_of_other_checksums(
 ) -> None:
     plans: dict[Split, Plan] = {split: Plan(4, split=split) for split in SPLITS}
     monkeypatch.setattr("symphony.data.sources.sumo.sumo_version", lambda: "0.0")
-    small = generation.Preset(plans, dict.fromkeys(SPLITS, "0" * 64))
+    small = planning.Preset(plans, dict.fromkeys(SPLITS, "0" * 64))
     monkeypatch.setitem(PRESETS, "town-small", small)
     command = ["data", "generate", "--out", str(tmp_path), "--preset", "town-small"]
     assert main(command) == 0
     assert capsys.readouterr().err.count("made with SUMO 0.0") == 3
     sums: dict[Split, str] = {split: SegmentStore(tmp_path / split).checksum() for split in SPLITS}
-    monkeypatch.setitem(PRESETS, "town-small", generation.Preset(plans, sums))
+    monkeypatch.setitem(PRESETS, "town-small", planning.Preset(plans, sums))
     assert main(command) == 0
     assert "warning" not in capsys.readouterr().err
     names = [{SegmentStore(tmp_path / split).tags(i)["network"] for i in range(4)} for split in SPLITS]

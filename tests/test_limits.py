@@ -15,7 +15,8 @@ from helpers_convert import FakeReader
 from helpers_sources import ROAD, commonroad, driver, obstacle, read_error, state, womd_scenario
 from symphony.data import convert as converting
 from symphony.data.convert import convert
-from symphony.data.generate import Plan, generate
+from symphony.data.generate import generate
+from symphony.data.plans import Plan
 from symphony.data.segment import RunSegment
 from symphony.data.sources import get_reader, tfrecord, womd
 from symphony.data.sources.base import Item

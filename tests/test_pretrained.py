@@ -24,7 +24,7 @@ from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.cli.train import Train
 from symphony.config import AgentSpec, EvaluateConfig, MGAILConfig, ValidationConfig, to_json
-from symphony.data.generate import PRESETS
+from symphony.data.plans import PRESETS
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 from symphony.recipes import train

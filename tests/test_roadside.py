@@ -13,9 +13,11 @@ import torch
 from helpers_segments import crossing, straight_road
 from symphony.cli import main
 from symphony.data import generate as generation
+from symphony.data import plans
 from symphony.data.builtin import builtin_store
-from symphony.data.generate import Harvest, Plan, Task, generate
+from symphony.data.generate import Harvest, generate
 from symphony.data.overlaps import overlapping
+from symphony.data.plans import Plan, Task
 from symphony.data.roadside import CLEARANCE, MOST, REACH, Roadside, add_roadside
 from symphony.data.segment import AgentType, RunSegment, content_hash
 from symphony.data.store import SegmentStore
@@ -157,7 +159,7 @@ def test_stores_without_are_those_of_before_and_others_are_told_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(generation, "harvest", _harvest)
-    monkeypatch.setattr(generation, "sumo_version", lambda: "0.0")
+    monkeypatch.setattr(plans, "sumo_version", lambda: "0.0")
     generate(Plan(2), tmp_path / "plain")
     report = tmp_path / "plain" / "report.json"
     old = json.loads(report.read_text())

@@ -14,7 +14,8 @@ from symphony.cli.tables import print_table, write_numbers
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.data.generate import Generation, Plan
+    from symphony.data.generate import Generation
+    from symphony.data.plans import Plan
 
 _WITH_PRESET = frozenset({"out", "preset", "workers", "engine", "json"})
 _TARGETS = {"collision_rate": "≤ 0.5", "offroad_time": "≤ 0.5", "directions": "each ≥ 15"}
@@ -70,7 +71,7 @@ class Generate:
 
     def _plans(self) -> dict[str, tuple[Plan, Path]]:
         """The stores to make, by split, and where."""
-        from symphony.data.generate import PRESETS, Plan
+        from symphony.data.plans import PRESETS, Plan
 
         if self.preset is not None:
             return {split: (plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()}
@@ -93,7 +94,7 @@ class Generate:
         from rich.console import Console
         from rich.markup import escape
 
-        from symphony.data.generate import MADE_WITH, PRESETS
+        from symphony.data.plans import MADE_WITH, PRESETS
         from symphony.data.sources.sumo import sumo_version
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
