@@ -19,6 +19,7 @@ from helpers_store import fill
 from symphony import keys
 from symphony.agents import Agent, build_agent, load_agent
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
+from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv, scene
@@ -29,7 +30,8 @@ from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.control import given_goals
-from symphony.simulation.crowd import Crowd, crowd_dataset
+from symphony.simulation.crowd import Crowd, CrowdDataset, crowd_dataset
+from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import simulation
 from symphony.simulation.saving import save_simulation
 from symphony.simulation.world import world_of
@@ -220,6 +222,45 @@ def cars(k: int) -> list[tuple[float, float, int]]:
 SEARCHES = ("none", "tree")
 
 
+def test_one_state_without_a_batch_is_as_good_as_many() -> None:
+    env = looking(crowded(FLOW))
+    many = course(env, 30)
+    now = env.start(torch.tensor(0))
+    for expected in many:
+        assert torch.equal(now.get(keys.VALID), expected.get(keys.VALID)[0])
+        assert torch.equal(now.get(keys.WAITING), expected.get(keys.WAITING)[0])
+        now = step_mdp(env.step(now.set(keys.ACTION, torch.full(now.get(keys.VALID).shape, 73))))
+
+
+def test_traffic_drawn_from_a_store_is_as_open_as_that_at_hand(store: SegmentStore) -> None:
+    data = CrowdDataset(store, Crowd(3, open_traffic=True))
+    at_hand, drawn = looking(data.scenes([0])), Playback(data, None, ObservationConfig.nothing())
+    assert drawn.state_spec[keys.WAITING].shape == at_hand.state_spec[keys.WAITING].shape
+    drawn.scenes = data.scenes([0])
+    for one, other in zip(course(drawn, 10), course(at_hand, 10), strict=True):
+        for key in (keys.VALID, keys.WAITING, keys.STATE):
+            assert torch.equal(one.get(key), other.get(key))
+    # An environment may also be given open scenes after closed ones.
+    closed = DrivingEnv(SceneDataset(store, 2).scenes([0]), None, ObservationConfig.nothing())
+    assert keys.WAITING not in closed.state_spec.keys(True)
+    closed.scenes = data.scenes([0])
+    assert keys.WAITING in closed.state_spec.keys(True)
+
+
+def test_routes_begin_where_an_agent_comes_in() -> None:
+    """Before it was logged on no lane."""
+    x = np.arange(0, 202, 2.0)
+    time = DT * np.arange(51)
+    places = np.stack([50 + 10 * time, -60 + 10 * time])
+    position = np.stack([places, 0 * places], -1)
+    velocity = np.stack([np.full_like(places, 10.0), 0 * places], -1)
+    segment = make_segment(make_road([np.stack([x, 0 * x], -1)]), position, 0 * places, velocity)
+    scenes = crowded(segment)
+    assert int(scenes.enter[0, 1]) > 0
+    assert (scenes.route_logged >= 0).all()
+    assert scenes.route_count[0, 1, 0] > 1
+
+
 @pytest.mark.parametrize("search", SEARCHES)
 @pytest.mark.parametrize("others", ["log", "idm", "learned"])
 def test_batch_and_padding_change_nothing(store: SegmentStore, search: Any, others: Any) -> None:
@@ -273,6 +314,34 @@ def test_others_are_driven_but_not_evaluated(store: SegmentStore, others: Any, t
     assert len(saved.agents) > 2
     assert saved.evaluated.tolist() == [0, 1]
     assert set(saved.drivers[2:]) == {f"background:{others}"}
+
+
+def test_the_others_count_neither_in_the_log_nor_among_goals(store: SegmentStore) -> None:
+    """The log against itself is at no distance, whoever drives the rest, and goals are those of the evaluated."""
+    config = EvaluateConfig(rollouts=1, interactive=2, others="idm")
+    log = evaluate("playback", builtin_store("test"), config, items=range(4)).numbers()
+    assert log["curvature_jsd"] == 0
+    config = replace(config, rollouts=4, search="tree", others="learned")
+    found = evaluate(tiny(), store, config).metrics.segments
+    drawn = [int(segment.choice.drawn.sum()) for segment in found.values()]
+    assert max(drawn) > 0
+    assert all(count <= 2 * config.rollouts for count in drawn)
+
+
+def test_errors_of_a_metric_of_ones_own_are_over_recordings(tmp_path: Path) -> None:
+    segments = [
+        row([(60, 5 + 3 * k, 0), (85, 10, 0)], steps=11, name=f"row-{k}").replace(group=f"recording-{k % 2}")
+        for k in range(4)
+    ]
+    fill(tmp_path / "store", segments)
+    config = EvaluateConfig(rollouts=1, search="none", metric=("helpers_workers:travelled",))
+    found = evaluate("constant_velocity", SegmentStore(tmp_path / "store"), config)
+    ((path, values),) = found.own.items()
+    halves = [np.mean([values[f"row-{k}"] for k in part]) for part in ((0, 2), (1, 3))]
+    assert halves[0] != halves[1]
+    numbers = found.numbers()
+    assert numbers[path] == pytest.approx(np.mean(halves))
+    assert numbers[f"{path}_se"] == pytest.approx(abs(halves[0] - halves[1]) / 2)
 
 
 @pytest.mark.parametrize("settings", [{"interactive": "all"}, {"interactive": 2, "others": "idm"}])

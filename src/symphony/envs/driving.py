@@ -71,6 +71,7 @@ class DrivingEnv(EnvBase):
     _supports_set_state = True
     _scenes: SceneBatch | None = None
     open_traffic: bool = False
+    _ready: bool = False
 
     def __init__(
         self,
@@ -98,9 +99,11 @@ class DrivingEnv(EnvBase):
         self._rng = torch.Generator() if generator is None else generator
         if generator is None:
             self._set_seed(seed)
+        self._source_open = self.open_traffic = self.source is not None and self.source.open_traffic
         if fixed is not None:
             self.scenes = fixed
         self._make_specs()
+        self._ready = True
 
     @property
     def num_agents(self) -> int:
@@ -128,8 +131,11 @@ class DrivingEnv(EnvBase):
         """Seconds per step, that of the scenes."""
         self.decisions = int(scenes.last_step.max())
         """Actions until the last logged step of the longest scene."""
-        self.open_traffic = scenes.exits.shape[1] + scenes.hull.shape[1] > 0
+        before = self.open_traffic
+        self.open_traffic = self._source_open or scenes.exits.shape[1] + scenes.hull.shape[1] > 0
         """Whether agents enter and leave."""
+        if self._ready and self.open_traffic != before:
+            self._make_specs()
 
     def _make_specs(self) -> None:
         self._tables: Tables | None = None
@@ -256,7 +262,9 @@ class DrivingEnv(EnvBase):
     ) -> tuple[Bool[Tensor, "*b N"], Bool[Tensor, "*b N"]]:
         """Who is there after a step [..., N], and who waits: those that have left do neither."""
         row, at = scene.flatten(), step.flatten()
-        old, new, there, waits = (v.flatten(0, scene.ndim - 1) for v in (before, after, valid, waiting))
+        old, new, there, waits = (
+            v.reshape(-1, *v.shape[scene.ndim :]) for v in (before, after, valid, waiting)
+        )
         gone = leaving(old[..., :2], new[..., :2], self.scenes.exits[row], self.scenes.hull[row])
         there = there & ~gone
         ready = waits & (at[:, None] >= self.scenes.enter[row])

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.errors import ConfigError
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
 from symphony.geometry.nearest import first_smallest
@@ -124,13 +125,16 @@ class Bicycle:
 
     Attributes:
         max_acceleration: m/s^2, the grid is symmetric.
-        num_acceleration: size of the acceleration grid (odd, so that 0 is in it).
+        num_acceleration: size of the acceleration grid (odd, so that 0 is in it, and at least 3).
         max_steering: radians.
-        num_steering: size of the steering grid (odd).
+        num_steering: size of the steering grid (likewise).
         heading_weight: metres that one radian of heading error counts for in the greedy fit.
         speed_weight: metres that one m/s of speed error counts for in the greedy fit.
         effort: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of
             steering; small, it decides where actions hardly differ, as at standstill, for the gentlest.
+
+    Raises:
+        ConfigError: for a grid of another size.
     """
 
     max_acceleration: float = 4.0
@@ -145,6 +149,9 @@ class Bicycle:
     _joint: tuple[tuple[float, ...], tuple[float, ...]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        for name in ("num_acceleration", "num_steering"):
+            if getattr(self, name) < 3 or getattr(self, name) % 2 == 0:
+                raise ConfigError(f"{name} must be odd and at least 3, is {getattr(self, name)}")
         acceleration = _quadratic(self.max_acceleration, self.num_acceleration)
         steering = _quadratic(self.max_steering, self.num_steering)
         joint = np.repeat(acceleration, self.num_steering), np.tile(steering, self.num_acceleration)
@@ -156,7 +163,9 @@ class Bicycle:
         return self.num_acceleration * self.num_steering
 
     def grid(self, like: Float[Tensor, "*_"]) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """Acceleration and steering of every joint action, in the dtype and on the device of ``like``."""
+        """Acceleration and steering of every joint action, in the dtype and on the device of ``like``. Shared: not to
+        be changed in place.
+        """
         acceleration, steering = self._joint
         return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
 

@@ -45,8 +45,10 @@ def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[n
     state, size = objects.state.detach().flatten(0, 1), objects.size.flatten(0, 1)
     (rows, subjects), agents = index.shape, objects.valid.shape[1]
     who = (index + np.arange(0, rows * agents, agents)[:, None]).ravel()
-    there, states = objects.valid.numpy(), state.numpy().reshape(rows, agents, 5)
-    # Whoever is not there may hold anything. Relative to the first agent, rounding matters little.
+    states = state.numpy().reshape(rows, agents, 5)
+    # Whoever is not there may hold anything, and a place that is not finite is met by nobody. Relative to the first
+    # agent, rounding matters little.
+    there = objects.valid.numpy() & np.isfinite(states[..., :2]).all(-1)
     origin = np.where(there[:, :1, None], states[:, :1, :2], 0.0)
     place = np.where(there[..., None], states[..., :2] - origin, 0.0)
     radius = np.where(there, 0.5 * np.hypot(*size.numpy().T).reshape(there.shape), 0.0)

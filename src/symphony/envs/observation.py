@@ -321,6 +321,8 @@ def _observed_objects(
     # Places among all agents there are now, and among those of all scenes.
     now = (flat + torch.arange(0, objects.valid.numel(), agents, device=flat.device)[:, None]).flatten()
     state = objects.state.flatten(0, 1).index_select(0, now).unflatten(0, shape)
+    # Whoever is not seen may hold anything, and neither its numbers nor their gradient may get through.
+    state = torch.where(mask[..., None], state, 0.0)
     static = tables.agents.index_select(0, row).unflatten(0, shape)
     # Component by component: operations on a last dimension of 2 are slow.
     angle, (_, _, _, own_x, own_y) = -heading[..., None], own[..., None, :].unbind(-1)

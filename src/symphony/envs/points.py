@@ -221,7 +221,6 @@ def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: n
 def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:
     """State [M, Q] int64 of the lights of each row."""
     scenes = tables.scenes
-    steps = scenes.light.shape[1]
     # Places in the flattened [B, steps]; after the log its last state stays.
-    row = scene * steps + step.clamp(max=steps - 1)
+    row = scene * scenes.light.shape[1] + torch.minimum(step, scenes.last_step[scene])
     return scenes.light.flatten(0, 1).index_select(0, row).long()

@@ -43,7 +43,7 @@ CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 
 @dataclass(frozen=True)
 class RouteTable:
-    """Feasible routes of one vehicle from its first valid state.
+    """Feasible routes of one vehicle from where it begins.
 
     Attributes:
         points: [G, K, 2] float32, :data:`SPACING` apart from beside the vehicle on; past the end the last one again.
@@ -58,12 +58,23 @@ class RouteTable:
     logged: int
 
 
-def route_table(segment: RunSegment, graph: LaneGraph, agent: int) -> RouteTable:
-    """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B)."""
-    first = int(segment.valid[agent].argmax())
-    position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
-    choices = feasible_routes(graph, position, heading)
-    if not choices:
+def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
+    """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
+
+    Args:
+        segment: with the agent's log.
+        graph: of its lanes.
+        agent: row of the segment.
+        begin: step at which the agent comes in; routes begin with its first valid state from there on, of one that
+            comes in later with the first on a lane.
+    """
+    steps = begin + np.flatnonzero(segment.valid[agent, begin:])
+    for first in steps if begin else steps[:1]:
+        position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
+        choices = feasible_routes(graph, position, heading)
+        if choices:
+            break
+    else:
         return RouteTable(
             np.zeros((0, POINTS, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1
         )
@@ -232,13 +243,13 @@ def pick_routes(
     scene: Int[Tensor, " M"],
     goal: Int[Tensor, "M N"],
 ) -> tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]]:
-    """The points of one route per agent and how many of them exist: none where the goal is -1."""
+    """The points of one route per agent and how many of them exist: none where there is no route of that number."""
     _, agents, routes = count.shape
     if routes == 0:
         return route.new_zeros(*goal.shape, POINTS, 2), torch.zeros_like(goal)
     place = torch.arange(agents, device=goal.device)
     # Places in the flattened [B, A, G].
-    row = ((scene[:, None] * agents + place) * routes + goal.clamp_min(0)).flatten()
+    row = ((scene[:, None] * agents + place) * routes + goal.clamp(0, routes - 1)).flatten()
     points = route.flatten(0, 2).index_select(0, row).unflatten(0, goal.shape)
     exists = count.flatten().index_select(0, row).unflatten(0, goal.shape)
-    return points, torch.where(goal >= 0, exists, 0)
+    return points, torch.where((goal >= 0) & (goal < routes), exists, 0)

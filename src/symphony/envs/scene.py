@@ -57,9 +57,15 @@ class SceneSource(Protocol):
 
     Attributes:
         interactive: N, interactive agents per scene.
+        open_traffic: whether its scenes say where their maps end.
     """
 
     interactive: int
+
+    @property
+    def open_traffic(self) -> bool:
+        """As above."""
+        ...
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Numbers of different run segments at random (all, if there are fewer)."""
@@ -175,6 +181,10 @@ def scene(
                 segment=segment.segment_id,
                 field="interactive",
             )
+    enter = np.zeros(len(chosen), np.int64) if edge is None else _first_inside(segment, chosen, edge)
+    tables = [
+        route_table(segment, graph, int(a), int(at)) for a, at in zip(chosen, enter, strict=True) if graph
+    ]
     log = np.concatenate(
         [segment.position[..., :2], segment.heading[..., None], segment.velocity], axis=-1
     ).swapaxes(0, 1)
@@ -187,7 +197,7 @@ def scene(
         "persona": np.zeros((segment.num_agents, 2), np.float32) if persona is None else persona,
         "interactive": chosen.astype(np.int64),
         "interactive_valid": np.ones(len(chosen), bool),
-        "enter": np.zeros(len(chosen), np.int64) if edge is None else _first_inside(segment, chosen, edge),
+        "enter": enter,
         "background": np.zeros(len(chosen), bool) if background is None else np.asarray(background, bool),
         "exits": np.zeros((0, 4), np.float32) if edge is None else edge.exits,
         "hull": np.zeros((0, 3), np.float32) if edge is None else edge.hull,
@@ -202,9 +212,7 @@ def scene(
         "segment": np.array(number),
         "dt": np.array(segment.dt, np.float64),
         **_points(segment),
-        **_routes(
-            [] if graph is None else [route_table(segment, graph, int(a)) for a in chosen], len(chosen)
-        ),
+        **_routes(tables, len(chosen)),
     }
     return SceneBatch(
         **{name: torch.from_numpy(np.array(value))[None] for name, value in fields.items()}, batch_size=[1]

@@ -158,6 +158,6 @@ def _corner_distance(
         for along, across in corners
     ]
     nearest = reduce(torch.minimum, squared)
-    positive = nearest > 0
+    positive = nearest != 0  # NaN stays NaN
     # The square root of a stand-in keeps the gradient finite where the distance is 0.
     return torch.where(positive, torch.where(positive, nearest, 1.0).sqrt(), 0.0)

@@ -160,8 +160,8 @@ def _nearest_segment(
     edges = start.shape[1]
     if batch == 0 or count == 0:
         return torch.zeros(batch, count, dtype=torch.long, device=points.device)
-    # Coordinates relative to the points' centre keep float32 rounding well below a millimetre.
-    center = points.where(points.isfinite(), torch.nan).nanmean(1, keepdim=True).nan_to_num()
+    # Coordinates relative to a point of the map keep float32 rounding well below a millimetre.
+    center = _middle(start, valid)
     x, y = (points - center)[..., None].unbind(2)
     axes = _segment_axes(start, end, valid, center)
     width, group = edges, batch
@@ -188,6 +188,14 @@ def _nearest_segment(
             result[rows] = torch.where(better, index + e, result[rows] if e else index)
             best = torch.where(better, smallest, best)
     return result
+
+
+def _middle(start: Float[Tensor, "B E 2"], valid: Bool[Tensor, "B E"]) -> Float[Tensor, "B 1 2"]:
+    """Halfway between the outermost valid starts; 0 where there are none. No position has a say in it."""
+    there = valid[..., None]
+    low = start.masked_fill(~there, torch.inf).amin(1, keepdim=True)
+    high = start.masked_fill(~there, -torch.inf).amax(1, keepdim=True)
+    return (0.5 * (low + high)).nan_to_num(0.0)
 
 
 def _segment_axes(

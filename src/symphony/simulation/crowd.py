@@ -100,7 +100,7 @@ class Crowd:
             return driven, np.zeros(0, np.int64)
         others = np.array([a for a in (*order, *rest) if a not in driven], np.int64)
         if self.along_routes:
-            on_route = [route_table(segment, graph, int(a)).logged >= 0 for a in others]
+            on_route = [route_table(segment, graph, int(a), int(first[a])).logged >= 0 for a in others]
             others = others[np.array(on_route, bool)]
         return driven, others[: MOST - len(driven)]
 
@@ -140,6 +140,11 @@ class CrowdDataset(SceneDataset):
         routes = routes or crowd.along_routes
         super().__init__(store, crowd.count, dynamics, indices, routes=routes, duration=duration, keep=keep)
         self.crowd = crowd
+
+    @property
+    def open_traffic(self) -> bool:
+        """Whether agents enter and leave."""
+        return self.crowd.open_traffic
 
     def __reduce__(self) -> tuple[Any, ...]:
         build = partial(CrowdDataset, routes=self.routes, duration=self.duration, keep=self.keep)

@@ -136,6 +136,11 @@ class SceneDataset:
         return float(steps[0])
 
     @property
+    def open_traffic(self) -> bool:
+        """Whether agents enter and leave: here the same ones are there from the first step to the last."""
+        return False
+
+    @property
     def decisions(self) -> int:
         """Actions until the last logged step of the longest segment, or up to the duration."""
         longest = int(self.store.num_steps[self.indices].max()) - 1
