@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_of_two_samples_the_error_is_half_the_difference_of_what_each_says() -> 
 
 
 @pytest.mark.parametrize("segments", [50, 200])
-def test_the_floor_is_what_another_log_scores(segments: int) -> None:
+def test_the_floor_is_what_a_log_scores_against_what_it_was_drawn_from(segments: int) -> None:
     rng = np.random.default_rng(segments)
     p = rng.dirichlet(np.full(BINS, 0.5))
     logs = [np.eye(BINS, dtype=int)[rng.choice(BINS, segments, p=p)] for _ in range(60)]
@@ -99,6 +100,8 @@ def test_the_floor_is_what_another_log_scores(segments: int) -> None:
     other = [float(jensen_shannon(log.sum(0), p)) for log in logs]
     assert np.mean(floors) == pytest.approx(np.mean(other), rel=0.25)
     assert sampling_floor(np.concatenate([logs[0]] * 4)) == pytest.approx(floors[0] / 4, rel=0.25)
+    pairs = [float(jensen_shannon(one.sum(0), two.sum(0))) for one, two in pairwise(logs)]
+    assert np.mean(pairs) == pytest.approx(2 * np.mean(floors), rel=0.25)
     # A perfect policy on the very segments scores less, if segments differ in what is usual.
     trials = [perfect(segments, 1600, rng) for _ in range(20)]
     scored = np.mean([sampled_divergence(policy, log).value for policy, log in trials])
@@ -113,12 +116,13 @@ def test_the_floor_is_what_another_log_scores(segments: int) -> None:
 def test_who_stands_is_said_of_agents_whose_log_lasts(seed: int) -> None:
     torch.manual_seed(seed)
     state, log = torch.rand(3, 2, 5, 2, 4), torch.rand(3, 5, 2, 4)
-    logged, last = torch.rand(3, 5, 2) < 0.6, torch.tensor([4, 2, 0])
-    found = standing_at_end(state, log, logged, last)
+    logged, last = torch.rand(3, 5, 2) < 0.6, torch.tensor([4, 2, 1])
+    there = torch.rand(3, 2, 4, 2) < 0.7
+    found = standing_at_end(state, log, logged, last, there)
     for b, step in enumerate(last.tolist()):
         assert torch.equal(found.rollouts[b], state[b, :, step, :, 3] < 0.5)
         assert torch.equal(found.log[b], log[b, step, :, 3] < 0.5)
-        assert torch.equal(found.counted[b], logged[b, step])
+        assert torch.equal(found.counted[b], logged[b, step] & there[b, :, step - 1])
     metrics, shape = RolloutMetrics(), (3, 2, 2, 4)
     nothing = torch.zeros(shape, dtype=torch.bool)
     metrics.update(
@@ -134,13 +138,13 @@ def test_who_stands_is_said_of_agents_whose_log_lasts(seed: int) -> None:
     )
     numbers, there = metrics.compute(), found.counted
     if there.any():
-        both = found.rollouts.transpose(0, 1)[:, there]
-        assert numbers["standing"] == pytest.approx(100 * both.float().mean().item())
-        assert numbers["standing_log"] == pytest.approx(100 * found.log[there].float().mean().item())
+        log = found.log[:, None].expand(there.shape)
+        assert numbers["standing"] == pytest.approx(100 * found.rollouts[there].float().mean().item())
+        assert numbers["standing_log"] == pytest.approx(100 * log[there].float().mean().item())
     else:
         assert math.isnan(numbers["standing"])
     for row, mine, slow in zip(metrics.rows(), there, found.rollouts, strict=True):
-        expected = 100 * slow[:, mine].float().mean().item() if mine.any() else math.nan
+        expected = 100 * slow[mine].float().mean().item() if mine.any() else math.nan
         assert row["standing"] == pytest.approx(expected, nan_ok=True)
 
 

@@ -297,3 +297,24 @@ def test_one_group_has_no_error():
     found = scored(random_inputs(8) | {"groups": 7 * ["a"]}).compute()
     assert found["groups"] == 1
     assert all(math.isnan(found[f"{name}_se"]) for name in NUMBERS)
+
+
+def test_a_rollout_whose_agents_leave_is_measured_over_the_steps_they_are_there():
+    there = torch.ones(1, 2, 1, 50, dtype=torch.bool)
+    there[0, 1, :, 5:] = False
+    metrics = RolloutMetrics()
+    metrics.update(
+        ["a"],
+        collided=torch.zeros_like(there),
+        offroad=torch.zeros_like(there),
+        displacement=torch.tensor([1.0, 3.0])[None, :, None, None].expand(there.shape),
+        simulated=there,
+        logged=torch.ones(1, 1, 50, dtype=torch.bool),
+        curvature=[np.zeros(1)],
+        curvature_log=[np.zeros(1)],
+    )
+    numbers = metrics.compute()
+    assert numbers["ade"] == pytest.approx((50 * 1 + 5 * 3) / 55)
+    assert numbers["min_sade"] == pytest.approx(1.0)
+    row = metrics.rows()[0]
+    assert (row["ade"], row["min_sade"]) == (numbers["ade"], numbers["min_sade"])

@@ -115,7 +115,7 @@ def _more(row: dict[str, Any]) -> list[str]:
     if not math.isnan(row.get("curvature_jsd_floor", math.nan)):
         lines.append(
             f"JSD {row['curvature_jsd']:.4f}, corrected for sampling {row['curvature_jsd_corrected']:.4f} ± "
-            f"{row['curvature_jsd_se']:.4f}; another log of this size would score {row['curvature_jsd_floor']:.4f}"
+            f"{row['curvature_jsd_se']:.4f}; the log's finite size alone gives {row['curvature_jsd_floor']:.4f}"
         )
     if not math.isnan(row.get("standing", math.nan)):
         lines.append(f"{row['standing']:.1f} % stand at the end, {row['standing_log']:.1f} % in the log")

@@ -83,7 +83,7 @@ COST = Column("cost", "CPU", "s/segment", digits=2)
 AT_A_DISTANCE = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor", "curvature_jsd_corrected")
 """What says nothing of the log itself."""
 FLOOR = Column("curvature_jsd_floor", "JSD floor", "10⁻³", 1000.0, optional=True)
-"""What another log of the same size would score, beside the divergence."""
+"""What the finite size of the log alone gives, beside the divergence."""
 ASKED: dict[TableColumns, tuple[Column, ...]] = {
     "split": (
         Column("collision_with_playback", "with playback", "%", optional=True),

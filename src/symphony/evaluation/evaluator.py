@@ -77,7 +77,7 @@ class Evaluation:
         config: how it was evaluated.
         interactive: agents per segment that acted, at most, or ``all``.
         search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
-        own: mean of each metric of the user's own per run segment, by import path.
+        own: mean of each metric of the user's own by run segment, by import path.
         seconds: CPU time of the simulation, what it costs.
         baselines: the same of :data:`BASELINES`, where they were asked for.
     """
@@ -87,7 +87,7 @@ class Evaluation:
     config: EvaluateConfig
     interactive: int | Literal["all"]
     search: str
-    own: dict[str, list[float]] = field(default_factory=dict)
+    own: dict[str, dict[str, float]] = field(default_factory=dict)
     seconds: float = 0.0
     baselines: tuple[Evaluation, ...] = ()
 
@@ -95,10 +95,7 @@ class Evaluation:
         """The table row: rates in percent, distances in metres, divergence in nats, standard errors beside them."""
         own: dict[str, float] = {}
         for path, values in self.own.items():
-            found = np.array([value for value in values if np.isfinite(value)])
-            many = len(found) > 1
-            own[path] = float(found.mean()) if len(found) else np.nan
-            own[f"{path}_se"] = float(found.std(ddof=1) / np.sqrt(len(found))) if many else np.nan
+            own[path], own[f"{path}_se"] = self.metrics.mean(values)
         return {
             "agent": self.agent,
             **self.metrics.compute(),
@@ -199,7 +196,7 @@ def evaluate_dataset(
             for k, part in enumerate(batch.parts):
                 found[k].metrics.merge(part.metrics)
                 for path, values in part.own.items():
-                    found[k].own.setdefault(path, []).extend(values)
+                    found[k].own.setdefault(path, {}).update(values)
                 seconds[k] += part.seconds
             if observe is not None and batch.seen is not None:
                 scenes, rollouts, goal = batch.seen
@@ -272,15 +269,16 @@ def _add(
     evaluated = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
     exists = _there(scenes, rollouts, log_valid if evaluation.search == "log" else None)
     both = evaluated._replace(counted=evaluated.counted & log_valid[:, None, 1:])
-    evaluated_log = log_valid & ~scenes.background[:, None]
-    standing = standing_at_end(rollouts.state, log, evaluated_log, scenes.last_step)
+    standing = standing_at_end(rollouts.state, log, log_valid, scenes.last_step, evaluated.counted)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
     for path, metric in own.items():
         values = metric(scenes, rollouts)
         if values.shape != rollouts.state.shape[:2]:
             shape = tuple(rollouts.state.shape[:2])
             raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")
-        evaluation.own.setdefault(path, []).extend(values.double().nanmean(-1).tolist())
+        names = (dataset.segment(i).segment_id for i in items)
+        means = values.double().nanmean(-1).tolist()
+        evaluation.own.setdefault(path, {}).update(zip(names, means, strict=True))
     kinds = _kinds(scenes, evaluated, exists)
     single = AgentSteps(
         evaluated.counted.transpose(2, 3),
@@ -290,12 +288,15 @@ def _add(
         rollouts.state[..., 1:, :, 3].transpose(2, 3),
         log[:, 1:, :, 3].transpose(1, 2),
     )
-    driven, counted, log, log_valid = (t.cpu() for t in (rollouts.state, evaluated.counted, log, log_valid))
+    evaluated_log = log_valid & ~scenes.background[:, None]
+    driven, counted, log, evaluated_log, log_valid = (
+        t.cpu() for t in (rollouts.state, evaluated.counted, log, evaluated_log, log_valid)
+    )
     regions, regions_log = [], []
     for b, item in enumerate(items):
         graph = dataset.graph(item)
         regions.append(_curvatures(graph, driven[b], counted[b]))
-        regions_log.append(_curvatures(graph, log[b], log_valid[b, 1:]))
+        regions_log.append(_curvatures(graph, log[b], evaluated_log[b, 1:]))
     segments = [dataset.segment(i) for i in items]
     evaluation.metrics.update(
         [segment.segment_id for segment in segments],
@@ -324,8 +325,11 @@ def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
     first = found.search.slots[..., 0, :each].sort(-1).values
     founders = 1 + (first.diff(dim=-1) != 0).sum(-1)
     turn = route_turns(scenes.route, scenes.route_count)
-    drawn = found.drawn.flatten(1, 2)
-    return choices(drawn.cpu(), found.goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
+    # Goals of the background are nobody's choice.
+    drawn, goal = (
+        torch.where(scenes.background[:, None], -1, each) for each in (found.drawn.flatten(1, 2), found.goal)
+    )
+    return choices(drawn.cpu(), goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
 
 
 def _there(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> Bool[Tensor, "B K N T+1"]:

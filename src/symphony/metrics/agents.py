@@ -83,7 +83,7 @@ def agent_results(steps: AgentSteps) -> list[AgentResult]:
                 agents=int(both.any(-1).sum()),
                 collided=(same & with_whom).sum((0, 1)),
                 offroad=int((off[b] & both).sum()),
-                standing=(int((own < STANDING).sum()), int((log < STANDING).sum())),
+                standing=(int((np.abs(own) < STANDING).sum()), int((np.abs(log) < STANDING).sum())),
                 speed=np.stack([_histogram(own), _histogram(log)], -1),
                 travel=(float(own.sum(dtype=np.float64)), float(log.sum(dtype=np.float64))),
             )

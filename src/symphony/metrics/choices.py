@@ -29,12 +29,12 @@ class Standing(NamedTuple):
     Attributes:
         rollouts: [B, K, N] agents of the rollouts.
         log: [B, N] the same agents in the log.
-        counted: [B, N] agents whose log lasts that long; the others are not compared.
+        counted: [B, K, N] agents that are there, and whose log lasts that long; the others are not compared.
     """
 
     rollouts: Bool[Tensor, "B K N"]
     log: Bool[Tensor, "B N"]
-    counted: Bool[Tensor, "B N"]
+    counted: Bool[Tensor, "B K N"]
 
 
 def standing_at_end(
@@ -42,6 +42,7 @@ def standing_at_end(
     log: Float[Tensor, "B U N 4"],
     logged: Bool[Tensor, "B U N"],
     last: Int[Tensor, " B"],
+    there: Bool[Tensor, "B K T N"],
 ) -> Standing:
     """Who stands at the last step.
 
@@ -50,10 +51,11 @@ def standing_at_end(
         log: likewise.
         logged: where the log is valid.
         last: number of each segment's last state.
+        there: where agents are simulated and evaluated, of the T = U - 1 states after the first.
     """
     row = torch.arange(len(last), device=last.device)
     slow, slow_log = state[row, :, last, :, 3].abs() < STANDING, log[row, last, :, 3].abs() < STANDING
-    return Standing(slow, slow_log, logged[row, last])
+    return Standing(slow, slow_log, logged[row, last][:, None] & there[row, :, last - 1])
 
 
 def route_turns(

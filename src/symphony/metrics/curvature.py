@@ -71,10 +71,11 @@ def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Diverg
 
 
 def sampling_floor(counts_log: NDArray[Any], draws: int = 200) -> float:
-    """What another log of the same size would score against this one, nats: no policy is known to be better.
+    """What a log of this size scores against the distribution that it is a sample of, nats: no policy is known to be
+    better, however many rollouts it has.
 
-    Finite samples of one distribution differ. The other log is a bootstrap sample of this one's segments, so it also
-    differs in which segments there are; a perfect policy on the same segments scores somewhat less.
+    Estimated by bootstrap samples of the segments against all of them. Two logs of this size differ by about twice as
+    much. It is too low where segments of one recording are alike, or many turns are so rare that the log has none.
 
     Args:
         counts_log: [n, K] histogram of the log of each segment.

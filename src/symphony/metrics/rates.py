@@ -27,7 +27,7 @@ class SegmentResult:
         offroad: agent-steps off the road, over all rollouts.
         steps: agent-steps simulated, over all rollouts.
         error: [K] displacement error summed over agents and steps, metres.
-        logged: agent-steps at which the log is valid, of one rollout.
+        logged: [K] agent-steps at which the log is valid and the agent is there.
         histogram: [201] curvatures of the branching regions visited by the rollouts.
         histogram_log: [201] likewise by the log.
         kinds: [kinds, 2] rollouts by the :class:`CollisionKind` of their first collision, with an interactive agent
@@ -37,8 +37,8 @@ class SegmentResult:
         simulated: egos, and other interactive agents, in all rollouts.
         group: the recording the segment is part of; None where not given.
         single: what became of single agents while their log exists; None where not asked for.
-        standing: agents that stand at the end, of all rollouts and of the log, and agents whose log lasts that long;
-            None where not given.
+        standing: of all rollouts, agents that stand at the end, agents whose log stands there, and agents that are
+            compared; None where not given.
         choice: what the search made of the goals; None without search or goals.
     """
 
@@ -47,7 +47,7 @@ class SegmentResult:
     offroad: int
     steps: int
     error: NDArray[np.float64]
-    logged: int
+    logged: NDArray[np.float64]
     histogram: NDArray[np.int64]
     histogram_log: NDArray[np.int64]
     kinds: NDArray[np.int64] | None = None
@@ -57,6 +57,13 @@ class SegmentResult:
     single: AgentResult | None = None
     standing: tuple[int, int, int] | None = None
     choice: Choice | None = None
+
+    @property
+    def nearest(self) -> tuple[float, float]:
+        """Error and agent-steps of the rollout that is nearest to the log on average; 0 where none is compared."""
+        each = np.where(self.logged > 0, self.error / np.maximum(self.logged, 1), np.inf)
+        best = int(each.argmin())
+        return float(self.error[best]), float(self.logged[best])
 
 
 def count_kinds(
@@ -115,10 +122,10 @@ def role_rates(
 
 
 def count_standing(standing: Standing) -> list[tuple[int, int, int]]:
-    """Of every segment: agents that stand, of the rollouts and of the log, and agents that are compared."""
+    """Of every segment and all its rollouts: agents that stand, whose log stands, and that are compared."""
     counted = standing.counted
-    slow = (standing.rollouts & counted[:, None]).sum((1, 2)).tolist()
-    return list(zip(slow, (standing.log & counted).sum(1).tolist(), counted.sum(1).tolist(), strict=True))
+    each = (standing.rollouts & counted, standing.log[:, None] & counted, counted)
+    return list(zip(*(flags.sum((1, 2)).tolist() for flags in each), strict=True))
 
 
 def standing_rates(
@@ -131,8 +138,7 @@ def standing_rates(
     if len(given) < len(found):
         raise ValueError(f"who stands was given for {len(given)} of {len(found)} segments")
     slow, slow_log, agents = np.array(given, dtype=np.float64).T
-    rollouts = np.array([s.rollouts for s in found], dtype=np.float64)
-    return {"standing": (100 * slow, agents * rollouts), "standing_log": (100 * slow_log, agents)}
+    return {"standing": (100 * slow, agents), "standing_log": (100 * slow_log, agents)}
 
 
 def group_numbers(found: Sequence[SegmentResult]) -> NDArray[np.int64] | None:

@@ -7,7 +7,7 @@ agree by construction, is not among the steps.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -107,8 +107,7 @@ class RolloutMetrics:
         ends = None if standing is None else count_standing(standing)
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
-        # The same agent-steps are compared in every rollout, up to those a rollout does not simulate.
-        count = compared.sum((2, 3)).amax(1)
+        count = compared.sum((2, 3))
         for b, (name, seen, seen_log) in enumerate(zip(segment_ids, curvature, curvature_log, strict=True)):
             if name in self.segments:
                 raise ValueError(f"segment {name} was added twice")
@@ -118,7 +117,7 @@ class RolloutMetrics:
                 offroad=int(off[b]),
                 steps=int(steps[b]),
                 error=error[b],
-                logged=int(count[b]),
+                logged=count[b].double().cpu().numpy(),
                 histogram=curvature_histogram(seen),
                 histogram_log=curvature_histogram(seen_log),
                 kinds=None if counts is None else counts[b],
@@ -154,12 +153,20 @@ class RolloutMetrics:
                 "group": s.group or name,
                 "collision_rate": 100.0 * s.collided / s.rollouts,
                 "offroad_time": 100.0 * s.offroad / s.steps if s.steps else math.nan,
-                "ade": s.error.mean() / s.logged if s.logged else math.nan,
-                "min_sade": s.error.min() / s.logged if s.logged else math.nan,
+                "ade": s.error.sum() / s.logged.sum() if s.logged.any() else math.nan,
+                "min_sade": s.nearest[0] / s.nearest[1] if s.logged.any() else math.nan,
                 **_more(s),
             }
             for name, s in sorted(self.segments.items())
         ]
+
+    def mean(self, values: Mapping[str, float]) -> tuple[float, float]:
+        """Mean of another number of every segment, and its standard error over the same groups; NaN is left out."""
+        known = {name: value for name, value in values.items() if math.isfinite(value)}
+        if not known:
+            return math.nan, math.nan
+        member = group_numbers([self.segments[name] for name in known])
+        return ratio(np.array(list(known.values())), np.ones(len(known)), member)
 
     def curvature_histograms(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Counts [201] of the branching regions visited by their average curvature: rollouts, and logs."""
@@ -187,10 +194,10 @@ class RolloutMetrics:
             ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
             all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
             standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
-            ``segments`` and ``rollouts`` (per segment). ``curvature_jsd_floor`` is what another log of
-            the same size would score, ``curvature_jsd_corrected`` the divergence without its bias by sampling (its
-            error is that of the divergence; NaN for a single segment or group). Where kinds were given, likewise the
-            percent of rollouts whose first collision is of a kind, ``collision_into_leader`` and so on for every
+            ``segments`` and ``rollouts`` (per segment). ``curvature_jsd_floor`` is what the
+            log's finite size alone gives, ``curvature_jsd_corrected`` the divergence without its bias by sampling
+            (its error is that of the divergence; NaN for a single segment or group). Where kinds were given, likewise
+            the percent of rollouts whose first collision is of a kind, ``collision_into_leader`` and so on for every
             :class:`CollisionKind` (they sum to ``collision_rate``), that is with a playback agent,
             ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
             themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
@@ -218,15 +225,15 @@ class RolloutMetrics:
         single = [s.single for s in found if s.single is not None]
         if 0 < len(single) < len(found):
             raise ValueError(f"steps of agents were given for {len(single)} of {len(found)} segments")
-        logged = column([s.logged for s in found])
+        nearest = [s.nearest for s in found]
         parts = {
             "collision_rate": (
                 100 * column([s.collided for s in found]),
                 column([s.rollouts for s in found]),
             ),
             "offroad_time": (100 * column([s.offroad for s in found]), column([s.steps for s in found])),
-            "ade": (column([s.error.mean() for s in found]), logged),
-            "min_sade": (column([s.error.min() for s in found]), logged),
+            "ade": (column([s.error.mean() for s in found]), column([s.logged.mean() for s in found])),
+            "min_sade": (column([error for error, _ in nearest]), column([steps for _, steps in nearest])),
             **kind_rates(found),
             **role_rates(found),
             **(agent_rates(single) if single else {}),
@@ -258,7 +265,7 @@ def _more(s: SegmentResult) -> dict[str, float]:
         out["collision_with_playback"] = 100.0 * float(s.kinds[:, 1].sum()) / s.rollouts
     if s.standing is not None:
         slow, slow_log, agents = s.standing
-        out["standing"] = 100.0 * slow / (agents * s.rollouts) if agents else math.nan
+        out["standing"] = 100.0 * slow / agents if agents else math.nan
         out["standing_log"] = 100.0 * slow_log / agents if agents else math.nan
     if s.choice is not None:
         out["goals_variation"] = s.choice.variation
