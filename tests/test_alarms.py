@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import shutil
@@ -26,6 +27,7 @@ from symphony.recipes import train
 from symphony.training import Trainer
 from symphony.training.alarms import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, loss_of
 from symphony.training.logging import read_metrics
+from symphony.training.phases import Updates
 
 NAN, INF = math.nan, math.inf
 
@@ -144,6 +146,20 @@ def test_skipped_updates_are_recorded_and_told_once(
     shutil.rmtree(choose(settings.out, "4"))
     train(tiny("bc", store, settings.out, steps=6, resume=True))
     assert [r["skipped_updates"] for r in read_metrics(settings.out)] == [0, 1, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize("spoiled", [0, 1])
+def test_a_network_that_is_stepped_twice_loses_no_skip(spoiled: int, store: Path, tmp_path: Path) -> None:
+    trainer = build(tiny("bc", store, tmp_path / "run"))
+    (phase,) = trainer.phases
+
+    def twice(step: int) -> Updates:
+        for k in range(2):
+            for name, losses in phase.update(step):
+                yield name, losses.apply(lambda loss, k=k: loss * NAN if k == spoiled else loss)
+
+    trainer.phases = [dataclasses.replace(phase, update=twice)]
+    assert Skips().count(trainer._update(0)) == ["policy"]
 
 
 def test_a_skipped_update_leaves_weights_and_optimizer_as_they_were(

@@ -390,6 +390,22 @@ def test_retries_take_the_better_run_of_bad_branches_only():
     assert idle.simulated_steps == plain.simulated_steps
 
 
+@pytest.mark.parametrize("spoiled", ["again", "first"])
+def test_of_two_runs_one_that_is_no_number_is_never_taken(spoiled):
+    start = starts(Walk(), 4, branches=4)
+    own = start.get(STREAM)
+
+    def score(state):
+        again = state.get(STREAM) != own
+        return torch.where(again == (spoiled == "again"), math.nan, distance(state))
+
+    found = search(start, score=score, steps=4, rule=KeepAll(), retries=1, retry_above=-1.0, reseed=reseed)
+    expected = search(
+        start if spoiled == "again" else reseed(start.clone(), 1), steps=4, rule=KeepAll()
+    ).totals
+    assert_close(found.totals, expected, rtol=0, atol=0)
+
+
 def test_retried_branches_go_on_with_the_numbers_of_their_slot():
     start = starts(Walk(), 4, branches=4)
     found = search(start, rule=KeepAll(), retries=1, retry_above=0.0, reseed=reseed)

@@ -7,7 +7,11 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
 from tensordict.nn.distributions import NormalParamExtractor
 from torch import nn
 from torch.distributions import Normal
@@ -347,3 +351,38 @@ def test_bad_calls_are_refused(env):
     for bad in ({"cost": "d"}, {"horizon": -1}, {"truncate": -1}, {"checkpoint": -1}, {"reduction": "max"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             make(env, **bad)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_a_logit_without_agents_is_one_entry(reduction):
+    """A score [...] is the same as [..., 1], and a mask of another shape than the score is refused."""
+    env = Walk(agents=1)
+    start = starts(env, 5, branches=1)[:, 0].exclude(STREAM).set(STREAM, torch.arange(5)[:, None])
+    heads = nn.Sequential(nn.Linear(1, 2), NormalParamExtractor())
+    policy = ProbabilisticTensorDictSequential(
+        TensorDictModule(heads, [X], [("agents", "loc"), ("agents", "scale")]),
+        ProbabilisticTensorDictModule(
+            [("agents", "loc"), ("agents", "scale")],
+            [("agents", "action")],
+            distribution_class=Normal,
+            default_interaction_type="random",
+        ),
+    )
+    network = nn.Linear(1, 1)
+    found = []
+    for shape in ((), (1,)):
+        scored = TensorDictModule(
+            lambda x, shape=shape: network(x).reshape(*x.shape[:-2], *shape), [X], ["score"]
+        )
+        loss = MGAILLoss(policy, scored, env, horizon=4, reduction=reduction)
+        loss.set_keys(score="score", valid="mask")
+        torch.manual_seed(1)
+        whole = loss(start)["loss_mgail"]
+        some = torch.tensor([True, True, False, False, False])
+        torch.manual_seed(1)
+        masked = loss(start.copy().set("mask", some.reshape(5, *shape)))["loss_mgail"]
+        assert not torch.equal(whole, masked)
+        found.append((whole, masked))
+        with pytest.raises(ValueError, match="shape"):
+            loss(start.copy().set("mask", torch.ones(5, 3, dtype=torch.bool)))
+    torch.testing.assert_close(found[0], found[1])

@@ -166,6 +166,14 @@ def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(
             train(replace(short, resume=True, steps=4, validation=replace(short.validation, **other)))
     moved = shutil.copytree(held_out, tmp_path / "moved")
     train(replace(short, resume=True, steps=4, validation=replace(short.validation, data=moved, every=4)))
+    # Nor can scores on other segments be compared, whether or not it was evaluated in between.
+    others = tmp_path / "others"
+    fill(others, [crossing(6, seed=20 + seed, steps=16) for seed in range(4)])
+    for between in (False, True):
+        if between:
+            train(replace(short, resume=True, steps=6, validation=ValidationConfig(rollouts=2)))
+        with pytest.raises(ConfigError, match=r"chosen by 4 segments of .*, 2 rollouts; can't be compared"):
+            train(replace(short, resume=True, steps=8, validation=replace(short.validation, data=others)))
     # A run that was not evaluated so far may be from now on.
     plain = config(store, tmp_path / "plain", None, steps=2)
     train(plain)

@@ -254,8 +254,9 @@ def _simulate(
 
 
 def _better(first: _Run, second: _Run, redo: Bool[Tensor, "*b S"], slot_keys: Sequence[NestedKey]) -> _Run:
-    """Branch by branch the run with the lower total, among those to be redone."""
-    take = redo & ~(first.totals <= second.totals)
+    """Branch by branch the run with the lower total, among those to be redone; NaN is worse than any."""
+    lower = (second.totals < first.totals) | (first.totals.isnan() & ~second.totals.isnan())
+    take = redo & lower
 
     def choose(new: Shaped[Tensor, "*e"], old: Shaped[Tensor, "*e"]) -> Shaped[Tensor, "*e"]:
         return torch.where(take.reshape(take.shape + (1,) * (new.ndim - take.ndim)), new, old)

@@ -33,7 +33,9 @@ class MGAILConfig:
     head_start: int = 30
     """Updates of the discriminator alone after them."""
     rollouts: int = 16
-    """Rollouts per update that the gradient goes through, drawn from those of the last search."""
+    """Rollouts per update that the gradient goes through, drawn from those of the last search; all of them, if it has
+    fewer.
+    """
     learning_rate: float = 2e-4
     """Of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
     cost: Cost = "non_saturating"

@@ -58,7 +58,7 @@ class MGAILLoss(MaskedLoss):
 
     Raises:
         KeyError: at the call, if the mask, `done` or the score is missing.
-        ValueError: for a bad argument, or numbers for no step at all.
+        ValueError: for a bad argument, numbers for no step at all, or a mask of another shape than the score.
     """
 
     @dataclass
@@ -157,11 +157,11 @@ class MGAILLoss(MaskedLoss):
         now = tensordict.exclude(self.tensor_keys.plan, self.tensor_keys.noise)
         # Called with tensors alone, the batch was guessed from them.
         now.batch_size = done.shape[:-1]
-        batch = now.batch_dims
+        batch, start = now.batch_dims, now
         steps = self.horizon if plan is None else plan.shape[batch]
         if steps < 1:
             raise ValueError("nothing to simulate: give a horizon, or random numbers for at least one step")
-        valid = self._counted(now, self._shape(now), done.device)
+        self._mask(start)  # or complain now
         size = self.checkpoint or steps
         scores, going = [], []
         for first in range(0, steps, size):
@@ -186,6 +186,7 @@ class MGAILLoss(MaskedLoss):
             scores.append(score)
             going.append(alive)
         score = torch.cat(scores, batch)
+        valid = self._counted(start, score.select(batch, 0).shape, done.device)
         counted = valid.unsqueeze(batch) & torch.cat(going, batch)
         result = TensorDict(
             {
@@ -195,10 +196,6 @@ class MGAILLoss(MaskedLoss):
         )
         self._clear_weakrefs(tensordict, result, "actor_network_params")
         return result
-
-    def _shape(self, now: TensorDictBase) -> torch.Size:
-        mask = self._mask(now)
-        return torch.Size([*now.shape, 1]) if mask is None else mask.shape
 
     def _simulate(
         self,

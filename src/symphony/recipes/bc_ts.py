@@ -38,7 +38,7 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=branched_streams,
-        **collector_settings(config.search, env, seed, data.decisions),
+        **collector_settings(config.search, env, seed, data),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
 

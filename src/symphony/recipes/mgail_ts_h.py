@@ -40,7 +40,7 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=lambda start: env.with_goals(branched_streams(start)),
-        **collector_settings(config.search, env, seed, data.decisions),
+        **collector_settings(config.search, env, seed, data),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
 

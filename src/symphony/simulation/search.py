@@ -28,6 +28,7 @@ from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.imports import build_object, load_object
 from symphony.modules import SeededNoise
+from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.importance import Tilt
 from symphony.streams import fold_in, uniform
 
@@ -127,7 +128,9 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
     return noise
 
 
-def collector_settings(config: SearchConfig, env: DrivingEnv, seed: int, decisions: int) -> dict[str, Any]:
+def collector_settings(
+    config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset
+) -> dict[str, Any]:
     """What a collector of driving needs beside environment, policy and scores: whole trees, random numbers that
     depend on nothing but seed, segment, branch and step.
 
@@ -135,7 +138,7 @@ def collector_settings(config: SearchConfig, env: DrivingEnv, seed: int, decisio
         config: of the search.
         env: that is searched.
         seed: of the pruning.
-        decisions: T, actions until the end of the longest segment.
+        data: that the environment draws its scenes from, as many at a time as the search takes, or all.
     """
     return {
         "branches": config.branches,
@@ -148,7 +151,7 @@ def collector_settings(config: SearchConfig, env: DrivingEnv, seed: int, decisio
         "slot_keys": (keys.STREAM,),
         "group_key": keys.GOAL if takes_groups(pruning_rule(config)) else None,
         "keep": kept_keys(env),
-        "frames_per_batch": config.segments * config.branches * decisions,
+        "frames_per_batch": min(config.segments, len(data)) * config.branches * data.decisions,
         "total_frames": -1,
     }
 

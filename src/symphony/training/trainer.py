@@ -84,6 +84,7 @@ class Trainer:
         self.seed = processes.seed(config.seed)
         self.skips, self.told = Skips(), set[str]()
         self.best: Best | None = None
+        self.validated: str | None = None
         self.progress = _progress(shown=processes.leads)
         self.tracker: Tracker | None = None
         self.checksum = data.checksum()
@@ -212,7 +213,11 @@ class Trainer:
                 group["lr"] = rate
         record: dict[str, Tensor] = {}
         for name, losses in phase.update(step):
-            record |= self._descend(name, losses)
+            found = self._descend(name, losses)
+            norm = f"{NORM}{name}"
+            if norm in record:  # stepped more than once: the largest counts, and NaN, so that no skip is lost
+                found[norm] = torch.maximum(record[norm], found[norm])
+            record |= found
         return record
 
     def _descend(self, name: str, losses: TensorDictBase) -> dict[str, Tensor]:
@@ -261,7 +266,7 @@ class Trainer:
             self.progress.update(self.task, description=f"validating {done}/{total}")
 
         numbers = validator(step, show)
-        self.best = validator.best
+        self.best, self.validated = validator.best, validator.what
         self.progress.update(self.task, description="training")
         return numbers
 
@@ -276,6 +281,7 @@ class Trainer:
         """Write a checkpoint; by now all records up to it are on the disk."""
         extra = {
             "best": None if self.best is None else dataclasses.asdict(self.best),
+            "validated": self.validated,
             "skips": dataclasses.asdict(self.skips),
             "processes": self.world.count,
             "data": self.checksum,
@@ -307,9 +313,14 @@ class Trainer:
                 f"checksum {self.checksum[:12]}, then {str(extra['data'])[:12]}",
                 file=self.data.store.path,
             )
-        self.best = Best.of(extra)
+        self.best, self.validated = Best.of(extra), extra.get("validated")
         self.skips = Skips.of(extra)
         if self.validator is not None:
+            if self.best is not None and self.validated not in (None, self.validator.what):
+                raise ConfigError(
+                    f"{self.config.out}: its best checkpoint was chosen by {self.validated}; can't be compared with "
+                    f"{self.validator.what}"
+                )
             self.validator.best = self.best
 
 

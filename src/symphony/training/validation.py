@@ -29,6 +29,7 @@ class Validator:
 
     Attributes:
         best: the best so far; to be set for a run that goes on.
+        what: which segments of what data are simulated how often: scores of something else can't be compared.
 
     Raises:
         ConfigError: if more rollouts are asked for than a tree has branches.
@@ -63,6 +64,7 @@ class Validator:
         self.agent, self.device = agent, device
         self.how = EvaluateConfig(rollouts=config.rollouts, device=str(device))
         self.best: Best | None = None
+        self.what = f"{len(chosen)} segments of {store.checksum()}, {config.rollouts} rollouts"
 
     def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]:
         """Evaluate the agent as it is after an update, and remember whether it is the best so far.
