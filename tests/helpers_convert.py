@@ -16,7 +16,7 @@ class FakeReader(Reader):
 
     name = "fake"
     patterns = ("*.scene", "*.scene-*-of-*")
-    stops = True
+    _stops = True
 
     def _read(self, path: Path) -> Iterator[Item]:
         for line in path.read_text().splitlines():
@@ -26,7 +26,7 @@ class FakeReader(Reader):
             elif kind == "stop":
                 raise DataError("checksum of record 4 does not match")
             elif kind == "interrupt":
-                if self.stops:
+                if self._stops:
                     raise KeyboardInterrupt
             else:
                 yield scene(kind, int(seed)).replace(file=path.name)

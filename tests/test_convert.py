@@ -129,7 +129,7 @@ def test_an_interrupted_conversion_goes_on_where_it_stopped(logs: Write, out: Pa
     with pytest.raises(DataError, match="unfinished conversion"):
         SegmentStore(out)
     reader = FakeReader()
-    reader.stops = False
+    reader._stops = False
     report = convert(reader, files, out)
     assert left(out) == ["store"]
     assert SegmentStore(out).ids == ["straight-1", "straight-2", "straight-3"]
@@ -164,7 +164,7 @@ def test_appending_keeps_the_store_whatever_happens(logs: Write, out: Path) -> N
     assert SegmentStore(out).report == first
     assert info(out)["unfinished"] == {"files": 0, "of": 1}
     reader = FakeReader()
-    reader.stops = False
+    reader._stops = False
     with pytest.raises(DataError, match="append to it"):
         convert(reader, [path], out)
     report = convert(reader, [path], out, append=True)

@@ -174,7 +174,7 @@ def test_finished_files_are_not_read_again(
     read: list[str] = []
 
     class Watched(FakeReader):
-        stops = False
+        _stops = False
 
         def _read(self, path: Path) -> Any:
             read.append(path.name)
@@ -235,22 +235,38 @@ def test_a_worker_that_dies_costs_no_finished_work(
         ({"files": 3}, "files is 3 .*, but .* had 4 "),
         ({"order": True}, "files are in another order"),
         ({"longer": True}, r"size of .*b\.scene is \d+, but .* had \d+"),
+        ({"edited": True}, r"b\.scene was changed since the conversion was interrupted"),
+        ({"companion": True}, r"b\.map was changed since the conversion was interrupted"),
+        ({"option": "other"}, "option is other, but .* had usual"),
     ],
     ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
 )
 def test_other_arguments_do_not_go_on(
     logs: list[Path], tmp_path: Path, changed: dict[str, Any], message: str
 ) -> None:
+    class WithMaps(FakeReader):
+        def __init__(self, option: str = "usual") -> None:
+            self.option = option
+
+        def companions(self, path: Path) -> tuple[Path, ...]:
+            return (path.with_suffix(".map"),)
+
+    for log in logs[:2]:
+        log.with_suffix(".map").write_text("a map")
     logs[3].write_text("interrupt")
     with pytest.raises(KeyboardInterrupt):
-        convert(FakeReader(), logs, tmp_path / "store")
+        convert(WithMaps(), logs, tmp_path / "store")
     files = logs[: changed.pop("files", 4)]
+    for name, path in (("edited", logs[1]), ("companion", logs[1].with_suffix(".map"))):
+        if changed.pop(name, False):
+            os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+    reader = WithMaps(changed.pop("option", "usual"))
     if changed.pop("order", False):
         files = files[::-1]
     if changed.pop("longer", False):
         logs[1].write_text("straight 1\nstraight 2\nstraight 3")
     with pytest.raises(ConfigError, match=message):
-        convert(FakeReader(), files, tmp_path / "store", **changed)
+        convert(reader, files, tmp_path / "store", **changed)
     assert (tmp_path / "store.partial" / "journal.jsonl").is_file()
 
 

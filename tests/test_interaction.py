@@ -14,6 +14,7 @@ from helpers_sources import read_error, read_one
 from symphony.data.conformance import check_reader
 from symphony.data.segment import AgentType, RunSegment, SignalState, validate
 from symphony.data.sources import get_reader
+from symphony.data.sources.egos import busiest_first
 from symphony.data.sources.interaction_tracks import read_rows
 from symphony.errors import ConfigError, DataError
 
@@ -100,6 +101,40 @@ def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
         assert (segment.predict.tolist(), segment.interest.tolist()) == ([1], [0])
         assert segment.agent_type[0] == AgentType.PEDESTRIAN
         np.testing.assert_allclose(segment.position[1, 0] + segment.origin, (x + 1, 2, 0), atol=1e-4)
+
+
+def newer(folder: Path, place: str, mapped: str, rows: list[str]) -> Path:
+    """A file of one case, beside the map of a place."""
+    (folder / f"{mapped}.osm_xy").write_text(osm())
+    path = folder / f"{place}_train.csv"
+    rows = [f"1.0,{row},0,0" for row in (*track(1), *track(2, x=-12), *rows)]
+    path.write_text(text(rows, f"case_id,{COLUMNS},track_to_predict,interesting_agent"))
+    return path
+
+
+def test_cases_are_not_put_on_the_map_of_another_place(tmp_path: Path) -> None:
+    assert len(segments(newer(tmp_path, "DR_A", "DR_A", []))) == 1
+    error = read_error("interaction", newer(tmp_path, "DR_B", "DR_A", []))
+    assert "no maps/DR_B.osm" in error.message
+
+
+@pytest.mark.parametrize("logged", [0.0, 0.56, 1.0])
+def test_who_rides_is_told_by_the_positions_where_velocities_are_wrong(logged: float, tmp_path: Path) -> None:
+    rider = track("P1", y=1, speed=4, steps=range(100), kind="pedestrian/bicycle", logged=logged)
+    path = newer(tmp_path, "DR_A", "DR_A", rider)
+    (found,) = segments(path, motion="positions")
+    assert found.agent_type[found.agent_id == -2].tolist() == [AgentType.CYCLIST]
+
+
+def test_jitter_is_no_motion() -> None:
+    rng = np.random.default_rng(0)
+    parked = rng.normal(0, 0.1, (3, 101, 2))
+    moving = np.stack([np.linspace(0, 30, 101), np.zeros(101)], -1)
+    position = np.concatenate([parked, moving[None]])
+    kind = np.full(4, int(AgentType.VEHICLE), np.uint8)
+    assert np.hypot(*np.diff(parked, axis=1).T).sum(0).min() > 10
+    assert busiest_first(np.arange(4), kind, position, np.ones((4, 101), bool)).tolist() == [3]
+    assert busiest_first(np.arange(3), kind[:3], parked, np.ones((3, 101), bool)).tolist() == []
 
 
 def test_lights_of_the_test_area(tmp_path: Path) -> None:

@@ -46,6 +46,9 @@ REASONS_SHOWN = 5
 CHECKPOINT = 2.0
 """Seconds after which files that are done are put on record."""
 
+_PLAIN = (str, int, float, bool, type(None))
+"""Kinds of a reader's attributes that are kept as its options."""
+
 Progress = Callable[[int, int, Report], None]
 """Called with the files done, the files in all, and the report so far, after each record and file."""
 
@@ -108,12 +111,21 @@ def convert(
     options = dict(reader_options or {})
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
+    else:
+        own = {name: value for name, value in vars(reader).items() if not name.startswith("_")}
+        options = {name: value for name, value in own.items() if isinstance(value, _PLAIN)}
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
     settings |= {} if radius is None else {"radius": radius}
     settings |= {"hold_lights": True} if hold_lights else {}
     paths = expand(files, reader.patterns)
-    draft = Draft(out, _job(settings, paths, out, append, 1 / rate))
+    changed = {
+        str(file.absolute()): file.stat().st_mtime_ns
+        for path in paths
+        for file in (path, *reader.companions(path))
+        if file.exists()
+    }
+    draft = Draft(out, _job(settings, paths, changed, out, append, 1 / rate))
     with closing(draft):
         report = draft.report
         try:
@@ -152,7 +164,14 @@ def _check_arguments(
         raise ConfigError(f"workers must be at least 1 and at most {MAX_WORKERS}, is {workers}")
 
 
-def _job(settings: Mapping[str, Any], paths: list[Path], out: Path, append: bool, dt: float) -> Job:
+def _job(
+    settings: Mapping[str, Any],
+    paths: list[Path],
+    changed: Mapping[str, int],
+    out: Path,
+    append: bool,
+    dt: float,
+) -> Job:
     """What there is to do, after a look at what is there already."""
     settings = json.loads(json.dumps(settings, default=str))  # as it is read back
     files = [(str(path.absolute()), path.stat().st_size) for path in paths]
@@ -161,24 +180,24 @@ def _job(settings: Mapping[str, Any], paths: list[Path], out: Path, append: bool
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         if begun is not None and begun.job.before is not None:
             raise DataError(f"is gone, and {folder} holds an unfinished conversion that adds to it", file=out)
-        return Job(settings, files)
+        return Job(settings, files, changed=changed)
     if not (out / store_format.HEADER).is_file():
         raise DataError("exists and is not a segment store: refusing to write there", file=out)
     if begun is not None and begun.job.before is None:
         if begun.report.files < len(begun.job.files) or (folder / STORE).exists():
             message = f"exists, and {folder} holds an unfinished conversion to that name: delete one of them"
             raise DataError(message, file=out)
-        return Job(settings, files)  # died between giving the store its name and tidying up
+        return Job(settings, files, changed=changed)  # died between giving the store its name and tidying up
     if not append:
         raise DataError("is a segment store already: append to it, or choose another name", file=out)
     if begun is not None:
-        return Job(settings, files, begun.job.before, begun.job.earlier)
+        return Job(settings, files, begun.job.before, begun.job.earlier, changed)
     store = SegmentStore(out)
     store.check_complete()
     if len(store) and abs(store[0].dt - dt) > 1e-6:
         message = f"holds segments at {1 / store[0].dt:g} steps per second, not {1 / dt:g}"
         raise DataError(message, file=out, field="rate")
-    return Job(settings, files, len(store), store.report)
+    return Job(settings, files, len(store), store.report, changed)
 
 
 def _nothing(report: Report) -> DataError:

@@ -41,12 +41,14 @@ class Job:
         files: path and bytes of every file, in order.
         before: segments in the store that is added to; None where a new one is made.
         earlier: report of the store that is added to.
+        changed: when each file, and each that is read together with one, was last changed (nanoseconds).
     """
 
     settings: Mapping[str, Any]
     files: list[tuple[str, int]]
     before: int | None = None
     earlier: Mapping[str, Any] = field(default_factory=dict)
+    changed: Mapping[str, int] = field(default_factory=dict)
 
     def check_same(self, begun: Job, folder: Path) -> None:
         """Refuse to go on with a conversion that was begun otherwise.
@@ -66,6 +68,12 @@ class Job:
                     f"arguments to go on with it, or delete {folder} to begin anew"
                 )
                 raise ConfigError(message)
+        # Journals from before this was kept don't say.
+        for name in begun.changed.keys() | self.changed.keys() if begun.changed else ():
+            if begun.changed.get(name) != self.changed.get(name):
+                raise ConfigError(
+                    f"{name} was changed since the conversion was interrupted: delete {folder} to begin anew"
+                )
         if begun.files != self.files:
             raise ConfigError(f"files are in another order than in the conversion begun in {folder}")
 

@@ -10,7 +10,7 @@ from symphony.data.segment import AgentType, Bools
 NEAR = 50.0
 """Metres within which another agent counts as a neighbour of an ego candidate."""
 MOVING = 2.0
-"""Metres an agent must cover during the segment to count as moving."""
+"""Metres an agent must get away from where it is first seen to count as moving."""
 
 
 def busiest_first(
@@ -29,9 +29,10 @@ def busiest_first(
         valid: [A, T].
         dynamic: [A] which may be egos; all by default.
     """
-    strides = np.hypot(*np.moveaxis(np.diff(position, axis=1), -1, 0))
-    both = valid[:, 1:] & valid[:, :-1]
-    moving = np.where(both, strides, 0).sum(axis=1) > MOVING
+    # Not the length of the path: the jitter of a parked car's track would add up.
+    start = position[np.arange(len(position)), valid.argmax(1), None]
+    away = np.hypot(*np.moveaxis(position - start, -1, 0))
+    moving = np.where(valid, away, 0).max(axis=1, initial=0) > MOVING
     able = (agent_type == AgentType.VEHICLE) & moving & valid.all(axis=1)
     rows = np.flatnonzero(able if dynamic is None else able & dynamic)
     scores = []

@@ -140,7 +140,8 @@ class InteractionReader(Reader):
             check_motion(rows, dt_ms)
         # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
         with np.errstate(over="ignore", invalid="ignore"):
-            yield from self._segments(resolved(rows), _scene(files, rows, dt_ms), files)
+            known = resolved(rows, by_positions=self.motion == "positions")
+            yield from self._segments(known, _scene(files, rows, dt_ms), files)
 
     def _segments(self, rows: Rows, scene: Scene, files: Files) -> Iterator[Item]:
         cases = np.unique(rows.case)

@@ -46,7 +46,8 @@ def find_files(path: Path) -> Files:
     if numbered is None:
         if split is None:
             raise DataError("expected a name like vehicle_tracks_000.csv or SCENE_train.csv", file=path)
-        return Files(path, split[2], _map(path, split[1]))
+        # Its name says which map it needs: another place's would fit nowhere, and nobody would be told.
+        return Files(path, split[2], _map(path, split[1], alone=False))
     folder, number_ = path.parent, numbered[1]
 
     def beside(name: str) -> Path | None:
@@ -64,12 +65,15 @@ def find_files(path: Path) -> Files:
     )
 
 
-def _map(path: Path, scene: str) -> Path:
+def _map(path: Path, scene: str, *, alone: bool = True) -> Path:
+    """The map of a place; if ``alone``, a single map beside the tracks does, whatever its name."""
     folders = (path.parent, path.parent.parent / "maps", path.parent.parent.parent / "maps")
     for folder in folders:
         for suffix in ("osm_xy", "osm"):
             if (folder / f"{scene}.{suffix}").is_file():
                 return folder / f"{scene}.{suffix}"
+    if not alone:
+        raise DataError(f"the map is missing: no maps/{scene}.osm_xy or .osm", file=path)
     maps = sorted(path.parent.glob("*.osm")) + sorted(path.parent.glob("*.osm_xy"))
     if len(maps) != 1:
         raise DataError(

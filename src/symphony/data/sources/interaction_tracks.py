@@ -283,11 +283,29 @@ def merged(rows: Rows) -> Rows:
     return replace(found, state=np.concatenate([mean, found.state[:, 4:]], axis=1))
 
 
-def resolved(rows: Rows) -> Rows:
-    """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists."""
+def _speeds(rows: Rows) -> Doubles:
+    """[N] m/s to the next state of the same track, at its last from the one before; 0 for a single one."""
+    order = np.lexsort((rows.time, rows.track, rows.case))
+    case, track, time = rows.case[order], rows.track[order], rows.time[order]
+    same = (case[1:] == case[:-1]) & (track[1:] == track[:-1])
+    step = np.hypot(*np.diff(rows.state[order, :2], axis=0).T)
+    speed = np.where(same, step / np.where(same, np.diff(time) / 1000, 1.0), np.nan)
+    ahead, behind = np.append(speed, np.nan), np.append(np.nan, speed)
+    found = np.zeros(len(rows))
+    found[order] = np.nan_to_num(np.where(np.isnan(ahead), behind, ahead))
+    return found
+
+
+def resolved(rows: Rows, *, by_positions: bool = False) -> Rows:
+    """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists.
+
+    Args:
+        rows: ordered.
+        by_positions: take speeds from the positions, not from the velocities.
+    """
     kind = rows.kind.copy()
     unknown = np.flatnonzero(kind == AgentType.UNSET)
-    speed = np.hypot(rows.state[:, 2], rows.state[:, 3])
+    speed = _speeds(rows) if by_positions else np.hypot(rows.state[:, 2], rows.state[:, 3])
     keys = np.stack([rows.case[unknown], rows.track[unknown]])
     for case, track in np.unique(keys, axis=1).T:
         mine = unknown[(keys[0] == case) & (keys[1] == track)]
