@@ -43,7 +43,8 @@ def feature_differences(found: WosacFeatures, file: Path) -> dict[str, float]:
                 else:
                     same = np.isnan(ours) & np.isnan(theirs)
                     apart = float(np.where(same, 0, np.abs(ours - theirs)).max())
-                largest[name] = max(largest.get(name, 0.0), apart)
+                # Not `max`, which would drop NaN: a number where the other has none is a difference.
+                largest[name] = float(np.maximum(largest.get(name, 0.0), apart))
     return largest
 
 

@@ -36,7 +36,7 @@ def filled(
         {"segment": f"s{k}", "group": f"g{k // 2}"} | {key: mean * n for key, mean in means.items()}
         for k, n in enumerate(noise)
     ]
-    record |= means | {"per_segment": rows}
+    record |= means | {"per_segment": rows, "segments": len(rows)}
     record["curvature"] |= {"parts": {f"g{k}": parts + 0.001 * k for k in range(SEGMENTS // 2)}}
     return record
 
@@ -170,7 +170,7 @@ def test_each_way_has_a_row_and_its_cost(tmp_path: Path, capsys: pytest.CaptureF
     entries, _ = collect([tmp_path], "main", each=True)
     comparison = compare(entries, "main")
     cost = {row.way: row.cells["cost"].mean for row in comparison.rows if row.method == "bc_ts"}
-    assert cost == {"tree-16x4-best": 6.0, "tree-1x16-best-goals=branch": 1.5}
+    assert cost == {"tree-16x4-best": 2.0, "tree-1x16-best-goals=branch": 0.5}
     assert [row["way"] for row in json.loads(as_json(comparison))["rows"] if row["method"] == "bc_ts"] == [
         *cost
     ]

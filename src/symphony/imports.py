@@ -27,8 +27,12 @@ def load_object(path: str) -> Any:
         found = _file(Path(module)) if module.endswith(".py") else importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
+    except ConfigError:
+        raise
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"can't import '{path}': {error}") from error
+    except (Exception, SystemExit) as error:  # whatever a user's module raises
+        raise ConfigError(f"can't import '{path}': {type(error).__name__}: {error}") from error
     return found
 
 
@@ -46,7 +50,7 @@ def _file(path: Path) -> ModuleType:
     sys.modules[str(path)] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever a user's file raises
+    except (Exception, SystemExit) as error:  # whatever a user's file raises
         del sys.modules[str(path)]
         raise ConfigError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
     return module

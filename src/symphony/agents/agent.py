@@ -136,7 +136,7 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
         device: where its weights go.
 
     Raises:
-        ConfigError: if there is no such agent or checkpoint.
+        ConfigError: if there is no such agent, checkpoint or device.
         CheckpointError: if its weights can't be read.
     """
     if name == PLAYBACK:
@@ -152,7 +152,22 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     load_checkpoint(choose(folder, which), modules=agent.modules, partial=True, restore_rng=False)
     for module in agent.modules.values():
         module.eval()
-    return agent.to(torch.device(device))
+    return agent.to(usable_device(device))
+
+
+def usable_device(name: str) -> torch.device:
+    """A device by its name.
+
+    Raises:
+        ConfigError: there is no such device here.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"unknown device '{name}'") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"device '{name}': this PyTorch sees no CUDA device")
+    return device
 
 
 def read_spec(folder: Path) -> AgentSpec:

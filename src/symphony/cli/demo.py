@@ -72,7 +72,7 @@ class Demo:
         draw_clips([clip for name in agents[2:] for clip in drawn[name].clips], picture, columns=len(items))
         console.print(f"Done in {seconds:.0f} s.")
         for what, where in (("picture of rollouts", picture), ("numbers", numbers), ("trained agent", run)):
-            console.print(f"{what + ':':21}{where}", soft_wrap=True)
+            console.print(f"{what + ':':21}{where}", soft_wrap=True, markup=False)
 
 
 PANELS = 3

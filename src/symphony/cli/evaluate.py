@@ -12,6 +12,7 @@ import tyro
 
 from symphony.cli.tables import print_metrics, short_name, write_numbers
 from symphony.config import EvaluateConfig, WosacSettings
+from symphony.config.evaluation import MOST_SECONDS
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -69,12 +70,16 @@ class Evaluate:
             )
         if self.planner and self.calibrate is not None:
             raise ConfigError("--calibrate goes without --planner: give the threshold, --threshold")
+        if self.planner and (self.metrics or self.config.metric):
+            raise ConfigError("--metrics and --metric go without --planner: they are of the agent")
         if self.config.tilt:
             raise ConfigError(
                 "--tilt goes with `symphony simulate`: the report makes up for it, these numbers don't"
             )
-        if not self.planner_seconds > 0:
-            raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
+        if not 0 < self.planner_seconds <= MOST_SECONDS:
+            raise ConfigError(
+                f"--planner-seconds must be above 0 and at most {MOST_SECONDS:g}, is {self.planner_seconds}"
+            )
 
     def run(self) -> None:
         """Evaluate, print the numbers and write them."""
@@ -86,12 +91,12 @@ class Evaluate:
 
             get_ready(["symphony.simulation.workers", "symphony.evaluation.evaluator"])
         from symphony.agents import load_agent
-        from symphony.cli.plot import segment_index
+        from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
         from symphony.evaluation.records import evaluation_record, keep_evaluation
         from symphony.simulation.demonstrations import evenly_spaced
         from symphony.simulation.saved_files import About, RolloutWriter
-        from symphony.simulation.saving import plain_settings
+        from symphony.simulation.saving import plain_settings, weights_of
 
         if self.figure is not None:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
@@ -101,7 +106,7 @@ class Evaluate:
             WosacSettings.of(self.config)  # or complain now
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
-        chosen = [segment_index(store, name) for name in self.segments]
+        chosen = segment_indices(store, self.segments)
         clips: ClipKeeper | None = None
         keepers: list[Callable[[EvaluatedBatch], None]] = []
         if self.figure is not None:
@@ -113,7 +118,7 @@ class Evaluate:
         if self.save_rollouts is not None:
             from symphony.evaluation.pictures import RolloutKeeper
 
-            plain = plain_settings(config, agent.interactive, agent.duration)
+            plain = plain_settings(config, agent.interactive, agent.duration) | weights_of(agent)
             about = About.of(agent.name, store, plain, seed=config.seed)
             keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
 
@@ -188,11 +193,18 @@ class Evaluate:
         print_wosac(found, aside=str(self.json) == "-")
         return wosac_parts(found, record)
 
+    def _chosen(self, store: SegmentStore) -> Sequence[int]:
+        """The run segments that are meant, by their numbers."""
+        from symphony.cli.plot import segment_indices
+
+        return segment_indices(store, self.segments) or range(len(store))
+
     def _evaluate_planner(self) -> None:
         from tempfile import TemporaryDirectory
 
         from symphony.cli.planners import table_text
         from symphony.cli.simulate import Simulate, failed_runs
+        from symphony.data.store import SegmentStore
         from symphony.evaluation.planners import planner_record
 
         with TemporaryDirectory() as spare:
@@ -205,7 +217,8 @@ class Evaluate:
                 planner_seconds=self.planner_seconds,
                 config=self.config,
             ).simulated()
-            record = planner_record(folder)
+            store = SegmentStore(self.data)
+            record = planner_record(folder.only(store.ids[i] for i in self._chosen(store)))
             for line in failed_runs(folder):
                 sys.stderr.write(f"{line}\n")
         if self.json is not None:

@@ -52,4 +52,4 @@ class Export:
                 else:
                     write_file(stem.with_name(f"{stem.name}.xml"), commonroad(saved, k))
                 count += 1
-        Console().print(f"written: {count} files in {out}", soft_wrap=True)
+        Console().print(f"written: {count} files in {out}", soft_wrap=True, markup=False)

@@ -41,7 +41,7 @@ class Planners:
 
     def run(self) -> None:
         """Evaluate what is not evaluated yet, and write the table."""
-        from symphony.evaluation.planners import planner_record, read_planner_record
+        from symphony.evaluation.planners import check_crowds, planner_record, read_planner_record
         from symphony.files import write_file
         from symphony.simulation.saved_files import load_rollouts
 
@@ -49,6 +49,7 @@ class Planners:
             planner_record(load_rollouts(path)) if path.is_dir() else read_planner_record(path)
             for path in self.found
         ]
+        check_crowds(records)
         if self.json is not None:
             write_numbers(self.json, {"records": records})
         text = table_text(records, self.format)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -98,7 +99,7 @@ class Rollouts:
         )
         if len(store) == 0:
             raise DataError("the store holds no run segments", file=store.path)
-        chosen = [segment_index(store, name) for name in self.segments]
+        chosen = segment_indices(store, self.segments)
         dataset = crowd_dataset(store, agent, config, chosen or evenly_spaced(len(store), self.panels))
         clips = ClipKeeper(range(len(dataset)), self.drawn, f"{short_name(agent.name)}: ")
         with segments_bar(f"simulating {agent.name}") as advance:
@@ -195,6 +196,22 @@ def segment_index(store: SegmentStore, name: str) -> int:
             raise DataError(held, file=store.path, segment=name)
         return int(name)
     return store.index_of(name)
+
+
+def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:
+    """Places in a store of some segments, each named once.
+
+    Raises:
+        ConfigError: one is named twice, by its id or its number.
+        DataError: there is no such segment.
+    """
+    found: dict[int, str] = {}
+    for name in names:
+        place = segment_index(store, name)
+        if place in found:
+            raise ConfigError(f"segment {store.ids[place]} is named twice: {found[place]}, {name}")
+        found[place] = name
+    return list(found)
 
 
 def run_names(folders: tuple[Path, ...]) -> list[str]:

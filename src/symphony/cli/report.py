@@ -71,4 +71,6 @@ class Report:
                 error = plain.get(f"{name}_se")
                 table.add_row(name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}"))
         print_table(table, Console())
-        Console().print(f"written: {out / 'report.html'}", soft_wrap=True)
+        if not table.row_count:
+            Console().print("no run could be evaluated")
+        Console().print(f"written: {out / 'report.html'}", soft_wrap=True, markup=False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.config import EvaluateConfig
+from symphony.config.evaluation import MOST_SECONDS
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -57,14 +58,16 @@ class Simulate:
             raise ConfigError("--runs is a number of runs, and goes without --segments")
         if self.runs and not self.config.tilt and self.config.rollouts != EvaluateConfig.rollouts:
             raise ConfigError("--runs says how many rollouts a segment gives: it goes without --rollouts")
-        if not self.planner_seconds > 0:
-            raise ConfigError(f"--planner-seconds must be positive, is {self.planner_seconds}")
+        if not 0 < self.planner_seconds <= MOST_SECONDS:
+            raise ConfigError(
+                f"--planner-seconds must be above 0 and at most {MOST_SECONDS:g}, is {self.planner_seconds}"
+            )
 
     def simulated(self) -> RolloutFolder:
         """Simulate and save."""
         from symphony.agents import load_agent
         from symphony.cli.evaluate import segments_bar
-        from symphony.cli.plot import segment_index
+        from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
         from symphony.simulation.crowd import crowd_dataset
         from symphony.simulation.demonstrations import evenly_spaced
@@ -78,7 +81,7 @@ class Simulate:
         )
         # Beside log playback nobody else is simulated.
         others = 1 if self.planner and agent.policy is None else agent.interactive
-        chosen = [segment_index(store, name) for name in self.segments]
+        chosen = segment_indices(store, self.segments)
         if self.runs:
             count, config = spread_runs(agent, config, self.runs, len(store))
             chosen = evenly_spaced(len(store), count)
@@ -108,7 +111,8 @@ class Simulate:
         from rich.console import Console
 
         found, console = self.simulated(), Console()
-        console.print(f"{len(found)} run segments in {self.out}: symphony view {self.out}", soft_wrap=True)
+        line = f"{len(found)} run segments in {self.out}: symphony view {self.out}"
+        console.print(line, soft_wrap=True, markup=False)
         if self.planner:
             for line in failed_runs(found):
                 console.print(line, soft_wrap=True, markup=False)

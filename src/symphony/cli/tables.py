@@ -43,6 +43,8 @@ def print_table(table: Table, console: Console) -> None:
         # Beside the table, or it would be broken to its width.
         console.print(table.title, style=table.title_style or "italic", soft_wrap=True)
         table.title = None
+    if not table.row_count:
+        return  # nothing has no width
     options = console.options.update(max_width=sys.maxsize)
     before, needed = console.width, Measurement.get(console, options, table).maximum
     console.width = max(before, needed)

@@ -52,7 +52,7 @@ class View:
             write_view(folder, out, self.segments)
         else:
             self._draw(folder, out)
-        Console().print(f"written: {out}", soft_wrap=True)
+        Console().print(f"written: {out}", soft_wrap=True, markup=False)
 
     def _draw(self, folder: RolloutFolder, out: Path) -> None:
         from symphony.evaluation.pictures import saved_clip

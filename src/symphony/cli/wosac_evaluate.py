@@ -42,12 +42,12 @@ class Evaluate:
         """Simulate and score, showing how far it is, and report."""
         from symphony.agents import load_agent
         from symphony.cli.evaluate import segments_bar
-        from symphony.cli.plot import segment_index
+        from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
         from symphony.evaluation.wosac import evaluate_wosac
 
         agent, store = load_agent(self.agent, self.settings.device), SegmentStore(self.data)
-        items = [segment_index(store, name) for name in self.segments] or list(range(len(store)))
+        items = segment_indices(store, self.segments) or list(range(len(store)))
         with segments_bar(f"scoring {agent.name}") as advance:
             found = evaluate_wosac(
                 agent, store, items, self.settings, self.config, advance, baselines=self.baselines

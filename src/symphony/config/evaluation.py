@@ -27,6 +27,8 @@ for sampling, what the search made of the goals.
 """
 
 
+MOST_SECONDS = 1e6
+"""That a planner can be given for an answer."""
 MANOEUVRES = ("hard_braking", "cut_in")
 """That a search can make more frequent."""
 PERSONA_PARTS = ("headway", "speed")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -56,7 +57,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
 
     Raises:
         DataError: the store is empty.
-        ConfigError: an unknown kind of action.
+        ConfigError: an unknown kind of action, or a negative duration.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own
@@ -73,6 +74,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     ) -> None:
         if action not in ("discrete", "continuous"):
             raise ConfigError(f"action is discrete or continuous, not {action!r}")
+        if not 0 <= duration < math.inf:
+            raise ConfigError(f"duration must not be negative, is {duration}")
         self.store = data if isinstance(data, SegmentStore) else SegmentStore(data)
         if len(self.store) == 0:
             raise DataError("the store holds no run segments", file=self.store.path)
@@ -108,6 +111,9 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
                 number = int(self.np_random.integers(len(self.store)))
         else:
             number = self.store.index_of(wanted) if isinstance(wanted, str) else int(wanted)
+            if not 0 <= number < len(self.store):
+                held = f"the store holds {len(self.store)} segments, the first is number 0"
+                raise DataError(held, file=self.store.path, segment=str(number))
             if not _usable(self.store[number]):
                 name = self.store.ids[number]
                 raise DataError("the ego is not seen at the first step", segment=name, field="valid")
@@ -116,12 +122,21 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         return self._observed(self._now), self._info(0.0)
 
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Drive one step."""
+        """Drive one step.
+
+        Raises:
+            ConfigError: the action is none of the space; continuous ones beyond it are clipped.
+        """
         if isinstance(self.dynamics, Bicycle):
+            if not 0 <= int(action) < self.dynamics.num_actions:
+                raise ConfigError(f"action {action} is not one of {self.dynamics.num_actions}")
             chosen = torch.tensor([int(action)])
         else:
+            numbers = np.asarray(action, np.float32)
+            if numbers.shape != (2,) or not np.isfinite(numbers).all():
+                raise ConfigError(f"an action is two finite numbers, not {action}")
             reach = TOP_SPEED * self.env.dt
-            chosen = torch.as_tensor(np.asarray(action, np.float32) * reach)[None]
+            chosen = torch.as_tensor(numbers.clip(-1.0, 1.0) * reach)[None]
         before = self._now.get(keys.STATE)[0, :2]
         stepped = self.env.step(self._now.set(keys.ACTION, chosen))
         after = stepped.get("next")

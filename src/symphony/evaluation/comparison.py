@@ -80,6 +80,8 @@ COST = Column("cost", "CPU", "s/segment", digits=2)
 """Of the simulation of all rollouts of a segment."""
 
 
+_TRAFFIC = {"interactive": 2, "others": "log", "open_traffic": False, "radius": 0.0}
+"""Settings of an evaluation that decide what agents meet, and what they usually are: rows of a table share them."""
 AT_A_DISTANCE = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor", "curvature_jsd_corrected")
 """What says nothing of the log itself."""
 FLOOR = Column("curvature_jsd_floor", "JSD floor", "10⁻³", 1000.0, optional=True)
@@ -196,8 +198,8 @@ def compare(
         asked: columns on request.
 
     Raises:
-        ConfigError: no runs, runs evaluated on different segments, seeds of a method evaluated in different ways, or
-            figures that the paper does not have.
+        ConfigError: no runs, runs evaluated on different segments or in other traffic, seeds of a method evaluated
+            in different ways, or figures that the paper does not have.
         DataError: an evaluation without a number that is needed.
     """
     figures = None if dataset is None else paper_figures(setting, dataset)
@@ -302,6 +304,16 @@ def _check_comparable(entries: Sequence[Entry]) -> None:
             raise ConfigError(
                 f"evaluated on different run segments, choose with --evaluation: {first.folder} ({first.name}), "
                 f"{entry.folder} ({entry.name})"
+            )
+        differing = [
+            name
+            for name, usual in _TRAFFIC.items()
+            if entry.record["config"].get(name, usual) != first.record["config"].get(name, usual)
+        ]
+        if differing:
+            raise ConfigError(
+                f"evaluated in other traffic ({', '.join(differing)}), choose with --evaluation: {first.folder} "
+                f"({first.name}), {entry.folder} ({entry.name})"
             )
         other = known.setdefault((entry.method, entry.way), entry)
         if _way(other) != _way(entry):

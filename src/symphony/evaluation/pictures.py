@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
@@ -17,14 +20,11 @@ from symphony.errors import ConfigError
 from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
-from symphony.simulation.control import given_personas
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import acting
-from symphony.simulation.planned import PlannedEnv
-from symphony.simulation.rollouts import Rollouts, start_states
+from symphony.simulation.driving import search_kind, simulation
+from symphony.simulation.rollouts import Rollouts
 from symphony.simulation.saved import SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import RolloutWriter
-from symphony.simulation.search import aggregate_of, pruning_rule, search
 
 PANELS = 6
 """Run segments in one picture."""
@@ -170,58 +170,42 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         config: how it is simulated.
 
     Raises:
-        ConfigError: if the agent has no discriminator to search by.
+        ConfigError: if the agent has no discriminator to search by, or is not to be searched.
     """
     if agent.policy is None or agent.discriminator is None:
         raise ConfigError(f"{agent.name} has no discriminator to search by: it was not trained with one")
-    agent.check_step(dataset.dt)
-    scene = dataset.scene(item).to(torch.device(config.device))
-    env = PlannedEnv(scene, agent.dynamics, agent.observation)
     settings = config.pruning(agent.search)
-    start = start_states(
-        env,
-        agent.goals,
-        trees=1,
-        branches=config.branches or settings.test_branches,
-        seed=config.seed,
-        logged_goals=config.logged_goals,
-        goals_per=config.pruning(agent.search).goals,
-        personas=given_personas(agent.personas, config.persona),
-    )[:, 0]
-    with torch.no_grad():
-        result = search(
-            env,
-            acting(agent.policy, env, config),
-            agent.discriminator,
-            start,
-            seed=config.seed,
-            rule=pruning_rule(settings),
-            prune_every=settings.prune_every,
-            aggregate=aggregate_of(settings),
-            keep_tree=True,
-        )
-    if result.tree is None:
+    if search_kind(agent, config) not in ("tree", "oracle"):
+        raise ConfigError(f"with search '{search_kind(agent, config)}' there is no tree to draw")
+    most = config.trees * (config.branches or settings.test_branches)
+    config = dataclasses.replace(config, rollouts=min(config.rollouts, most))
+    scene = dataset.scene(item).to(torch.device(config.device))
+    found = simulation(agent, scene, config, keep_tree=True)
+    result = found.search
+    if result is None or result.tree is None or found.drawn is None:
         raise RuntimeError("the search kept no tree")
     state, collision, offroad = (
-        result.tree.get(("next", *key))[0].cpu().numpy() for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)
+        result.tree.get(("next", *key))[0, 0].cpu().numpy()
+        for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)
     )
     agents = torch.where(scene.interactive_valid, scene.interactive, -1)[0]
     return SearchTree(
         position=state[..., :2],
-        score=result.simulated_scores[0].cpu().numpy(),
-        parents=result.parents[0].cpu().numpy(),
-        reaches_leaf=result.reaches_leaf[0].cpu().numpy(),
+        score=result.simulated_scores[0, 0].cpu().numpy(),
+        parents=result.parents[0, 0].cpu().numpy(),
+        reaches_leaf=result.reaches_leaf[0, 0].cpu().numpy(),
         prune_every=settings.prune_every,
         agents=agents.cpu().numpy(),
         collision=collision[..., 0],
         offroad=offroad[..., 0],
-        routes=_routes(scene, start.get(keys.GOAL)[0, 0].tolist()) if agent.goals is not None else [],
+        routes=_routes(scene, found.drawn[0, 0]) if agent.goals is not None else [],
     )
 
 
-def _routes(scene: SceneBatch, goals: Sequence[int]) -> list[Any]:
-    """Points of the route of each agent; None where it follows none."""
+def _routes(scene: SceneBatch, goals: Int[Tensor, "S N"]) -> list[Any]:
+    """Points of the route of each agent; None where it follows none, or not the same in all branches."""
+    same = torch.where((goals == goals[:1]).all(0), goals[0], -1)
     return [
         scene.route[0, n, route, : scene.route_count[0, n, route]].cpu().numpy() if route >= 0 else None
-        for n, route in enumerate(goals)
+        for n, route in enumerate(same.tolist())
     ]

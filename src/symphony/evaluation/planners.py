@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import grouped_mean, report, total_numbers
 from symphony.files import locating
 from symphony.simulation.saved import SavedRollouts
@@ -40,6 +40,9 @@ _KEPT = (
     "progress_ratio",
 )
 """Of each run, in a record."""
+
+OWN = ("planner", "planner_seconds")
+"""Settings that are the planner's own."""
 
 Record = dict[str, Any]
 
@@ -139,10 +142,15 @@ def read_planner_record(path: Path) -> Record:
         DataError: it can't be read, or is no such record.
     """
     with locating(path):
-        found = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8", errors="replace")
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"not valid JSON ({error})", file=path) from error
     if not isinstance(found, dict) or found.get("format") != FORMAT or "planner" not in found:
         raise DataError("no record of a planner (format 1)", file=path, field="format")
-    missing = [name for name in ("crowd", "per_run", *(name for name, _, _ in COLUMNS)) if name not in found]
+    needed = ("crowd", "settings", "store", "per_run", *(name for name, _, _ in COLUMNS))
+    missing = [name for name in needed if name not in found]
     if missing:
         raise DataError("missing in this record of a planner", file=path, field=missing[0])
     return found
@@ -179,6 +187,37 @@ def planner_grid(records: Sequence[Record]) -> list[list[str]]:
 def planner_title(record: Record) -> str:
     """The planner's name without its folder."""
     return str(record["planner"]).rpartition("/")[2]
+
+
+def check_crowds(records: Sequence[Record]) -> None:
+    """Refuse to put planners beside each other that did not meet the same.
+
+    Raises:
+        ConfigError: of two records of one crowd the store, the settings or the segments differ; names what does.
+    """
+    first: dict[str, Record] = {}
+    for one in records:
+        other = first.setdefault(crowd_name(one), one)
+        # What is the planner's own; records from before weights were kept have none.
+        pairs = [
+            (name, one["settings"].get(name), other["settings"].get(name))
+            for name in dict.fromkeys([*other["settings"], *one["settings"]])
+            if name not in OWN and not (name == "weights" and None in map(_weights, (one, other)))
+        ]
+        pairs.append(("the agent", one["crowd"], other["crowd"]))
+        pairs.append(("the store", one["store"]["checksum"], other["store"]["checksum"]))
+        mine, theirs = ({run["segment"] for run in each["per_run"]} for each in (one, other))
+        pairs.append(("the segments", mine, theirs))
+        differing = [name for name, here, there in pairs if here != there]
+        if differing:
+            raise ConfigError(
+                f"{planner_title(other)} and {planner_title(one)} did not meet the same crowd: "
+                f"{', '.join(differing)} differ; compare them apart"
+            )
+
+
+def _weights(record: Record) -> Any:
+    return record["settings"].get("weights")
 
 
 def winners(records: Sequence[Record]) -> list[str]:

@@ -30,7 +30,14 @@ FOLDER = "evaluations"
 
 _MEMORY = ("batch", "device", "workers", "engine")
 """Settings that change no result."""
-_USUAL = {"threshold": None, "goals": "tree", "retries": 0, "logged_goals": False}
+_USUAL = {
+    "threshold": None,
+    "goals": "tree",
+    "retries": 0,
+    "logged_goals": False,
+    "action_temperature": 1.0,
+    "persona": "",
+}
 """What goes without saying in the name of a way to simulate."""
 _NAMED = ("search", "trees", "branches", "rule", "interactive", "rollouts", "duration", "seed")
 _PRUNING = ("prune_every", "temperature")
@@ -42,6 +49,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "playback": (),
     "constant_velocity": (),
     "curvature": ("policy", "log"),
+    "cost": ("simulation",),
 }
 """What a kept evaluation must have."""
 
@@ -216,8 +224,12 @@ def read_evaluation(file: Path) -> dict[str, Any]:
         for name in names:
             if name not in held:
                 raise DataError("is missing", file=file, field=f"{part}.{name}")
-    if not isinstance(record.get("segments"), int):
+    segments, rows = record.get("segments"), record.get("per_segment")
+    if type(segments) is not int or segments < 1:
         raise DataError("is missing", file=file, field="segments")
+    # Included agents come without the rows of segments.
+    if rows is not None and (not isinstance(rows, list) or len(rows) != segments):
+        raise DataError(f"has not one row for each of {segments} segments", file=file, field="per_segment")
     return record
 
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
-
+from symphony.agents.agent import usable_device
 from symphony.config import TrainConfig
-from symphony.errors import ConfigError
 from symphony.recipes.bc import bc
 from symphony.recipes.bc_h import bc_h
 from symphony.recipes.bc_ts import bc_ts
@@ -60,15 +58,5 @@ def train(config: TrainConfig) -> Path:
         DataError: if a store can't be read or holds nothing to learn from, or the disk refuses.
         TrainingError: if gradients stay infinite or undefined.
     """
-    with processes(_device(config.device)) as world:
+    with processes(usable_device(config.device)) as world:
         return RECIPES[config.method](config, world).run()
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f"unknown device '{name}'") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device '{name}': this PyTorch sees no CUDA device")
-    return device

@@ -89,10 +89,12 @@ def simulation(
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
-            step, a planner can't be copied for a search, or another rule drives the others than the agent.
+            step, a goal is given to an agent that follows none, a planner can't be copied for a search, or another
+            rule drives the others than the agent.
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
     policy = agent.policy
+    _check_given(agent, scenes, config, given)
     if agent.rule:
         scenes, config = _ruled(agent, scenes, config, given)
     if policy is None:
@@ -204,6 +206,17 @@ def _ruled(
     return ruled, dataclasses.replace(config, others=agent.rule or config.others)
 
 
+def _check_given(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
+) -> None:
+    """Refuse goals for agents that follow none."""
+    if given is None or agent.goals is not None or agent.rule:
+        return
+    follows = scenes.background & (config.others == "idm")
+    if bool(((given.to(follows.device) >= 0) & ~follows).any()):
+        raise ConfigError(f"{agent.name} follows no goals, so a given one means nothing to it")
+
+
 def _with_fixed_goals(
     env: DrivingEnv, start: TensorDictBase, given: Tensor | None, *, along_log: bool
 ) -> TensorDictBase:
@@ -306,6 +319,7 @@ def driven_by(
     """What an agent does: :func:`playback` of the log, or a :func:`simulation`."""
     if agent.policy is not None or egos is not None:
         return simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+    _check_given(agent, scenes, config, given)
     found = playback(scenes)
     return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
 

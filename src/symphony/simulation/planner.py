@@ -32,6 +32,8 @@ MAX_STEERING = 0.6
 """Radians of its front wheels either way."""
 MAX_SPEED = 80.0
 """m/s that a pose may ask for, and by which it may lie away from where the vehicle is."""
+MAX_HEADING = 1e4
+"""Radians either way that a pose may have."""
 
 
 class Pose(NamedTuple):
@@ -189,7 +191,7 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
         return partial(FunctionPlanner, given)
     try:
         made = given()
-    except Exception as error:  # whatever a user's planner raises
+    except (Exception, SystemExit) as error:  # whatever a user's planner raises
         raise ConfigError(f"planner '{name}' can't be made: {type(error).__name__}: {error}") from error
     missing = [part for part in ("reset", "plan") if not callable(getattr(made, part, None))]
     if missing:
@@ -207,7 +209,10 @@ def planner_name(planner: str | Callable[..., Any]) -> str:
 def _process_maker(command: str) -> Callable[[], Planner]:
     from symphony.simulation.planner_process import ProcessPlanner  # noqa: PLC0415 - builds on this module
 
-    words = shlex.split(command)
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ConfigError(f"planner '{PIPE}{command}': {error}") from error
     if not words or shutil.which(words[0]) is None:
         raise ConfigError(f"planner '{PIPE}{command}': there is no command '{words[0] if words else ''}'")
     return partial(ProcessPlanner, command)
@@ -303,5 +308,7 @@ def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
             raise ValueError(
                 f"a target {away:.1f} m away at {numbers[3]:.1f} m/s, at most {MAX_SPEED:g} m/s are possible"
             )
+        if abs(numbers[2]) > MAX_HEADING:
+            raise ValueError(f"a heading of {numbers[2]:g} rad, at most {MAX_HEADING:g} are possible")
         return numbers
     return np.clip(numbers, [-MAX_BRAKING, -MAX_STEERING], [MAX_ACCELERATION, MAX_STEERING])

@@ -45,11 +45,22 @@ def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: floa
             [seen[m] for m in members],
             seconds=seconds,
         )
-        if not isinstance(given, Exception) and len(given) != len(members):
-            given = ValueError(f"plan_batch gave {len(given)} plans for {len(members)} planners")
+        if not isinstance(given, Exception):
+            given = _as_many(given, len(members))
         for k, m in enumerate(members):
             found[m] = given if isinstance(given, Exception) else given[k]
     return found
+
+
+def _as_many(given: Any, count: int) -> Any:
+    """The plans that ``plan_batch`` gave as a list, or an exception if they are something else."""
+    try:
+        plans = list(given)
+    except TypeError:
+        return TypeError(f"plan_batch gave no plans, but {type(given).__name__}")
+    if len(plans) != count:
+        return ValueError(f"plan_batch gave {len(plans)} plans for {count} planners")
+    return plans
 
 
 def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
@@ -59,6 +70,8 @@ def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
             return call(*args)
     except _Overdue as late:
         return TimeoutError(f"took more than {seconds:g} s{late}")
+    except SystemExit as ended:
+        return RuntimeError(f"called sys.exit({ended.code!r})")
     except Exception as error:  # whatever a user's planner raises
         return error
 

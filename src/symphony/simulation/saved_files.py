@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 import json
@@ -108,10 +109,13 @@ class RolloutWriter:
         if (self.path / MANIFEST).exists():
             held = _read_manifest(self.path)
             changed = [name for name in manifest if manifest[name] != held.get(name)]
-            if changed:
+            # One that holds nothing yet is nobody's.
+            if changed and (_read_index(self.path) or any((self.path / SEGMENTS).iterdir())):
                 message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
                 raise DataError(message, file=self.path / MANIFEST, field=changed[0])
             _repair(self.path / INDEX)
+            if changed:
+                write_json(self.path / MANIFEST, manifest)
         elif self.path.exists() and any(self.path.iterdir()):
             raise DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
         else:
@@ -185,6 +189,13 @@ class RolloutFolder(Sequence[SavedRollouts]):
         found = _read_index(self.path).values()
         self.entries = [entry for entry in found if entry.failed is None]
         self.failures = [entry for entry in found if entry.failed is not None]
+
+    def only(self, segments: Iterable[str]) -> RolloutFolder:
+        """The same with some segments only."""
+        wanted, found = set(segments), copy.copy(self)
+        found.entries = [entry for entry in self.entries if entry.segment in wanted]
+        found.failures = [entry for entry in self.failures if entry.segment in wanted]
+        return found
 
     def __len__(self) -> int:
         return len(self.entries)

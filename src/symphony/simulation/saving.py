@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import inspect
+import shlex
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.planned import EgoPlanners
-from symphony.simulation.planner import planner_maker, planner_name
+from symphony.simulation.planner import PIPE, planner_maker, planner_name
 from symphony.simulation.planner_calls import SECONDS
 from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
@@ -65,13 +69,12 @@ def save_simulation(
     """
     if planner:
         planner_maker(planner)  # or complain before anything is simulated
-    about = About.of(
-        agent.name,
-        dataset.store,
-        plain_settings(config, dataset.interactive, dataset.duration)
-        | ({"goal": list(goals)} if goals else {}),
-        seed=config.seed,
-    )
+    settings = plain_settings(config, dataset.interactive, dataset.duration) | weights_of(agent)
+    if goals:
+        settings["goal"] = list(goals)
+    if planner:
+        settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds}
+    about = About.of(agent.name, dataset.store, settings, seed=config.seed)
     writer = RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about)
     names = [dataset.store.ids[i] for i in dataset.indices]
     todo = [i for i, name in enumerate(names) if not writer.has(name)]
@@ -158,6 +161,34 @@ def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int]
         else:
             writer.fail(segment.segment_id, rollouts, why)
     return found
+
+
+def weights_of(agent: Agent) -> dict[str, str]:
+    """A digest of an agent's weights, as a setting: another agent of the same name is another simulation."""
+    if not agent.modules:
+        return {}
+    digest = hashlib.sha256()
+    for part, module in sorted(agent.modules.items()):
+        for name, value in sorted(module.state_dict().items()):
+            digest.update(f"{part}.{name} {value.dtype} {tuple(value.shape)}".encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return {"weights": digest.hexdigest()[:12]}
+
+
+def source_of(planner: str | Callable[..., Any]) -> str:
+    """A digest of the files that a planner is made of, as far as its name tells: one that was changed is another one.
+    Empty for those that come with the package, and for functions that no file defines.
+    """
+    if isinstance(planner, str) and planner.startswith(PIPE):
+        files = [Path(word) for word in shlex.split(planner.removeprefix(PIPE))]
+    else:
+        made = planner_maker(planner)
+        given = made.args[0] if isinstance(made, partial) and made.args else made
+        module = inspect.getmodule(given)
+        own = module is None or module.__name__.partition(".")[0] == "symphony"
+        files = [] if own or module is None or module.__file__ is None else [Path(module.__file__)]
+    found = [file.read_bytes() for file in files if file.is_file()]
+    return hashlib.sha256(b"".join(found)).hexdigest()[:12] if found else ""
 
 
 def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:

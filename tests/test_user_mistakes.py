@@ -1,0 +1,218 @@
+"""What a user gets wrong: one clear line, nothing lost, and never an old answer for a new question."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers_runs import tiny
+from helpers_segments import crossing
+from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.cli import main
+from symphony.config import EvaluateConfig
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError
+from symphony.evaluation.pictures import search_tree
+from symphony.recipes import train
+from symphony.simulation.crowd import crowd_dataset
+from symphony.simulation.planner_calls import answer, plans_of
+from symphony.simulation.saved_files import load_rollouts
+from symphony.simulation.saving import save_simulation
+
+PLAN = "def plan(seen):\n    return {}\n"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    fill(path, [crossing(5, seed=seed, steps=8) for seed in range(3)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(tiny("bc_ts_h", store, tmp_path_factory.mktemp("runs") / "run", steps=2))
+
+
+@pytest.fixture
+def told(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Runs a command in an empty folder; gives its exit code and what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: Any) -> tuple[int, str]:
+        code = main([str(word) for word in words])
+        printed = capsys.readouterr()
+        return code, " ".join((printed.out + printed.err).split())
+
+    return call
+
+
+def drive(store: Path, *more: Any, rollouts: int = 1) -> list[Any]:
+    """The common part of a simulation of the first segment beside the log."""
+    return ["simulate", "playback", "--data", store, "--segments", 0, "--rollouts", rollouts, *more]
+
+
+def test_a_planner_that_was_changed_is_another_simulation(store: Path, told: Any) -> None:
+    Path("mine.py").write_text(PLAN.format("(-0.5, 0.0)"))
+    assert told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))[0] == 0
+    assert told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))[0] == 0
+    Path("mine.py").write_text(PLAN.format("(2.0, 0.0)"))
+    code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
+    assert code == 1
+    assert "another simulation, which differs in settings" in words
+    assert told(*drive(store, "--planner", "mine.py:plan", "--out", "b"))[0] == 0
+
+
+def test_other_weights_under_the_same_name_are_another_simulation(store: Path, run: Path, told: Any) -> None:
+    command = ["simulate", run, "--data", store, "--segments", 0, "--rollouts", 2, "--out", "a"]
+    assert told(*command)[0] == 0
+    agent = load_agent(str(run))
+    with torch.no_grad():
+        next(agent.modules["policy"].parameters()).add_(1e-3)
+    data = SegmentStore(store)
+    config = EvaluateConfig(rollouts=2)
+    with pytest.raises(Exception, match="differs in settings"):
+        save_simulation("a", agent, crowd_dataset(data, agent, config, [0]), config)
+
+
+def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path, told: Any) -> None:
+    Path("brake.py").write_text("import sys\nfor line in sys.stdin:\n    print('{}', flush=True)\n")
+    command = ["simulate", run, "--data", store, "--segments", 0, "--rollouts", 2, "--out", "a"]
+    code, words = told(*command, "--planner", "pipe:python brake.py")
+    assert code == 1
+    assert "--search none" in words
+    assert told(*command, "--planner", "pipe:python brake.py", "--search", "none")[0] == 0
+
+
+def test_a_report_of_nothing_says_so(store: Path, told: Any) -> None:
+    Path("mine.py").write_text(PLAN.format("missing"))
+    code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
+    assert (code, "1 of 1 runs failed" in words) == (0, True)
+    code, words = told("report", "a", "--evaluated", "ego")
+    assert code == 0
+    assert "no run could be evaluated" in words
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("__import__('sys').exit()", "called sys.exit(None)"),
+        ("(*seen.ego[:2], 2e5, 1.0)", "a heading of 200000 rad"),
+        ("(*seen.ego[:2], 1e300, 1.0)", "a heading of 1e+300 rad"),
+    ],
+)
+def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, body: str, reason: str) -> None:
+    Path("mine.py").write_text(PLAN.format(body))
+    code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
+    assert code == 0
+    assert "1 of 1 runs failed" in words
+    assert reason in words
+
+
+def test_a_batch_of_planners_that_plans_nothing() -> None:
+    class Idle:
+        def plan_batch(self: Any, seen: Any) -> Any:
+            return None
+
+    (given,) = plans_of([Idle()], [None])  # type: ignore[list-item]
+    assert isinstance(given, TypeError)
+    assert isinstance(answer(lambda: exec("raise SystemExit(3)")), RuntimeError)  # noqa: S102
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("import sys\nsys.exit()\n", "SystemExit"),
+        ("def plan(:\n", "SyntaxError"),
+        ("1 / 0\n", "ZeroDivisionError"),
+    ],
+)
+@pytest.mark.parametrize("name", ["mistaken.py:plan", "mistaken_{}:plan"])
+def test_a_file_that_can_not_be_imported(store: Path, told: Any, text: str, message: str, name: str) -> None:
+    module = name.format(message.lower())
+    Path(module.rpartition(":")[0].removesuffix(".py") + ".py").write_text(text)
+    code, words = told(*drive(store, "--planner", module, "--out", "a"))
+    assert code == 1
+    assert message in words
+    assert "error:" in words
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--planner", "idm", "--planner-seconds", "inf"], "planner-seconds must be above 0"),
+        (["--planner", "pipe:python 'foo"], "No closing quotation"),
+        (["--planner", "idm", "--segments", "0", "0"], "is named twice: 0, 0"),
+        (["--goal", "1=3,4"], "follows no goals"),
+        (["--planner", "idm", "--device", "foo"], "unknown device 'foo'"),
+    ],
+)
+def test_one_line_names_the_mistake(store: Path, told: Any, words: list[str], message: str) -> None:
+    agent = ["simulate", "constant_velocity", "--data", store, "--out", "a", "--rollouts", 1]
+    if "--segments" not in words:
+        agent += ["--segments", 0]
+    if "--goal" in words:
+        ids = SegmentStore(store)[0].agent_id.tolist()
+        place = SegmentStore(store)[0].position[0, -1, :2].tolist()
+        words = ["--goal", f"{ids[0]}={place[0]:.1f},{place[1]:.1f}"]
+    if "foo" in words:
+        agent[1] = "pretrained:bc_ts_h"
+    code, printed = told(*agent, *words)
+    assert code in (1, 2)
+    assert message in printed
+    assert "Traceback" not in printed
+
+
+def test_paths_are_no_markup(store: Path, told: Any) -> None:
+    for out in ("a[lr=0.001]", "b[", "c[/x]"):
+        code, words = told(*drive(store, "--planner", "idm", "--out", out))
+        assert code == 0
+        assert f"symphony view {out}" in words
+        assert told("report", out, "--evaluated", "ego")[0] == 0
+
+
+def test_only_what_was_asked_for_is_evaluated(store: Path, told: Any) -> None:
+    command = ["evaluate", "playback", "--data", store, "--planner", "idm", "--rollouts", 1]
+    for number in (0, 1):
+        words = ["--segments", number, "--save-rollouts", "kept", "--json", f"{number}.json"]
+        assert told(*command, *words)[0] == 0
+        assert json.loads(Path(f"{number}.json").read_text())["runs"] == 1
+    assert len(load_rollouts("kept")) == 2
+    code, words = told(*command, "--metrics", "wosac")
+    assert (code, "go without --planner" in words) == (2, True)
+    # Nor are planners compared that drove other segments, or not in the same way.
+    code, words = told("planners", "0.json", "1.json")
+    assert (code, "the segments differ" in words) == (1, True)
+    assert told(*command, "--segments", 0, "--json", "2.json", "--duration", 1)[0] == 0
+    code, words = told("planners", "0.json", "2.json")
+    assert (code, "duration differ" in words) == (1, True)
+    Path("no.json").write_text("def")
+    code, words = told("planners", "no.json")
+    assert (code, "not valid JSON" in words) == (1, True)
+
+
+@pytest.mark.parametrize("changes", [{}, {"search": "oracle"}, {"retries": 1, "retry_above": -50.0}])
+def test_the_tree_that_is_drawn_is_the_one_that_is_simulated(
+    store: Path, run: Path, tmp_path: Path, changes: dict[str, Any]
+) -> None:
+    agent, config = load_agent(str(run)), EvaluateConfig(rollouts=2, branches=2, goals="branch", **changes)
+    dataset = crowd_dataset(SegmentStore(store), agent, config, [1])
+    drawn = search_tree(agent, dataset, 0, config)
+    kept = save_simulation(tmp_path / "sim", agent, dataset, config)[0].trees
+    assert kept is not None
+    np.testing.assert_array_equal(drawn.position, kept.state[0, ..., :2])
+    np.testing.assert_array_equal(drawn.score, kept.score[0])
+    np.testing.assert_array_equal(drawn.parents, kept.parents[0])
+
+
+@pytest.mark.parametrize("search", ["none", "best"])
+def test_without_a_tree_there_is_none_to_draw(store: Path, run: Path, search: Any) -> None:
+    agent, config = load_agent(str(run)), EvaluateConfig(rollouts=2, search=search)
+    with pytest.raises(ConfigError, match="there is no tree to draw"):
+        search_tree(agent, crowd_dataset(SegmentStore(store), agent, config, [1]), 0, config)
