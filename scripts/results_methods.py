@@ -146,6 +146,13 @@ PARTS = (
     ("BC+TS+H, 2 000 instead of 500 updates", "parts/{}-tsh2000"),
 )
 """What inputs, further updates, distillation and search each do, of one seed."""
+TOWNS = (
+    ("BC, 3 290 towns, three seeds", "eight/{}-bc-*"),
+    ("BC, 10 000 towns", "towns/{}-bc"),
+    ("BC+TS, 3 290 towns, three seeds", "eight/{}-bc_ts-*"),
+    ("BC+TS, 10 000 towns", "towns/{}-bc_ts"),
+)
+"""What three times as many simulated towns do in as many updates."""
 INPUTS = (
     ("the paper's inputs", "inputs/{}-paper"),
     ("+ gaps to others", "inputs/{}-gaps"),
