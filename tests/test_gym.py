@@ -125,3 +125,25 @@ def test_the_extra_is_named_where_it_is_missing() -> None:
     code = "import sys; sys.modules['gymnasium'] = None; import symphony.gym"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "symphony-traffic[gym]" in done.stderr
+
+
+def test_actions_and_segments_that_are_none(store: Path) -> None:
+    env = gymnasium.make(NAME, data=store, action="continuous", observation=SMALL, ends_on=()).unwrapped
+    env.reset(options={"segment": 1})
+    for action in ((np.nan, 0.0), (0.0, np.inf), (1.0,)):
+        with pytest.raises(ConfigError, match="two finite numbers"):
+            env.step(np.array(action, np.float32))
+    _, _, _, _, at_most = env.step(np.array([1.0, 0.0], np.float32))
+    env.reset(options={"segment": 1})
+    _, _, _, _, beyond = env.step(np.array([5.0, 0.0], np.float32))
+    np.testing.assert_array_equal(beyond["state"], at_most["state"])
+    for number in (-1, 3):
+        with pytest.raises(DataError, match="holds 3 segments"):
+            env.reset(options={"segment": number})
+    with pytest.raises(ConfigError, match="duration must not be negative"):
+        gymnasium.make(NAME, data=store, duration=-1.0)
+    discrete = gymnasium.make(NAME, data=store, observation=SMALL).unwrapped
+    discrete.reset(options={"segment": 1})
+    for action in (-1, discrete.action_space.n):
+        with pytest.raises(ConfigError, match="is not one of"):
+            discrete.step(action)

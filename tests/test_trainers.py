@@ -275,5 +275,8 @@ def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> N
         from_dict(TrainConfig, {**saved, "learning_rat": 1})
     with pytest.raises(ConfigError, match="missing"):
         from_dict(TrainConfig, {"out": "x", "method": "bc"})
+    for seed in (1 << 40, -(1 << 40)):
+        with pytest.raises(ConfigError, match="seed must be within"):
+            config(store, tmp_path, seed=seed)
     with pytest.raises(ConfigError, match="steps must be positive"):
         replace(config(store, tmp_path), steps=0)

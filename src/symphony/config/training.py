@@ -21,6 +21,8 @@ the model (MGAIL), with goals (H: hierarchy), with tree search (TS), with both.
 """
 METHODS: tuple[str, ...] = get_args(Method)
 Cost = Literal["log_d", "non_saturating", "logit"]
+MAX_SEED = (1 << 40) - 1
+"""Of a training, which derives a number from it for every update."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +197,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         positive(self, "steps", "clip", "checkpoint_every", "log_every")
+        if abs(self.seed) > MAX_SEED:
+            raise ConfigError(f"seed must be within ±{MAX_SEED}, is {self.seed}")
         if self.validation.every % self.checkpoint_every:
             raise ConfigError(
                 f"validation.every ({self.validation.every}) must be a multiple of checkpoint-every "

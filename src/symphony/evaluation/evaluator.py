@@ -289,14 +289,15 @@ def _add(
         log[:, 1:, :, 3].transpose(1, 2),
     )
     evaluated_log = log_valid & ~scenes.background[:, None]
-    driven, counted, log, evaluated_log, log_valid = (
-        t.cpu() for t in (rollouts.state, evaluated.counted, log, evaluated_log, log_valid)
+    there = (exists & ~scenes.background[:, None, :, None]).transpose(2, 3)
+    driven, counted, there, log, evaluated_log, log_valid = (
+        t.cpu() for t in (rollouts.state, evaluated.counted, there, log, evaluated_log, log_valid)
     )
     regions, regions_log = [], []
     for b, item in enumerate(items):
         graph = dataset.graph(item)
-        regions.append(_curvatures(graph, driven[b], counted[b]))
-        regions_log.append(_curvatures(graph, log[b], evaluated_log[b, 1:]))
+        regions.append(_curvatures(graph, driven[b], there[b]))
+        regions_log.append(_curvatures(graph, log[b], evaluated_log[b]))
     segments = [dataset.segment(i) for i in items]
     evaluation.metrics.update(
         [segment.segment_id for segment in segments],
@@ -358,15 +359,14 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T
 
 
 def _curvatures(
-    graph: LaneGraph, state: Float[Tensor, "*b U N 4"], counted: Bool[Tensor, "*b T N"]
+    graph: LaneGraph, state: Float[Tensor, "*b U N 4"], there: Bool[Tensor, "*b U N"]
 ) -> NDArray[np.float64]:
     """Average curvature of every branching region that each trajectory visits.
 
     Args:
         graph: lanes.
         state: [..., T + 1, N, 4].
-        counted: [..., T, N]; the first state counts wherever the second does.
+        there: [..., T + 1, N] which states count.
     """
-    valid = torch.cat([counted[..., :1, :], counted], -2)
     path = state.transpose(-2, -3).numpy()
-    return visited_curvatures(graph, path[..., :2], path[..., 2], valid.transpose(-1, -2).numpy())
+    return visited_curvatures(graph, path[..., :2], path[..., 2], there.transpose(-1, -2).numpy())

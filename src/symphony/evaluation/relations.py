@@ -146,7 +146,7 @@ def _checked(one: Statement, entries: Sequence[Entry]) -> Relation:
         return Relation(one, missing="not in these evaluations: evaluate again")
     value, error = found
     if math.isnan(value):
-        return Relation(one, missing="a mean over nothing")
+        return Relation(one, missing="no number: both are 0, or a mean over nothing")
     away = {
         "times": value - one.bound,
         "lower": one.bound - value,
