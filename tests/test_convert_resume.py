@@ -237,7 +237,7 @@ def test_a_worker_that_dies_costs_no_finished_work(
         ({"longer": True}, r"size of .*b\.scene is \d+, but .* had \d+"),
         ({"edited": True}, r"b\.scene was changed since the conversion was interrupted"),
         ({"companion": True}, r"b\.map was changed since the conversion was interrupted"),
-        ({"option": "other"}, "option is other, but .* had usual"),
+        ({"option": "other"}, "options is {'option': 'other'}, but .* had {'option': 'usual'}"),
     ],
     ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
 )

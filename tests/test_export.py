@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from helpers_saved import played, searched
 from helpers_segments import crossing, hide, straight_road
 from symphony.cli import main
-from symphony.data.segment import AgentType, RunSegment, SignalState
+from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.data.sources.commonroad import CommonRoadReader
 from symphony.simulation.export import commonroad
 from symphony.simulation.saved import SavedRollouts
@@ -128,3 +129,24 @@ def test_the_command_writes_a_file_for_each_rollout(
     assert found["lights"][0]["states"][0] == SignalState(saved.segment.signal_state[0, 0]).name.lower()
     assert main(["export", sim, "--rollouts", "1"]) == 1
     assert "straight-0 has rollouts 0 to 0, not 1" in capsys.readouterr().err
+
+
+def test_the_limit_of_a_lane_that_is_not_written_is_not_written() -> None:
+    segment = crossing()
+    road = segment.road
+
+    def more(name: str, value: float) -> Any:
+        held = getattr(road, name)
+        return np.append(held, np.asarray(value, held.dtype))
+
+    lines = [road.lanes[k] for k in range(len(road.lanes))] + [road.lanes[0][:1]]
+    longer = dataclasses.replace(
+        road,
+        lanes=Polylines.of(lines),
+        lane_id=more("lane_id", road.lane_id.max() + 1),
+        lane_type=more("lane_type", road.lane_type[0]),
+        speed_limit=more("speed_limit", 7.77),
+        lane_width=more("lane_width", 3.5),
+    )
+    text = commonroad(played(segment.replace(road=longer)), 0)
+    assert "7.77" not in str(text)

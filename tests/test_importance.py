@@ -47,7 +47,9 @@ def rare(records: Sequence[TensorDictBase]) -> Tensor:
     return (there > FAR).flatten(-3).any(-1).float()
 
 
-def walk(strength: float | None, *, rows: int = 3000, score: float = 0.0) -> BeamSearchResult:
+def walk(
+    strength: float | None, *, rows: int = 3000, score: float = 0.0, leaves: int | None = None
+) -> BeamSearchResult:
     env = Walk(agents=1)
     start = starts(env, rows, branches=4, seed=3)
     generator = torch.Generator().manual_seed(5)
@@ -63,6 +65,7 @@ def walk(strength: float | None, *, rows: int = 3000, score: float = 0.0) -> Bea
             noise=torch.rand(rows, 3, generator=generator),
             slot_keys=[STREAM],
             tilt=None if strength is None else (lambda records: strength * rare(records)),
+            leaves=leaves,
         )
 
 
@@ -89,6 +92,19 @@ def test_weights_give_back_the_rate_that_the_tilt_has_raised() -> None:
     # Without scores nothing but the tilt prunes: weights are 1 on average.
     mean, error = mean_error(weight)
     assert abs(mean - 1) < 4 * error
+
+
+@pytest.mark.parametrize("score", [0.0, 0.5])
+def test_leaves_in_the_order_of_their_totals_keep_their_own_weights(score: float) -> None:
+    plain, ranked = walk(1.5, score=score, rows=200), walk(1.5, score=score, rows=200, leaves=4)
+    assert plain.log_weights is not None
+    assert ranked.log_weights is not None
+    assert not torch.equal(plain.slots, ranked.slots)
+    for b in range(len(plain.slots)):
+        # Leaves of one history have one weight.
+        weights = {tuple(plain.slots[b, :, k].tolist()): plain.log_weights[b, k] for k in range(4)}
+        for k in range(4):
+            assert ranked.log_weights[b, k] == weights[tuple(ranked.slots[b, :, k].tolist())]
 
 
 def test_a_tilt_makes_up_for_itself_beside_scores_too() -> None:

@@ -64,6 +64,16 @@ def test_idm_stops_behind_a_standing_car(speed: float) -> None:
     np.testing.assert_allclose(found[:, 1:3], 0, atol=1e-4)
 
 
+@pytest.mark.parametrize("dt", [2.0])
+def test_idm_keeps_its_place_where_steps_are_long(dt: float) -> None:
+    """Of more metres than are looked at around the last place."""
+    found = states(in_a_row([14, 0], [20, 180], steps=31).replace(dt=dt))
+    gap = 180 - found[:, 0] - LENGTH
+    assert np.diff(found[:, 0]).max() > 20
+    assert gap.min() > 0
+    assert found[-1, 3] < 0.5
+
+
 def test_idm_follows_at_its_headway() -> None:
     """Where nothing changes any more, s = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     leader = 8.0

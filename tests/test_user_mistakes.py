@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from symphony.recipes import train
 from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.planner_calls import answer, plans_of
 from symphony.simulation.saved_files import load_rollouts
-from symphony.simulation.saving import save_simulation
+from symphony.simulation.saving import save_simulation, source_of
 
 PLAN = "def plan(seen):\n    return {}\n"
 
@@ -79,6 +81,38 @@ def test_other_weights_under_the_same_name_are_another_simulation(store: Path, r
     config = EvaluateConfig(rollouts=2)
     with pytest.raises(Exception, match="differs in settings"):
         save_simulation("a", agent, crowd_dataset(data, agent, config, [0]), config)
+
+
+def test_folders_from_before_weights_were_kept_are_gone_on_with(store: Path, run: Path, told: Any) -> None:
+    command = ["simulate", run, "--data", store, "--rollouts", 2, "--out", "a"]
+    assert told(*command, "--segments", 0)[0] == 0
+    manifest = json.loads(Path("a/manifest.json").read_text())
+    del manifest["settings"]["weights"]
+    Path("a/manifest.json").write_text(json.dumps(manifest))
+    assert told(*command, "--segments", 1)[0] == 0
+    assert len(load_rollouts("a")) == 2
+    code, words = told(*command, "--segments", 2, "--goals", "tree")
+    assert (code, "differs in settings.goals" in words) == (1, True)
+
+
+def test_planners_that_no_file_defines(store: Path, tmp_path: Path) -> None:
+    body = (
+        "from pathlib import Path\n"
+        "from symphony.agents import load_agent\n"
+        "from symphony.config import EvaluateConfig\n"
+        "from symphony.data.store import SegmentStore\n"
+        "from symphony.simulation.crowd import crowd_dataset\n"
+        "from symphony.simulation.saving import save_simulation\n"
+        "def plan(seen):\n    return 0.0, 0.0\n"
+        "agent, config = load_agent('playback'), EvaluateConfig(rollouts=1)\n"
+        f"data = crowd_dataset(SegmentStore({str(store)!r}), agent, config, [0], default=1, routes=True)\n"
+        "print(len(save_simulation('sim', agent, data, config, planner=plan)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", body], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["1"], done.stderr
+    assert source_of(f"pipe:{sys.executable} -c '{'#' * 300}'") == source_of(f"pipe:{sys.executable} -c ''")
 
 
 def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path, told: Any) -> None:
@@ -192,6 +226,10 @@ def test_only_what_was_asked_for_is_evaluated(store: Path, told: Any) -> None:
     assert told(*command, "--segments", 0, "--json", "2.json", "--duration", 1)[0] == 0
     code, words = told("planners", "0.json", "2.json")
     assert (code, "duration differ" in words) == (1, True)
+    # How often, and a search beside the log that does not search, don't matter.
+    more = ["--segments", 0, "--json", "3.json", "--search", "none"]
+    assert told("evaluate", "playback", "--data", store, "--planner", "log", "--rollouts", 2, *more)[0] == 0
+    assert told("planners", "0.json", "3.json")[0] == 0
     Path("no.json").write_text("def")
     code, words = told("planners", "no.json")
     assert (code, "not valid JSON" in words) == (1, True)

@@ -218,7 +218,8 @@ class Evaluate:
                 config=self.config,
             ).simulated()
             store = SegmentStore(self.data)
-            record = planner_record(folder.only(store.ids[i] for i in self._chosen(store)))
+            folder = folder.only(store.ids[i] for i in self._chosen(store))
+            record = planner_record(folder)
             for line in failed_runs(folder):
                 sys.stderr.write(f"{line}\n")
         if self.json is not None:

@@ -156,12 +156,12 @@ def beam_search(
         torch.stack(parents, -2),
     )
     slots = lineage(all_parents)
-    log_weights = None
-    if weights:
-        log_weights = torch.stack(weights, -2).gather(-1, slots[..., : len(weights), :]).sum(-2)
     if leaves is not None:
         best = ranking(all_totals[..., -1, :].detach(), slots[..., -1, :])[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
+    log_weights = None
+    if weights:
+        log_weights = torch.stack(weights, -2).gather(-1, slots[..., : len(weights), :]).sum(-2)
     steps_at = _step_rows(slots, start.shape[-1], periods)
     trajectories = _take(tree, steps_at)
     trajectories.refine_names(..., "time")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import shutil
@@ -112,8 +113,11 @@ def convert(
     if isinstance(reader, str):
         reader = get_reader(reader, **options)
     else:
-        own = {name: value for name, value in vars(reader).items() if not name.startswith("_")}
-        options = {name: value for name, value in own.items() if isinstance(value, _PLAIN)}
+        # What it was made with, as far as it keeps that under the same names.
+        asked = inspect.signature(type(reader)).parameters
+        own = {name: value for name, value in vars(reader).items() if name in asked}
+        found = {name: value for name, value in own.items() if isinstance(value, _PLAIN)}
+        options = {"options": found} if found else {}
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
     settings |= {} if radius is None else {"radius": radius}

@@ -176,7 +176,9 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         raise ConfigError(f"{agent.name} has no discriminator to search by: it was not trained with one")
     settings = config.pruning(agent.search)
     if search_kind(agent, config) not in ("tree", "oracle"):
-        raise ConfigError(f"with search '{search_kind(agent, config)}' there is no tree to draw")
+        raise ConfigError(
+            f"with search '{search_kind(agent, config)}' there is no tree to draw: ask for one, --search tree"
+        )
     most = config.trees * (config.branches or settings.test_branches)
     config = dataclasses.replace(config, rollouts=min(config.rollouts, most))
     scene = dataset.scene(item).to(torch.device(config.device))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import grouped_mean, report, total_numbers
 from symphony.files import locating
-from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.saved import PLAYBACK, SavedRollouts
 from symphony.simulation.saved_files import RolloutFolder
 
 FORMAT = 1
@@ -41,8 +41,10 @@ _KEPT = (
 )
 """Of each run, in a record."""
 
-OWN = ("planner", "planner_seconds")
-"""Settings that are the planner's own."""
+FREE = ("planner", "planner_seconds", "rollouts")
+"""Settings that are the planner's own, and how often it is tried."""
+BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
+"""Those that mean something where all others play back their log."""
 
 Record = dict[str, Any]
 
@@ -161,7 +163,7 @@ def crowd_name(record: Record) -> str:
     name = str(record["crowd"]).rpartition("/")[2].removeprefix("pretrained:")
     settings = record["settings"]
     others = settings.get("others", "log")
-    if name == "playback":
+    if name == PLAYBACK:
         return "log" if others == "log" else f"{others}, all driven"
     many = settings["interactive"]
     driven = "all" if many == "all" else int(many) - 1
@@ -198,13 +200,16 @@ def check_crowds(records: Sequence[Record]) -> None:
     first: dict[str, Record] = {}
     for one in records:
         other = first.setdefault(crowd_name(one), one)
-        # What is the planner's own; records from before weights were kept have none.
-        pairs = [
-            (name, one["settings"].get(name), other["settings"].get(name))
-            for name in dict.fromkeys([*other["settings"], *one["settings"]])
-            if name not in OWN and not (name == "weights" and None in map(_weights, (one, other)))
-        ]
-        pairs.append(("the agent", one["crowd"], other["crowd"]))
+        weights = [each["settings"].get("weights") for each in (one, other)]
+        names = [name for name in dict.fromkeys([*other["settings"], *one["settings"]]) if name not in FREE]
+        if one["crowd"] == other["crowd"] == PLAYBACK:
+            names = [name for name in names if name in BESIDE_LOG]
+        if None in weights:  # records from before they were kept
+            names = [name for name in names if name != "weights"]
+        pairs = [(name, one["settings"].get(name), other["settings"].get(name)) for name in names]
+        # The same agent may go by several names.
+        if None in weights or weights[0] != weights[1]:
+            pairs.append(("the agent", one["crowd"], other["crowd"]))
         pairs.append(("the store", one["store"]["checksum"], other["store"]["checksum"]))
         mine, theirs = ({run["segment"] for run in each["per_run"]} for each in (one, other))
         pairs.append(("the segments", mine, theirs))
@@ -214,10 +219,6 @@ def check_crowds(records: Sequence[Record]) -> None:
                 f"{planner_title(other)} and {planner_title(one)} did not meet the same crowd: "
                 f"{', '.join(differing)} differ; compare them apart"
             )
-
-
-def _weights(record: Record) -> Any:
-    return record["settings"].get("weights")
 
 
 def winners(records: Sequence[Record]) -> list[str]:

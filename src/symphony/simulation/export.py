@@ -146,7 +146,9 @@ class _Network:
     def add(self, root: ET.Element) -> None:
         """Add all elements in the order that the format wants."""
         limits = self.road.speed_limit
-        signs = {float(limit): self._number() for limit in np.unique(limits[np.isfinite(limits)])}
+        # Of the lanes that are written: one of a single point is not.
+        known = limits[list(self.lines)]
+        signs = {float(limit): self._number() for limit in np.unique(known[np.isfinite(known)])}
         lights = self._lights()
         for k in self.lines:
             self._lanelet(

@@ -18,8 +18,8 @@ from symphony.envs.routes import POINTS, RouteTable
 from symphony.files import replacing
 from symphony.simulation.experts import Experts
 
-VERSION = 1
-"""Of the fit: raised when it gives something else for the same segment."""
+VERSION = 2
+"""Of the fit: raised when it gives something else for the same segment, or other routes (a test says when)."""
 PACKAGE = Path(symphony.__file__).parent
 FOLDER = "experts"
 """Of a store's."""
@@ -58,7 +58,7 @@ class KeptExperts:
             # Opened here: NumPy leaves a damaged file open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 return _from_arrays({name: file[name] for name in file.files})
-        except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile):
+        except (OSError, ValueError, KeyError, EOFError, IndexError, RuntimeError, zipfile.BadZipFile):
             return None
 
     def save(self, content: str, experts: Experts) -> None:

@@ -82,6 +82,7 @@ class IDMPlanner:
         if len(scenario.route) < 2:
             raise ValueError("the ego is on no lane that it could follow")
         self.length, self.width = scenario.size.tolist()
+        self.dt, self.before = scenario.dt, 0.0
         self.route = RouteLine(scenario.route)
         self.limit = np.minimum(
             _limits(scenario, self.route.points, self.speed),
@@ -96,7 +97,10 @@ class IDMPlanner:
     def plan(self, traffic: Traffic) -> Control:
         """Speed by the leader, steering by the route."""
         x, y, heading, speed = traffic.state.tolist()
-        within = self.station - BACK, self.station + _ON
+        # Where steps are long, the way of one may be longer than that.
+        driven = self.dt * max(speed, self.before)
+        self.before = speed
+        within = self.station - BACK, self.station + max(_ON, 2.0 * driven)
         self.station = station = float(self.route.project(np.array([[x, y]]), *within)[0][0])
         pull = self._acceleration(speed, self._free_speed(station), self._leader(traffic, station, speed))
         return Control(pull, self._steering(x, y, heading, speed))

@@ -26,6 +26,8 @@ from symphony.simulation.saved_tensors import KEY, MAX_LENGTH, read_tensors, ten
 
 FORMAT = 1
 MANIFEST, INDEX, SEGMENTS = "manifest.json", "index.jsonl", "segments"
+LATER = ("weights", "planner", "planner_seconds")
+"""Settings that a manifest has since November 2026."""
 _LONGEST = 120
 _KINDS: dict[str, tuple[type, ...]] = {
     "segment": (str,),
@@ -108,11 +110,12 @@ class RolloutWriter:
         manifest = {"format": FORMAT, **dataclasses.asdict(about)}
         if (self.path / MANIFEST).exists():
             held = _read_manifest(self.path)
-            changed = [name for name in manifest if manifest[name] != held.get(name)]
+            changed = _differing(manifest, held)
             # One that holds nothing yet is nobody's.
-            if changed and (_read_index(self.path) or any((self.path / SEGMENTS).iterdir())):
+            if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
                 message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
-                raise DataError(message, file=self.path / MANIFEST, field=changed[0])
+                raise DataError(message, file=self.path / MANIFEST, field=changed[0].partition(".")[0])
+            (self.path / SEGMENTS).mkdir(exist_ok=True)
             _repair(self.path / INDEX)
             if changed:
                 write_json(self.path / MANIFEST, manifest)
@@ -164,6 +167,18 @@ class RolloutWriter:
         self._entries[entry.segment] = entry
 
 
+def _differing(mine: Mapping[str, Any], held: Mapping[str, Any]) -> list[str]:
+    """Names of what two manifests differ in; of their settings each."""
+    found = [name for name in mine if name != "settings" and mine[name] != held.get(name)]
+    before = held.get("settings")
+    if not isinstance(before, dict):
+        return [*found, "settings"]
+    now = mine["settings"]
+    # Folders from before these were kept don't say.
+    names = [name for name in dict.fromkeys([*now, *before]) if name not in LATER or name in before]
+    return found + [f"settings.{name}" for name in names if now.get(name) != before.get(name)]
+
+
 class RolloutFolder(Sequence[SavedRollouts]):
     """Read access to a folder of rollouts: ``folder[i]`` reads and checks that segment only.
 
@@ -195,6 +210,7 @@ class RolloutFolder(Sequence[SavedRollouts]):
         wanted, found = set(segments), copy.copy(self)
         found.entries = [entry for entry in self.entries if entry.segment in wanted]
         found.failures = [entry for entry in self.failures if entry.segment in wanted]
+        found.__dict__.pop("ids", None)  # kept once it was asked for
         return found
 
     def __len__(self) -> int:

@@ -176,19 +176,32 @@ def weights_of(agent: Agent) -> dict[str, str]:
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """A digest of the files that a planner is made of, as far as its name tells: one that was changed is another one.
-    Empty for those that come with the package, and for functions that no file defines.
+    """A digest of the code that a planner is made of, as far as its name tells: one that was changed is another one.
+
+    Of a command the first word that is a file. Empty for what comes with the package, and where no source is known.
     """
     if isinstance(planner, str) and planner.startswith(PIPE):
-        files = [Path(word) for word in shlex.split(planner.removeprefix(PIPE))]
-    else:
-        made = planner_maker(planner)
-        given = made.args[0] if isinstance(made, partial) and made.args else made
-        module = inspect.getmodule(given)
-        own = module is None or module.__name__.partition(".")[0] == "symphony"
-        files = [] if own or module is None or module.__file__ is None else [Path(module.__file__)]
-    found = [file.read_bytes() for file in files if file.is_file()]
-    return hashlib.sha256(b"".join(found)).hexdigest()[:12] if found else ""
+        return next(filter(None, map(_digest, shlex.split(planner.removeprefix(PIPE)))), "")
+    made = planner_maker(planner)
+    given = made.args[0] if isinstance(made, partial) and made.args else made
+    module = inspect.getmodule(given)
+    if module is None or module.__name__.partition(".")[0] == "symphony":
+        return ""
+    file = getattr(module, "__file__", None)
+    if file is not None:
+        return _digest(file)
+    try:  # of a notebook, say
+        return hashlib.sha256(inspect.getsource(given).encode()).hexdigest()[:12]
+    except (OSError, TypeError):
+        return ""
+
+
+def _digest(file: str) -> str:
+    """Of what a file holds; empty where there is none that can be read."""
+    try:
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12] if Path(file).is_file() else ""
+    except OSError:
+        return ""
 
 
 def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:
