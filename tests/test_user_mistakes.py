@@ -21,6 +21,7 @@ from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
 from symphony.evaluation.pictures import search_tree
+from symphony.evaluation.planners import check_crowds, winners
 from symphony.recipes import train
 from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.planner_calls import answer, plans_of
@@ -222,7 +223,11 @@ def test_only_what_was_asked_for_is_evaluated(store: Path, told: Any) -> None:
     assert (code, "go without --planner" in words) == (2, True)
     # Nor are planners compared that drove other segments, or not in the same way.
     code, words = told("planners", "0.json", "1.json")
-    assert (code, "the segments differ" in words) == (1, True)
+    assert (code, "all segments differ" in words) == (1, True)
+    # Where some are shared, those are compared.
+    told(*command, "--segments", 0, 1, "--save-rollouts", "kept", "--json", "both.json")
+    code, words = told("planners", "0.json", "both.json")
+    assert (code, "in the 1 segments that both drove" in words) == (0, True)
     assert told(*command, "--segments", 0, "--json", "2.json", "--duration", 1)[0] == 0
     code, words = told("planners", "0.json", "2.json")
     assert (code, "duration differ" in words) == (1, True)
@@ -233,6 +238,24 @@ def test_only_what_was_asked_for_is_evaluated(store: Path, told: Any) -> None:
     Path("no.json").write_text("def")
     code, words = told("planners", "no.json")
     assert (code, "not valid JSON" in words) == (1, True)
+
+
+def test_of_two_planners_the_better_one_is_better_where_both_drove() -> None:
+    def record(name: str, scores: dict[str, float]) -> dict[str, Any]:
+        runs = [
+            {"segment": segment, "group": "", "failed": None, "progress_ratio": score / 100}
+            | {"at_fault_collision": False, "red_lights": 0, "offroad_time": 0.0}
+            for segment, score in scores.items()
+        ]
+        found = {"planner": name, "crowd": "playback", "settings": {"interactive": 1}, "per_run": runs}
+        return found | {"score": float(np.mean(list(scores.values()))), "store": {"checksum": "a"}}
+
+    careful = record("careful", {"a": 60.0, "b": 70.0})
+    quick = record("quick", {"b": 50.0, "c": 99.0, "d": 99.0})
+    check_crowds([careful, quick])
+    (sentence,) = winners([careful, quick])
+    assert sentence.startswith("log: careful is first")
+    assert "20.0 above quick, in the 1 segments that both drove" in sentence
 
 
 @pytest.mark.parametrize("changes", [{}, {"search": "oracle"}, {"retries": 1, "retry_above": -50.0}])

@@ -195,7 +195,7 @@ def check_crowds(records: Sequence[Record]) -> None:
     """Refuse to put planners beside each other that did not meet the same.
 
     Raises:
-        ConfigError: of two records of one crowd the store, the settings or the segments differ; names what does.
+        ConfigError: of two records of one crowd the store, the settings or all segments differ; names what does.
     """
     first: dict[str, Record] = {}
     for one in records:
@@ -211,9 +211,9 @@ def check_crowds(records: Sequence[Record]) -> None:
         if None in weights or weights[0] != weights[1]:
             pairs.append(("the agent", one["crowd"], other["crowd"]))
         pairs.append(("the store", one["store"]["checksum"], other["store"]["checksum"]))
-        mine, theirs = ({run["segment"] for run in each["per_run"]} for each in (one, other))
-        pairs.append(("the segments", mine, theirs))
         differing = [name for name, here, there in pairs if here != there]
+        if not _segments(one) & _segments(other):
+            differing.append("all segments")
         if differing:
             raise ConfigError(
                 f"{planner_title(other)} and {planner_title(one)} did not meet the same crowd: "
@@ -221,9 +221,14 @@ def check_crowds(records: Sequence[Record]) -> None:
             )
 
 
+def _segments(record: Record) -> set[str]:
+    return {run["segment"] for run in record["per_run"]}
+
+
 def winners(records: Sequence[Record]) -> list[str]:
     """For each crowd a sentence: which planner scores best, by how much over the next one, paired over the runs of
     the segments that both drove (± standard error over groups), and whether that is more than two standard errors.
+    Of two that drove different ones the better is who was better where both did.
     """
     crowds: dict[str, list[Record]] = {}
     for one in records:
@@ -233,12 +238,17 @@ def winners(records: Sequence[Record]) -> list[str]:
         first, *rest = sorted(members, key=lambda one: -(one["score"] or 0.0))
         if not rest:
             continue
-        difference, error = paired_difference(first, rest[0])
+        second = rest[0]
+        difference, error = paired_difference(first, second)
+        if difference is not None and difference < 0:
+            first, second, difference = second, first, -difference
         clear = error is not None and difference is not None and difference > 2 * error
         by = "–" if difference is None else f"{difference:.1f}"
         by += "" if error is None else f" ± {error:.1f}"
         verb = "wins" if clear else "is first, within the error"
-        found.append(f"{crowd}: {planner_title(first)} {verb}, {by} above {planner_title(rest[0])}")
+        shared = len(_segments(first) & _segments(second))
+        where = "" if _segments(first) == _segments(second) else f", in the {shared} segments that both drove"
+        found.append(f"{crowd}: {planner_title(first)} {verb}, {by} above {planner_title(second)}{where}")
     return found
 
 
