@@ -12,7 +12,7 @@ import tyro
 
 from symphony.cli.tables import print_metrics, short_name, write_numbers
 from symphony.config import EvaluateConfig, WosacSettings
-from symphony.config.evaluation import MOST_SECONDS
+from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -76,10 +76,7 @@ class Evaluate:
             raise ConfigError(
                 "--tilt goes with `symphony simulate`: the report makes up for it, these numbers don't"
             )
-        if not 0 < self.planner_seconds <= MOST_SECONDS:
-            raise ConfigError(
-                f"--planner-seconds must be above 0 and at most {MOST_SECONDS:g}, is {self.planner_seconds}"
-            )
+        check_planner_seconds(self.planner_seconds)
 
     def run(self) -> None:
         """Evaluate, print the numbers and write them."""
@@ -193,16 +190,11 @@ class Evaluate:
         print_wosac(found, aside=str(self.json) == "-")
         return wosac_parts(found, record)
 
-    def _chosen(self, store: SegmentStore) -> Sequence[int]:
-        """The run segments that are meant, by their numbers."""
-        from symphony.cli.plot import segment_indices
-
-        return segment_indices(store, self.segments) or range(len(store))
-
     def _evaluate_planner(self) -> None:
         from tempfile import TemporaryDirectory
 
         from symphony.cli.planners import table_text
+        from symphony.cli.plot import segment_indices
         from symphony.cli.simulate import Simulate, failed_runs
         from symphony.data.store import SegmentStore
         from symphony.evaluation.planners import planner_record
@@ -218,7 +210,8 @@ class Evaluate:
                 config=self.config,
             ).simulated()
             store = SegmentStore(self.data)
-            folder = folder.only(store.ids[i] for i in self._chosen(store))
+            chosen = segment_indices(store, self.segments) or range(len(store))
+            folder = folder.only(store.ids[i] for i in chosen)
             record = planner_record(folder)
             for line in failed_runs(folder):
                 sys.stderr.write(f"{line}\n")

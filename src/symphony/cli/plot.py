@@ -190,12 +190,7 @@ def segment_index(store: SegmentStore, name: str) -> int:
     Raises:
         DataError: there is no such segment.
     """
-    if name not in store.ids and name.isdecimal():
-        if int(name) >= len(store):
-            held = f"the store holds {len(store)} segments, the first is number 0"
-            raise DataError(held, file=store.path, segment=name)
-        return int(name)
-    return store.index_of(name)
+    return store.index_of(int(name) if name not in store.ids and name.isdecimal() else name)
 
 
 def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:

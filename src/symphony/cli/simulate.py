@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.config import EvaluateConfig
-from symphony.config.evaluation import MOST_SECONDS
+from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,10 +58,7 @@ class Simulate:
             raise ConfigError("--runs is a number of runs, and goes without --segments")
         if self.runs and not self.config.tilt and self.config.rollouts != EvaluateConfig.rollouts:
             raise ConfigError("--runs says how many rollouts a segment gives: it goes without --rollouts")
-        if not 0 < self.planner_seconds <= MOST_SECONDS:
-            raise ConfigError(
-                f"--planner-seconds must be above 0 and at most {MOST_SECONDS:g}, is {self.planner_seconds}"
-            )
+        check_planner_seconds(self.planner_seconds)
 
     def simulated(self) -> RolloutFolder:
         """Simulate and save."""

@@ -55,6 +55,16 @@ def persona_quantiles(text: str) -> dict[str, float]:
     return found
 
 
+def check_planner_seconds(seconds: float) -> None:
+    """Refuse a time limit that no clock can be set to.
+
+    Raises:
+        ConfigError: it is not above 0, or too long.
+    """
+    if not 0 < seconds <= MOST_SECONDS:
+        raise ConfigError(f"--planner-seconds must be above 0 and at most {MOST_SECONDS:g}, is {seconds}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
     """How agents are evaluated."""

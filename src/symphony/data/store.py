@@ -164,12 +164,17 @@ class SegmentStore(Sequence[RunSegment]):
     def _places(self) -> dict[str, int]:
         return {name: i for i, name in enumerate(self.ids)}
 
-    def index_of(self, segment_id: str) -> int:
-        """Index of a segment.
+    def index_of(self, segment_id: str | int) -> int:
+        """Index of a segment by its id, or by its number, which it is.
 
         Raises:
-            DataError: there is none of that name.
+            DataError: there is none of that name or number.
         """
+        if isinstance(segment_id, int):
+            if not 0 <= segment_id < len(self):
+                held = f"the store holds {len(self)} segments, the first is number 0"
+                raise DataError(held, file=self.path, segment=str(segment_id))
+            return segment_id
         if segment_id not in self._places:
             raise DataError("no such segment in the store", file=self.path, segment=segment_id)
         return self._places[segment_id]

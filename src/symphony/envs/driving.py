@@ -71,7 +71,6 @@ class DrivingEnv(EnvBase):
     _supports_set_state = True
     _scenes: SceneBatch | None = None
     open_traffic: bool = False
-    _ready: bool = False
 
     def __init__(
         self,
@@ -99,11 +98,11 @@ class DrivingEnv(EnvBase):
         self._rng = torch.Generator() if generator is None else generator
         if generator is None:
             self._set_seed(seed)
-        self._source_open = self.open_traffic = self.source is not None and self.source.open_traffic
         if fixed is not None:
             self.scenes = fixed
+        elif self.source is not None:
+            self.open_traffic = self.source.open_traffic
         self._make_specs()
-        self._ready = True
 
     @property
     def num_agents(self) -> int:
@@ -131,10 +130,10 @@ class DrivingEnv(EnvBase):
         """Seconds per step, that of the scenes."""
         self.decisions = int(scenes.last_step.max())
         """Actions until the last logged step of the longest scene."""
-        before = self.open_traffic
-        self.open_traffic = self._source_open or scenes.exits.shape[1] + scenes.hull.shape[1] > 0
+        before, drawn_open = self.open_traffic, self.source is not None and self.source.open_traffic
+        self.open_traffic = drawn_open or scenes.exits.shape[1] + scenes.hull.shape[1] > 0
         """Whether agents enter and leave."""
-        if self._ready and self.open_traffic != before:
+        if self.open_traffic != before:
             self._make_specs()
 
     def _make_specs(self) -> None:

@@ -110,10 +110,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             while not _usable(self.store[number]):
                 number = int(self.np_random.integers(len(self.store)))
         else:
-            number = self.store.index_of(wanted) if isinstance(wanted, str) else int(wanted)
-            if not 0 <= number < len(self.store):
-                held = f"the store holds {len(self.store)} segments, the first is number 0"
-                raise DataError(held, file=self.store.path, segment=str(number))
+            number = self.store.index_of(wanted if isinstance(wanted, str) else int(wanted))
             if not _usable(self.store[number]):
                 name = self.store.ids[number]
                 raise DataError("the ego is not seen at the first step", segment=name, field="valid")

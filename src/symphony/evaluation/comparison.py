@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from symphony.config import PaperData, Setting, TableColumns
+from symphony.config import EvaluateConfig, PaperData, Setting, TableColumns
 from symphony.errors import ConfigError
 from symphony.evaluation.entries import BASELINES, ROWS, SETTINGS, Entry, family, method_name, number
 from symphony.evaluation.paper import METRICS, paper_figures
@@ -80,8 +80,8 @@ COST = Column("cost", "CPU", "s/segment", digits=2)
 """Of the simulation of all rollouts of a segment."""
 
 
-_TRAFFIC = {"interactive": 2, "others": "log", "open_traffic": False, "radius": 0.0}
-"""Settings of an evaluation that decide what agents meet, and what they usually are: rows of a table share them."""
+_TRAFFIC = ("interactive", "others", "open_traffic", "radius")
+"""Settings of an evaluation that decide what agents meet: rows of a table share them."""
 AT_A_DISTANCE = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor", "curvature_jsd_corrected")
 """What says nothing of the log itself."""
 FLOOR = Column("curvature_jsd_floor", "JSD floor", "10⁻³", 1000.0, optional=True)
@@ -307,8 +307,11 @@ def _check_comparable(entries: Sequence[Entry]) -> None:
             )
         differing = [
             name
-            for name, usual in _TRAFFIC.items()
-            if entry.record["config"].get(name, usual) != first.record["config"].get(name, usual)
+            for name in _TRAFFIC
+            if len(
+                {each.record["config"].get(name, getattr(EvaluateConfig, name)) for each in (first, entry)}
+            )
+            > 1
         ]
         if differing:
             raise ConfigError(
