@@ -175,6 +175,17 @@ def test_a_mean_over_something_unknown_is_unknown_and_never_the_best() -> None:
     assert json.loads(as_json(comparison))["rows"][2]["ade"]["mean"] is None
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("others", "idm"), ("open_traffic", True), ("radius", 40.0), ("interactive", 8)]
+)
+def test_methods_that_met_other_traffic_are_not_compared(name: str, value: Any) -> None:
+    entries = [make_entry("bc", 0), make_entry("bc_h", 0)]
+    compare(entries, "main")
+    entries[1].record["config"][name] = value
+    with pytest.raises(ConfigError, match=rf"other traffic \({name}\)"):
+        compare(entries, "main")
+
+
 # --- the paper's own figures ---
 
 BOLD = {
@@ -397,6 +408,8 @@ def test_notes_say_what_differs_and_what_is_outdated(tmp_path: Path) -> None:
         (json.dumps(make_record() | {"config": {"search": "none"}}), r"field config\.trees"),
         (json.dumps(make_record() | {"run": None}), "field run"),
         (json.dumps(make_record() | {"segments": None}), "field segments"),
+        (json.dumps(make_record() | {"per_segment": [{}]}), "one row for each of 4 segments"),
+        (json.dumps(make_record() | {"cost": {}}), r"field cost\.simulation"),
     ],
 )
 def test_damaged_evaluations_are_named(tmp_path: Path, text: str, message: str) -> None:
