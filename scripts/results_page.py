@@ -44,7 +44,7 @@ from results_methods import (
     settings,
     sweep,
 )
-from results_roads import by_kind, by_place, unseen
+from results_roads import by_kind, by_place, elsewhere, roads, unseen
 from results_users import (
     PLACES,
     THREE,
@@ -63,7 +63,16 @@ PAGES = (
     "README.md",
     *(
         f"docs/{name}.md"
-        for name in ("results", "ablations", "roads", "appendix", "wosac", "planners", "rollouts")
+        for name in (
+            "results",
+            "ablations",
+            "roads",
+            "roads-tables",
+            "appendix",
+            "wosac",
+            "planners",
+            "rollouts",
+        )
     ),
 )
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
@@ -93,7 +102,9 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "forest": lambda: searched("forest", "town-bc_ts_h", FOREST),
     "driving-places": lambda: by_place(2),
     "roads-places-many": lambda: by_place(8),
-    "roads": lambda: by_kind(2),
+    "roads": roads,
+    "elsewhere": elsewhere,
+    "roads-kinds": lambda: by_kind(2),
     "roads-many": lambda: by_kind(8),
     "roads-unseen": unseen,
     "included": included,

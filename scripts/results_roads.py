@@ -32,7 +32,10 @@ ELSEWHERE = {
     "2-included-none": "driving/ngsim-none",
     "2-included-bc_ts_h": "driving/ngsim-replace-branch",
     "2-rate-paper": "driving/ngsim-bc",
-    **{f"2-rate-{method}": f"eight/ngsim-{method}-40" for method in ("bc", "bc_h", "bc_ts", "bc_ts_h")},
+    **{
+        f"2-rate-{method}": f"eight/ngsim-{method}-40"
+        for method in ("bc", "bc_h", "bc_ts", "bc_ts_h", "mgail_ts_h")
+    },
 }
 """Records of the table on real roads that other tables have, too."""
 UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
@@ -56,7 +59,12 @@ KINDS = {
 }
 """Collisions by kind: their headings, and the digits after their points."""
 NO_CARS = {"collision_pedestrian": ("into a pedestrian", 1), "collision_cyclist": ("into a cyclist", 1)}
+ROWS_IN_SHORT = (*(label for label, _ in ROAD_BASELINES), "BC", "BC+TS+H without its search", "BC+TS+H")
 OTHERWISE = {name: COLUMNS[name] for name in ("offroad_time", "ade", "min_sade")}
+IN_SHORT = {
+    "collision_rate": ("collisions %", 1),
+    "collision_with_playback": ("with playback %", 1),
+} | OTHERWISE
 
 
 def road_rows(count: int) -> list[tuple[str, str, Record]]:
@@ -101,6 +109,29 @@ def by_kind(count: int) -> Grid:
     columns = KINDS | OTHERWISE
     grid = [["", "learned from", *(heading for heading, _ in columns.values())]]
     return grid + [[label, source, *figures(record, columns)] for source, label, record in road_rows(count)]
+
+
+def roads() -> Grid:
+    """The NGSIM test part in short: the rows that answer what was learned from what."""
+    grid = [["", "learned from", *(heading for heading, _ in IN_SHORT.values())]]
+    for source, label, record in road_rows(2):
+        if label in ROWS_IN_SHORT:
+            grid.append([label, source, *figures(record, IN_SHORT)])
+    return grid
+
+
+def elsewhere() -> Grid:
+    """Real roads that no agent has learned from, side by side: collisions and ADE."""
+    columns = {name: COLUMNS[name] for name in ("collision_rate", "ade")}
+    found = {
+        (data, name): records(f"roads/{data}-{name}")[0] for data in UNSEEN for _, name, _ in UNSEEN_ROWS
+    }
+    grid = [["", *(f"{title}: {heading}" for title in UNSEEN.values() for heading, _ in columns.values())]]
+    for label, name, part in UNSEEN_ROWS:
+        rows = [found[data, name] for data in UNSEEN]
+        cells = [cell for row in rows for cell in figures(row[part] if part else row, columns)]
+        grid.append([label, *cells])
+    return grid
 
 
 def unseen() -> Grid:
