@@ -45,8 +45,20 @@ def parts() -> dict[str, Any]:
 
 
 @pytest.fixture
-def saved(tmp_path: Path) -> Path:
+def signed(tmp_path: Path) -> Path:
     return save_checkpoint(tmp_path, step=7, **parts(), extra={"best": None, "seen": (1, 2.5)})
+
+
+def unsigned(manifest: dict[str, Any]) -> dict[str, Any]:
+    """As earlier versions wrote it: nothing is noticed by a checksum of the whole."""
+    return {name: value for name, value in manifest.items() if name != "sha256"}
+
+
+@pytest.fixture
+def saved(signed: Path) -> Path:
+    file = signed / MANIFEST
+    file.write_text(json.dumps(unsigned(json.loads(file.read_text()))))
+    return signed
 
 
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -77,6 +89,26 @@ def refusal(path: Path, own: dict[str, Any]) -> CheckpointError | None:
     except CheckpointError as error:
         return error
     return None
+
+
+def test_no_other_value_is_taken(signed: Path) -> None:
+    file = signed / MANIFEST
+    good = json.loads(file.read_text())
+    file.write_text(json.dumps(good))  # another layout, the same values
+    load_checkpoint(signed, **parts())
+    group = ("parts", "optimizer.adam", "state", "param_groups", 0)
+    changes = [((*group, "lr"), 0.2), ((*group, "weight_decay"), 1), (("parts", "extra", "state", "seen"), 3)]
+    changes += [(("parts", "rng", "state", "numpy", "state", "pos"), 5), (("torch",), "2.13")]
+    altered = [put(good, at, new) for at, new in changes]
+    for manifest in (*altered, {**unsigned(good), "sha257": good["sha256"]}):
+        file.write_text(json.dumps(manifest))
+        with pytest.raises(CheckpointError, match=f"{MANIFEST}.*checksum") as caught:
+            load_checkpoint(signed, **parts())
+        assert (caught.value.file, caught.value.field) == (file, "sha256")
+
+
+def test_manifests_of_earlier_versions_are_read(saved: Path) -> None:
+    assert load_checkpoint(saved, **parts()).extra["seen"] == (1, 2.5)
 
 
 def test_no_manifest_makes_loading_fail_otherwise(saved: Path) -> None:
@@ -216,7 +248,7 @@ def test_what_a_run_keeps_is_looked_at_when_it_goes_on(at: str, store: Path, tmp
     evaluated = ValidationConfig(data=store, segments=1, rollouts=1)
     train(tiny("bc", store, tmp_path / "run", validation=evaluated))
     file = checkpoints(tmp_path / "run" / "checkpoints")[-1] / MANIFEST
-    good = json.loads(file.read_text())
+    good = unsigned(json.loads(file.read_text()))
     assert good["parts"]["extra"]["state"]["best"] is not None
     for new in ("x", -1, {"step": "one", "infractions": 2}):
         file.write_text(json.dumps(put(good, ("parts", "extra", "state", at), new)))

@@ -1,7 +1,8 @@
 """Checkpoints of a training run: atomic on disk, free of pickle, resumed to the last bit.
 
 A checkpoint is a folder `step-<number>` that holds one safetensors file per module, optimizer and for the random
-number generators, and `checkpoint.json` with everything that is not a tensor and a checksum of each file.
+number generators, and `checkpoint.json` with everything that is not a tensor, a checksum of each file and one of its
+own.
 
 Why not `torchrl.checkpoint` (0.14): it reads tensors through `tensordict.load`, which unpickles a file that the
 manifest doesn't mention, if one is planted beside them; it never flushes to the disk before the rename that
@@ -35,6 +36,7 @@ FORMAT = 1
 MANIFEST = "checkpoint.json"
 _NAME = re.compile(r"step-(\d{12})")
 _PART = re.compile(r"[A-Za-z0-9_-]+")
+_CHECKSUM = "sha256"
 
 
 class Stateful(Protocol):
@@ -112,6 +114,7 @@ def save_checkpoint(
             files[f"{part}.safetensors"] = content
             entry |= {"file": f"{part}.safetensors", "sha256": hashlib.sha256(content).hexdigest()}
         manifest["parts"][part] = entry
+    manifest[_CHECKSUM] = _checksum(manifest)
     files[MANIFEST] = (json.dumps(manifest, indent=1, allow_nan=False) + "\n").encode()
     try:
         _publish(folder, final, files)
@@ -293,6 +296,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / MANIFEST
     try:
         manifest = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+        checksum = _checksum(manifest) if isinstance(manifest, dict) else ""
     except OSError as error:
         raise CheckpointError(f"no checkpoint here: {error.strerror}", file=file) from error
     except (ValueError, RecursionError) as error:
@@ -313,7 +317,19 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     for part, entry in parts.items():
         if not _is_entry(part, entry):
             raise CheckpointError("no part of a checkpoint", file=file, field=f"parts.{part[:80]}")
+    # Earlier versions wrote none. Its own name may be what was changed, hence no others are known.
+    strange = set(manifest) - {"format", "step", "torch", "parts", _CHECKSUM}
+    if strange or manifest.get(_CHECKSUM, checksum) != checksum:
+        raise CheckpointError(
+            "damaged: its checksum differs from the recorded one", file=file, field=_CHECKSUM
+        )
     return manifest
+
+
+def _checksum(manifest: Mapping[str, Any]) -> str:
+    """Of all other values that a manifest holds."""
+    held = {name: value for name, value in manifest.items() if name != _CHECKSUM}
+    return hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()
 
 
 def _refuse(text: str) -> None:
