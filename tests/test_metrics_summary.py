@@ -318,3 +318,34 @@ def test_a_rollout_whose_agents_leave_is_measured_over_the_steps_they_are_there(
     assert numbers["min_sade"] == pytest.approx(1.0)
     row = metrics.rows()[0]
     assert (row["ade"], row["min_sade"]) == (numbers["ade"], numbers["min_sade"])
+
+
+@pytest.mark.parametrize(("agents", "steps"), [(0, 1), (0, 13), (3, 50)])
+def test_padding_changes_no_bit_of_a_distance(agents, steps):
+    """A segment is padded as the longest and fullest of its batch is."""
+    inputs = random_inputs(5, batch=3, agents=3, steps=37)
+    inputs["displacement"] = (inputs["displacement"] / 4) ** 8
+    padded = dict(inputs)
+    for name in ("collided", "offroad", "displacement", "simulated", "logged"):
+        padded[name] = torch.nn.functional.pad(inputs[name], (0, steps, 0, agents))
+    assert scored(padded).rows() == scored(inputs).rows()
+
+
+def test_the_order_of_segments_changes_no_bit_of_a_metric_of_ones_own():
+    metrics = scored(random_inputs(6, batch=40))
+    values = dict(zip(sorted(metrics.segments), np.random.default_rng(0).random(40), strict=True))
+    for seed in range(9):
+        names = np.random.default_rng(seed).permutation(list(values))
+        assert metrics.mean({name: values[name] for name in names}) == metrics.mean(values)
+
+
+def test_a_group_without_anything_to_count_is_no_sample():
+    """Of two recordings of which one has no step to compare there is no error, as of one alone."""
+    inputs = random_inputs(7, batch=4) | {"groups": ["a", "a", "b", "c"]}
+    inputs["segment_ids"] = ["1", "2", "3", "4"]
+    inputs["logged"][3] = False
+    full, without = scored(inputs).compute(), scored(part(inputs, [0, 1, 2])).compute()
+    for name in ("ade", "min_sade"):
+        assert (full[name], full[f"{name}_se"]) == (without[name], without[f"{name}_se"])
+    inputs["logged"][2] = False
+    assert math.isnan(scored(inputs).compute()["ade_se"])

@@ -311,7 +311,9 @@ def total_numbers(rows: Sequence[Row]) -> Row:
     names = sorted({row["group"] for row in good})
     group = np.array([names.index(row["group"]) for row in good], np.int64)
     tilted = any(row["log_weight"] is not None for row in good)
-    heavy = np.array([math.exp(_known(row["log_weight"])) for row in good], np.float64)
+    log_weight = np.array([_known(row["log_weight"]) for row in good], np.float64)
+    # Only their ratios matter: less the largest, none is too large for a number and not all are 0.
+    heavy = np.exp(log_weight - log_weight.max(initial=-math.inf))
     if tilted:
         out["effective_runs"] = float(heavy.sum() ** 2 / (heavy**2).sum())
     for name, (of, scale, by) in _MEANS.items():
@@ -333,9 +335,13 @@ def total_numbers(rows: Sequence[Row]) -> Row:
 def grouped_mean(
     value: NDArray[np.float64], weight: NDArray[np.float64], group: NDArray[np.int64]
 ) -> tuple[float | None, float | None]:
-    """Weighted mean and its standard error over groups (linearised: groups are what was drawn independently)."""
+    """Weighted mean and its standard error over groups (linearised: groups are what was drawn independently).
+
+    Groups without weight are none.
+    """
     total, share = np.bincount(group, value * weight), np.bincount(group, weight)
-    if share.sum() == 0:
+    total, share = total[share > 0], share[share > 0]
+    if not len(share):
         return None, None
     mean = float(total.sum() / share.sum())
     count = len(total)

@@ -163,11 +163,16 @@ def summed(values: NDArray[Any], member: NDArray[np.int64] | None) -> NDArray[An
 def ratio(
     total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64] | None = None
 ) -> tuple[float, float]:
-    """Ratio of sums and its standard error over segments or groups (linearised; NaN for a single one)."""
+    """Ratio of sums and its standard error over segments or groups (linearised; NaN for a single one).
+
+    Those without anything to count are no samples: of two recordings of which one is empty there is no error.
+    """
     if weight.sum() == 0:
         return math.nan, math.nan
     rate = total.sum() / weight.sum()
     total, weight = summed(total, member), summed(weight, member)
+    some = (total != 0) | (weight != 0)
+    total, weight = total[some], weight[some]
     count = len(total)
     if count < 2:
         return float(rate), math.nan

@@ -89,11 +89,9 @@ class RolloutMetrics:
         """
         _check_shapes(len(segment_ids), simulated, collided, offroad, displacement, logged)
         compared = simulated & logged[:, None]
-        # One contiguous row per rollout, so that its sum does not depend on the batch it came in.
-        away = (
-            displacement.detach().double().masked_fill(~compared, 0.0).flatten(2).contiguous().cpu().numpy()
-        )
-        error = away.sum(-1)
+        away = displacement.detach().double().masked_fill(~compared, 0.0).flatten(2).tolist()
+        # Sums are exact, so that padding among what is summed does not change how they are rounded.
+        error = np.array([[math.fsum(rollout) for rollout in segment] for segment in away])
         if not np.isfinite(error).all():
             bad = segment_ids[int(np.argwhere(~np.isfinite(error))[0, 0])]
             raise ValueError(f"segment {bad}: displacement is not finite")
@@ -162,7 +160,7 @@ class RolloutMetrics:
 
     def mean(self, values: Mapping[str, float]) -> tuple[float, float]:
         """Mean of another number of every segment, and its standard error over the same groups; NaN is left out."""
-        known = {name: value for name, value in values.items() if math.isfinite(value)}
+        known = {name: value for name, value in sorted(values.items()) if math.isfinite(value)}
         if not known:
             return math.nan, math.nan
         member = group_numbers([self.segments[name] for name in known])
