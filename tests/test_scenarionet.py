@@ -131,6 +131,66 @@ def test_a_map_without_areas_has_the_width_of_its_lanes(tmp_path: Path) -> None:
     assert (off_road(road, spots) < 0).tolist() == [True, True, False, False, True]
 
 
+def test_a_track_of_nuscenes_does_not_stop_where_it_ends(tmp_path: Path) -> None:
+    """ScenarioNet's velocities are differences to the next position, and 0 where there is none."""
+    tree = scenario()
+    state = tree["tracks"]["8f3a"]["state"]
+    state["valid"][[10, 12, 13]] = 0
+    speed = np.arange(STEPS) * (state["valid"] > 0)
+    ends = [9, 11, STEPS - 1]
+    speed[ends] = 0
+    state["velocity"] = np.stack([speed, speed], axis=-1)
+    found = read_one("scenarionet", write(tmp_path, tree)).velocity[0, :, 0]
+    # A single state has none before it.
+    assert found[ends].tolist() == [8, 0, STEPS - 2]
+    others = np.setdiff1d(np.arange(STEPS), ends)
+    np.testing.assert_array_equal(found[others], speed[others])
+    tree["metadata"]["dataset"] = "waymo"
+    np.testing.assert_array_equal(read_one("scenarionet", write(tmp_path, tree)).velocity[0, :, 0], speed)
+
+
+def test_long_outlines_that_were_cut_up_leave_no_islands_as_road(tmp_path: Path) -> None:
+    """As ScenarioNet writes Argoverse 2: pieces of 20 points, so that only short rings are whole."""
+    tree = scenario()
+    tree["metadata"]["dataset"] = "av2"
+    features = tree["map_features"]
+    for lane in LANES:
+        features[lane].pop("polygon", None)
+        features[lane]["speed_limit_kmh"] = 136.79424
+    outline = features.pop("boundary_0")["polyline"]
+    features["boundary_00"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": outline[:3]}
+    features["boundary_020"] = {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": outline[3:]}
+    road = read_one("scenarionet", write(tmp_path, tree)).road
+    spots = np.array([(20, 0), (50, 0), (50, 4), (20, -3)])
+    assert (off_road(road, spots) < 0).tolist() == [True, True, False, False]
+    assert road.mark_type.tolist() == [MarkType.ROAD_LINE] * 4
+    assert np.isnan(road.speed_limit).all()
+
+
+def test_what_scenarionet_makes_of_nuplan(tmp_path: Path) -> None:
+    """Neighbours are all lanes of a road, in any order; stop points lie past the line; logs have many scenarios."""
+    tree = scenario()
+    tree["metadata"] |= {"dataset": "nuplan", "map": "us-ma-boston", "log_name": "2021.05.12_veh-35"}
+    del tree["metadata"]["date"]
+    features = tree["map_features"]
+    features["left"]["left_neighbor"] = ["left", "right"]
+    states = STEPS * ["TRAFFIC_LIGHT_RED"]
+    stop = (FAR + np.array([48, 0])).tolist()
+    tree["dynamic_map_states"] = {"on": {"lane": "on", "state": {"object_state": states}, "stop_point": stop}}
+    segment = read_one("scenarionet", write(tmp_path, tree))
+    assert segment.group == "nuplan us-ma-boston 2021.05.12_veh-35"
+    assert segment.road.left_neighbors.tolist() == [[0, 1]]
+    assert segment.road.right_neighbors.tolist() == [[1, 0]]
+    np.testing.assert_allclose(segment.signal_point, [(40, 0, 0)])
+
+
+def test_a_stop_point_that_was_never_named_is_where_the_lane_begins(tmp_path: Path) -> None:
+    tree = scenario()
+    light = {"lane": "on", "state": {"object_state": STEPS * [None]}, "stop_point": np.zeros(3, np.float32)}
+    tree["dynamic_map_states"] = {"on": light}
+    np.testing.assert_allclose(read_one("scenarionet", write(tmp_path, tree)).signal_point, [(40, 0, 0)])
+
+
 # What is refused
 
 

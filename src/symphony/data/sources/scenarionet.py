@@ -4,19 +4,23 @@ Pickles can do anything; these are read by :mod:`.safe_pickle`, which admits pla
 
 How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
-- ``segment_id`` is the scenario's ``id``. ``group`` is dataset, map and date where the file has them (scenes of one
-  nuScenes drive share them), else the id.
+- ``segment_id`` is the scenario's ``id``. ``group`` is dataset, map and date or log where the file has them (scenes
+  of one nuScenes drive share them, scenarios of one nuPlan log), else the id.
 - The ego is the recording vehicle (``sdc_id``). Agents are in file order; their ids are the track's names if all are
   numbers, else their place in the file, as the ego's is. Tracks that are valid at no step are left out.
 - A box size is the median over the valid states. An ego wider than long (ScenarioNet swaps the two for nuScenes) is
   turned. The position of nuScenes' ego is that of its rear axle, as logged. Cones, barriers and other things are of
   type OTHER.
+- Velocities of nuScenes are differences to the next position; at the last state of a track, where ScenarioNet writes
+  0, that of the state before is taken.
 - Coordinates are taken relative to the ego's first position, rounded to metres, z as logged.
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes): see
   :func:`.scenarionet_map.successors` and :func:`.scenarionet_map.neighbors`.
-- The boundary is the road edges, or goes round the union of the drivable areas (``boundary_…``) and the lanes' areas,
-  open where no lane goes on. nuScenes has no speed limits; the 100 km/h in its files are not taken.
-- A light is one row per lane, at the stop point logged, or where the lane begins.
+- The boundary is the road edges, or goes round the union of the drivable areas (``boundary_…``, if all are closed)
+  and the lanes' areas, open where no lane goes on. nuScenes and Argoverse 2 have no speed limits; the 100 km/h and
+  85 mph in their files are not taken.
+- A light is one row per lane, at the stop point logged, or where the lane begins: so, too, for nuPlan, for which
+  ScenarioNet names a place 8 m further on.
 """
 
 from __future__ import annotations
@@ -82,7 +86,9 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     origin[2] = 0
     dataset = str(metadata.get("dataset", ""))
     features = read_features(mapping(scenario.get("map_features"), "map_features"), dataset)
-    lane, point, state = _signals(scenario.get("dynamic_map_states") or {}, features, steps)
+    lane, point, state = _signals(scenario.get("dynamic_map_states") or {}, features, steps, dataset)
+    if dataset == "nuscenes":
+        _carry_velocity(states[..., 4:6], valid)
     numbers = all(each.isdecimal() and len(each) < 18 for each in names)
     return RunSegment(
         segment_id=name.replace("/", "_"),
@@ -107,7 +113,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
 
 
 def _group(metadata: Mapping[Any, Any], dataset: str) -> str:
-    place, date = metadata.get("map"), metadata.get("date")
+    place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
     return f"{dataset} {place} {date}" if isinstance(place, str) and isinstance(date, str) else ""
 
 
@@ -175,8 +181,14 @@ def _sizes(sizes: Doubles, valid: Bools, ego: int) -> NDArray[np.float32]:
     return to_float32(found)
 
 
+def _carry_velocity(velocity: Doubles, valid: Bools) -> None:
+    """Give the last of consecutive valid states the velocity [A, T, 2] of the one before."""
+    last = valid[:, 1:] & valid[:, :-1] & ~np.pad(valid[:, 2:], ((0, 0), (0, 1)))
+    velocity[:, 1:][last] = velocity[:, :-1][last]
+
+
 def _signals(
-    states: Any, features: Features, steps: int
+    states: Any, features: Features, steps: int, dataset: str
 ) -> tuple[NDArray[np.int32], Doubles, NDArray[np.uint8]]:
     """(lane [Q], stop point [Q, 3], state [Q, T]); one row per lane that is there."""
     index = {lane.name: k for k, lane in enumerate(features.lanes)}
@@ -195,7 +207,10 @@ def _signals(
         if lane is None or lane in found:
             continue
         stop = light.get("stop_point")
-        place = features.lanes[lane].line[:1] if stop is None else points([stop], f"{field}: stop_point")
+        place = np.zeros((0, 3)) if stop is None else points([stop], f"{field}: stop_point")
+        # Zeros are what ScenarioNet begins with, for a point that is never named.
+        if not place.any() or dataset == "nuplan":
+            place = features.lanes[lane].line[:1]
         place = np.pad(place, ((0, 0), (0, 3 - place.shape[1])))
         found[lane] = place[0], [_LIGHTS[str(state)] for state in logged]
     return (

@@ -42,6 +42,8 @@ _AREAS = {
     "SPEED_BUMP": MarkType.SPEED_BUMP,
     "DRIVEWAY": MarkType.DRIVEWAY,
 }
+_NO_LIMITS = frozenset({"nuscenes", "av2"})
+"""Datasets without speed limits: ScenarioNet writes 100 km/h for connectors, and 85 mph for all lanes."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
     lanes: list[Lane] = []
     edges: list[Doubles] = []
     outlines: list[Doubles] = []
+    pieces: list[Doubles] = []
     marks: list[tuple[Doubles, MarkType]] = []
     for key, value in features.items():
         field = f"map_features {str(key)[:60]}"
@@ -101,20 +104,26 @@ def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
         elif kind == "STOP_SIGN":
             place = points([node.get("position", ())], f"{field}: position")
             marks.append((place, MarkType.STOP_SIGN))
-        elif str(key).startswith("boundary_") and len(line) > 3 and np.allclose(line[0], line[-1]):
-            outlines.append(line[:, :2])
+        elif str(key).startswith("boundary_") and len(line) > 1:
+            closed = len(line) > 3 and np.allclose(line[0], line[-1])
+            (outlines if closed else pieces).append(line[:, :2])
         elif kind.startswith("ROAD_LINE") and len(line) > 1:
             marks.append((line, MarkType.ROAD_LINE))
     if not lanes:
         raise DataError("has no lanes", field="map_features")
+    if pieces:
+        # Long rings were cut up (Argoverse 2): without them, the islands that are whole would be all the road.
+        marks += [(line, MarkType.ROAD_LINE) for line in outlines + pieces]
+        outlines = []
     return Features(tuple(lanes), tuple(edges), tuple(outlines), tuple(marks))
 
 
 def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles, dataset: str) -> Lane:
     limit = node.get("speed_limit_kmh")
-    # nuScenes has no limits; ScenarioNet writes 100 km/h.
-    known = isinstance(limit, int | float) and 0 < limit < 300 and dataset != "nuscenes"
+    known = isinstance(limit, int | float) and 0 < limit < 300 and dataset not in _NO_LIMITS
     exits = node.get("exit_lanes")
+    # Of nuPlan, ScenarioNet names all lanes of a road, in an order that need not be theirs.
+    beside = dataset != "nuplan"
     return Lane(
         name=name,
         line=line,
@@ -122,8 +131,8 @@ def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles, data
         kind=_LANES[str(node["type"])],
         speed_limit=float(limit) / 3.6 if known and limit is not None else np.nan,
         exits=None if exits is None else _references(exits),
-        left=_references(node.get("left_neighbor", ())),
-        right=_references(node.get("right_neighbor", ())),
+        left=_references(node.get("left_neighbor", ())) if beside else (),
+        right=_references(node.get("right_neighbor", ())) if beside else (),
     )
 
 
