@@ -58,3 +58,11 @@ def test_names_are_file_names_whatever_the_store_is_called(store: str) -> None:
     name = evaluation_name(make_record() | {"data": {"name": store, "checksum": "ab" * 32}})
     assert re.fullmatch(r"[A-Za-z0-9._-]+", name)
     assert len(name) < 200
+
+
+def test_long_names_are_cut_and_differ_all_the_same() -> None:
+    """An evaluation of hours was lost where its name was too long for a file."""
+    paths = [f"measures.of.comfort.{part}:{part}_of_all_agents" for part in "abcdefgh"]
+    names = {evaluation_name(make_record(metric=[*paths, last])) for last in ("x:y", "x:z")}
+    assert len(names) == 2
+    assert max(map(len, names)) <= 200

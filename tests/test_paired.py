@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import compare
 from symphony.evaluation.entries import Entry
 from symphony.evaluation.formats import as_markdown
@@ -36,6 +36,10 @@ def test_paired_differences_are_over_what_both_have_and_over_recordings() -> Non
         assert found.means[column.key] == pytest.approx(2.0)
         assert found.errors[column.key] == pytest.approx(0.0, abs=1e-9)
     assert "12 segments of 4 groups" in found.text()
+    wrong = entry("bc_h", 1, 0.0)
+    wrong.record["per_segment"][3]["ade"] = "far"
+    with pytest.raises(DataError, match="ade"):
+        differences([entry("bc", 0, 0.0), wrong], "bc")
     with pytest.raises(ConfigError, match="not among the methods"):
         differences([entry("bc", 0, 0.0)], "mgail")
 

@@ -93,6 +93,12 @@ def test_divergences_must_differ_by_more_than_sampling(shift: float, held: bool)
     assert found.error == pytest.approx(0.001 * np.sqrt(2 / 40), rel=0.4)
 
 
+def test_what_stays_the_same_does_not_fall() -> None:
+    found = relations([entry(method, collision_rate=3.0) for method in ("bc", "bc_ts", "mgail")])
+    assert of(found, "collision_rate", "bc", "bc_ts").held is False
+    assert of(found, "collision_rate", "bc", "mgail").held is False
+
+
 def test_who_stands_is_compared_with_the_log() -> None:
     entries = [
         entry("bc", standing=16.0, standing_log=12.0),

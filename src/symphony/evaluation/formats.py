@@ -87,7 +87,7 @@ def as_markdown(comparison: Comparison) -> str:
 def as_latex(comparison: Comparison) -> str:
     """The table as a LaTeX ``tabular`` that needs no package."""
     double = comparison.dataset is not None
-    heads = [column.title.replace("curvature JSD", "curv. JSD") for column in comparison.columns]
+    heads = [_latex_text(column.title.replace("curvature JSD", "curv. JSD")) for column in comparison.columns]
     units = [
         {"%": r"\%", "10⁻³": r"$\times 10^{-3}$"}.get(column.unit, column.unit)
         for column in comparison.columns
@@ -108,7 +108,7 @@ def as_latex(comparison: Comparison) -> str:
             lines.append(r"\hline")
         last = group
         cells = _cells(row, comparison, _latex_cell)
-        name = row.name.replace("+", " + ")
+        name = _latex_text(row.name.replace("+", " + "))
         lines.append(rf"{' & '.join([name, str(len(row.seeds) or ''), *cells])} \\")
     return "\n".join([*lines, r"\hline", r"\end{tabular}"]) + "\n"
 
@@ -171,6 +171,10 @@ def _latex_cell(cell: Cell, column: Column) -> str:
         return "--"
     text = _bold(column.shown(cell.mean), cell, r"\textbf{", "}")
     return text if math.isnan(cell.error) else rf"{text} {{\scriptsize $\pm${column.shown(cell.error)}}}"
+
+
+def _latex_text(text: str) -> str:
+    return "".join(f"\\{letter}" if letter in "_%&#$" else letter for letter in text)
 
 
 def _bold(text: str, cell: Cell, before: str, after: str) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import COLUMNS, Column
-from symphony.evaluation.entries import Entry, method_name
+from symphony.evaluation.entries import Entry, method_name, number
 
 PAIRED: tuple[Column, ...] = tuple(column for column in COLUMNS if column.key != "curvature_jsd")
 """What every run segment has a number of."""
@@ -95,7 +95,7 @@ def _rows(entry: Entry, metrics: Sequence[str]) -> Rows:
         raise DataError("is missing", file=f"{entry.folder}: {entry.name}", field="per_segment")
     found: Rows = {}
     for row in rows:
-        numbers = {key: math.nan if row.get(key) is None else float(row[key]) for key in metrics}
+        numbers = {key: number(entry, {key: row.get(key)}, key) for key in metrics}
         found[str(row["segment"])] = str(row.get("group") or row["segment"]), numbers
     return found
 

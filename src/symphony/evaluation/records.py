@@ -7,6 +7,7 @@ different ones lie side by side.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import re
 from collections.abc import Iterable
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 FORMAT = 2
 """Version of a kept evaluation."""
 FOLDER = "evaluations"
+_LONGEST = 200
+"""Letters in the name of an evaluation; file systems allow 255 with what is added while a file is written."""
 
 _MEMORY = ("batch", "device", "workers", "engine")
 """Settings that change no result."""
@@ -154,7 +157,10 @@ def evaluation_name(record: dict[str, Any]) -> str:
     parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
     if "wosac" in record:
         parts.append(f"wosac{record['wosac']['config']}")
-    return "-".join(parts)
+    name = "-".join(parts)
+    if len(name) > _LONGEST:
+        name = f"{name[: _LONGEST - 13]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+    return name
 
 
 def simulation_name(config: dict[str, Any]) -> str:
@@ -224,12 +230,17 @@ def read_evaluation(file: Path) -> dict[str, Any]:
         for name in names:
             if name not in held:
                 raise DataError("is missing", file=file, field=f"{part}.{name}")
+    for part, name, kinds in (("data", "checksum", (str,)), ("cost", "simulation", (int, float))):
+        if type(record[part][name]) not in kinds:
+            raise DataError(f"is {record[part][name]!r}", file=file, field=f"{part}.{name}")
     segments, rows = record.get("segments"), record.get("per_segment")
     if type(segments) is not int or segments < 1:
         raise DataError("is missing", file=file, field="segments")
     # Included agents come without the rows of segments.
     if rows is not None and (not isinstance(rows, list) or len(rows) != segments):
         raise DataError(f"has not one row for each of {segments} segments", file=file, field="per_segment")
+    if not all(isinstance(row, dict) and "segment" in row for row in rows or ()):
+        raise DataError("has a row without a segment", file=file, field="per_segment")
     return record
 
 

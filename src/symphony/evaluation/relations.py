@@ -155,7 +155,8 @@ def _checked(one: Statement, entries: Sequence[Entry]) -> Relation:
         "near_log": one.bound - abs(value),
     }[one.kind]
     clear = abs(away) > CLEAR * error or math.isinf(value)
-    strict = one.clearly or one.kind in ("lower", "higher")
+    # What stays the same does not fall.
+    strict = one.clearly or one.kind in ("lower", "higher") or one.bound == 1.0
     held = (away > 0 if strict else away >= 0) and (clear or not one.clearly)
     return Relation(one, held, value, error, clear)
 
