@@ -205,6 +205,17 @@ def test_an_unknown_speed_limit_is_nan(path: Path) -> None:
     assert np.isnan(convert(path, scenario).road.speed_limit).tolist() == [True, False, False, False]
 
 
+@pytest.mark.parametrize("rate", [10, 15, 30, 60])
+def test_the_time_step_is_that_of_the_whole_log(path: Path, rate: int) -> None:
+    """Rounded to milliseconds, steps of 1/30 s would take a hundredth off the time."""
+    scenario = womd_scenario(steps=91)
+    jitter = np.random.default_rng(0).uniform(-2e-5, 2e-5, 91)
+    scenario.timestamps_seconds[:] = (np.arange(91) / rate + jitter).tolist()
+    write_records(path, [scenario.SerializeToString()])
+    dt = read_one("womd", path).dt
+    assert dt == (0.1 if rate == 10 else pytest.approx(1 / rate, rel=1e-4))
+
+
 def test_precision_far_from_the_origin(path: Path) -> None:
     near = convert(path, womd_scenario())
     scenario = womd_scenario()

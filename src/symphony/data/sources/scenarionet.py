@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_STEPS, check_counts
 from symphony.data.segment import AgentType, Bools, RunSegment, SignalState
-from symphony.data.sources.base import Item, Reader, to_float32
+from symphony.data.sources.base import Item, Reader, time_step, to_float32
 from symphony.data.sources.lines import Doubles
 from symphony.data.sources.safe_pickle import Array, load_plain
 from symphony.data.sources.scenarionet_map import Features, mapping, points, read_features, road_map
@@ -118,16 +118,12 @@ def _group(metadata: Mapping[Any, Any], dataset: str) -> str:
 
 
 def _time_step(scenario: Mapping[Any, Any], metadata: Mapping[Any, Any]) -> tuple[float, int]:
-    """(seconds per step to the millisecond, number of steps)."""
+    """(seconds per step, number of steps)."""
     times = numbers(metadata.get("ts"), "metadata: ts", 1)[:, 0]
     steps = scenario.get("length")
     if steps != len(times) or not 2 <= len(times) <= MAX_STEPS:
         raise DataError(f"{len(times)} for {str(steps)[:20]} steps", field="metadata: ts")
-    gaps = np.diff(times)
-    dt = round(float(np.median(gaps)), 3)
-    if not (np.isfinite(gaps).all() and dt > 0 and (np.abs(gaps - dt) <= 0.1 * dt).all()):
-        raise DataError(f"steps of {gaps.min():g} to {gaps.max():g} s are uneven", field="metadata: ts")
-    return dt, len(times)
+    return time_step(times, "metadata: ts"), len(times)
 
 
 _STATE = (("position", 3), ("heading", 1), ("velocity", 2), ("length", 1), ("width", 1), ("height", 1))

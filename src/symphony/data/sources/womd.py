@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from symphony.data.bounds import MAX_AGENTS, check_counts, check_signals
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.base import Item, Reader, codes, pairs, to_float32, unexpected
+from symphony.data.sources.base import Item, Reader, codes, pairs, time_step, to_float32, unexpected
 from symphony.data.sources.tfrecord import read_records
 from symphony.errors import DataError
 
@@ -155,17 +155,13 @@ def _name(scenario: pb.Scenario) -> str:
 
 
 def _time_step(scenario: pb.Scenario) -> tuple[float, int]:
-    """(seconds per step to the millisecond, number of steps)."""
+    """(seconds per step, number of steps)."""
     times = np.array(scenario.timestamps_seconds, np.float64)
     if len(times) < 2:
         raise DataError(f"{len(times)} steps, needs at least 2", field="timestamps_seconds")
     if not np.isfinite(times).all():
         raise DataError("not finite", field="timestamps_seconds")
-    gaps = np.diff(times)
-    dt = round(float(np.median(gaps)), 3)
-    if dt <= 0 or (np.abs(gaps - dt) > 0.1 * dt).any():
-        raise DataError(f"steps of {gaps.min():g} to {gaps.max():g} s are uneven", field="timestamps_seconds")
-    return dt, len(times)
+    return time_step(times, "timestamps_seconds"), len(times)
 
 
 def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict[int, int]]:
