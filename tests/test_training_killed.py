@@ -169,6 +169,17 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_starts_over(
     assert records(part) == records(run)
 
 
+def test_checkpoints_without_the_configuration_they_go_with_are_refused(
+    run: Path, store: Path, tmp_path: Path
+) -> None:
+    part = shutil.copytree(run, tmp_path / "part")
+    (part / "config.json").unlink()
+    for resume in (False, True):
+        with pytest.raises(ConfigError, match=r"part holds checkpoints.*config\.json is gone"):
+            train(tiny("bc", store, part, seed=99, steps=6, resume=resume))
+    assert learned(part) == learned(run)
+
+
 LOCKED = """
 import sys, time
 from pathlib import Path
@@ -229,6 +240,19 @@ def test_records_are_kept_up_to_the_checkpoint_and_never_lost_in_between(tmp_pat
     again.close()
     assert [r["step"] for r in read_metrics(tmp_path)] == [1, 2, 3, 4]
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+@pytest.mark.parametrize("bad", [b"5", b"[1]", b'{"loss": 1}', b'{"step": "x"}', b"\xff\x00", b"{" * 9000])
+def test_a_damaged_record_costs_no_others(bad: bytes, tmp_path: Path) -> None:
+    first = Tracker(tmp_path, {}, "disabled")
+    for step in range(1, 5):
+        first.log(step, {"loss": float(step)})
+    first.close()
+    lines = first.path.read_bytes().splitlines()
+    first.path.write_bytes(b"\n".join([lines[0], bad, *lines[2:], b""]))
+    again = Tracker(tmp_path, {}, "disabled", after=3)
+    again.close()
+    assert [r["step"] for r in again.kept] == [r["step"] for r in read_metrics(tmp_path)] == [1, 3]
 
 
 def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:

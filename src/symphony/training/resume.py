@@ -53,7 +53,12 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
         ]
         if changed:
             raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
-    return latest(config.out / "checkpoints")
+    found = latest(config.out / "checkpoints")
+    if found is not None and not path.exists():
+        raise ConfigError(
+            f"{config.out} holds checkpoints of a run whose config.json is gone; choose another folder"
+        )
+    return found
 
 
 def warm_start(agent: Agent, run: Path) -> None:
