@@ -14,6 +14,8 @@ from symphony.geometry import boxes_overlap
 
 MANY = 0.05
 """Share of a store's segments with overlaps above which a conversion warns."""
+BLOCK = 500_000
+"""States that are compared at a time, drivers times agents times steps."""
 TAG = "overlaps"
 """Tag of a stored segment that has some: how many pairs of agents."""
 
@@ -25,6 +27,13 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
     Touching does not count.
     """
     drivers = np.flatnonzero((segment.agent_type == AgentType.VEHICLE) & (travel(segment) > MOVING))
+    rows = max(BLOCK // segment.valid.size, 1)
+    found = [_pairs(segment, drivers[k : k + rows]) for k in range(0, len(drivers), rows)]
+    return np.unique(np.concatenate([np.zeros((0, 2), np.int64), *found]), axis=0)
+
+
+def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """[P, 2] pairs of one of the drivers and anybody, each in order, once for each step of an overlap."""
     position = segment.position[..., :2].astype(np.float64)
     size = segment.size[:, :2].astype(np.float64)
     radius = np.hypot(*size.T) / 2
@@ -42,8 +51,7 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
         return tuple(map(torch.from_numpy, (position[rows, step], heading, size[rows])))
 
     hit = boxes_overlap(*boxes(one), *boxes(other)).numpy()
-    pairs = np.sort(np.stack([one[hit], other[hit]], axis=-1), axis=1)
-    return np.unique(pairs, axis=0)
+    return np.sort(np.stack([one[hit], other[hit]], axis=-1), axis=1)
 
 
 def tags(segment: RunSegment) -> dict[str, int] | None:
