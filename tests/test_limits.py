@@ -222,14 +222,17 @@ def test_options_out_of_range(option: dict[str, float], tmp_path: Path) -> None:
         convert(FakeReader(), [tmp_path], tmp_path / "out", **option)  # type: ignore[arg-type]
 
 
-def test_names_of_files_that_are_not_text(tmp_path: Path) -> None:
-    path = tmp_path / "\udcff.scene"
+@pytest.mark.parametrize("name", ["\udcff.scene", "\udcff/a.scene"])
+def test_names_of_files_that_are_not_text(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
     try:
+        path.parent.mkdir(exist_ok=True)
         path.write_text("straight 1")
     except (OSError, UnicodeError):
         pytest.skip("this file system has no such names")
     with pytest.raises(DataError, match="not UTF-8"):
         convert(FakeReader(), [tmp_path], tmp_path / "out")
+    assert not list(tmp_path.glob("out*"))
 
 
 def test_reports_that_are_none(tmp_path: Path) -> None:

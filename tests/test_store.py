@@ -62,6 +62,14 @@ def test_numpy_scalars_become_plain_numbers(folder: Path) -> None:
     assert hashes(SegmentStore(folder)) == hashes([plain])
 
 
+def test_numpy_text_becomes_plain_text(folder: Path) -> None:
+    """Names out of an array are written otherwise in its content, and would come back as damage."""
+    plain = straight_road()
+    names = {name: np.str_(getattr(plain, name)) for name in ("segment_id", "source", "file", "group")}
+    fill(folder, [plain.replace(**names)])
+    assert hashes(SegmentStore(folder)) == hashes([plain])
+
+
 def test_tags_come_back(folder: Path) -> None:
     with StoreWriter(folder) as writer:
         writer.append(straight_road(seed=1), tags={"split": "test", "stadt": "Köln", "n": [1, 2]})

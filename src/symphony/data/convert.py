@@ -303,9 +303,9 @@ def expand(files: Iterable[str | Path], patterns: tuple[str, ...]) -> list[Path]
     if not found:
         raise DataError("no files given")
     for path in found:
-        # Reports are UTF-8; a name that is not could be neither written nor found again.
-        if any(0xD800 <= ord(letter) <= 0xDFFF for letter in path.name):
-            raise DataError("a file's name that is not UTF-8: give it another", file=path)
+        # Journals and reports are UTF-8; a name that is not could be neither written nor found again.
+        if any(0xD800 <= ord(letter) <= 0xDFFF for letter in str(path.absolute())):
+            raise DataError("the name of a file or of its folder is not UTF-8: give it another", file=path)
     return list(dict.fromkeys(found))
 
 

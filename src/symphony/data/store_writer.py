@@ -176,8 +176,10 @@ class StoreWriter:
 
 
 def _plain(segment: RunSegment) -> RunSegment:
-    """Python scalars in place of NumPy's, which would enter the content hash."""
-    return segment.replace(dt=float(segment.dt), ego=int(segment.ego), current_step=int(segment.current_step))
+    """Python scalars and text in place of NumPy's, which would enter the content hash."""
+    texts = {name: str(getattr(segment, name)) for name in ("segment_id", "source", "file")}
+    numbers = {"dt": float(segment.dt), "ego": int(segment.ego), "current_step": int(segment.current_step)}
+    return segment.replace(**texts, **numbers)
 
 
 def _tags_text(segment: RunSegment, tags: Mapping[str, Any] | None) -> str:
