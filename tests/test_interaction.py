@@ -187,6 +187,15 @@ def test_headings_that_are_not_those_of_the_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(still.heading[3], 1.25, rtol=1e-6)
 
 
+@pytest.mark.parametrize("every", [2, 8, 10])
+def test_velocities_from_positions_at_every_rate(every: int, tmp_path: Path) -> None:
+    """Up to steps of a second, the longest that are read."""
+    rows = [row for row in raw() if int(row.split(",")[2]) % (100 * every) == 0]
+    found = read_one("interaction", public(tmp_path, rows), motion="positions")
+    assert found.dt == every / 10
+    np.testing.assert_allclose(found.velocity, np.broadcast_to((10, 0), found.velocity.shape), atol=1e-3)
+
+
 def test_states_logged_twice(tmp_path: Path) -> None:
     rows = [*CARS, track(3)[7].replace("7.0000,2.0000", "7.2000,2.1000")]
     path = public(tmp_path, rows)

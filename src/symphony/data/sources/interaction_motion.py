@@ -27,7 +27,8 @@ def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
         valid: [A, T].
         dt: seconds per step.
     """
-    _, slope, _ = local_line(state[..., :2], valid, dt, SIGMA)
+    # The line reaches over 4 sigma: at least to the next step.
+    _, slope, _ = local_line(state[..., :2], valid, dt, max(SIGMA, dt / 4))
     found = state.copy()
     found[..., 2:4] = slope
     course = _nearest_course(found, valid)
