@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
 from symphony.agents import Agent, build_agent
-from symphony.collectors import BeamSearchResult, KeepAll, KeepBest
+from symphony.collectors import Aggregate, BeamSearchResult, KeepAll, KeepBest
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
@@ -31,12 +31,13 @@ from symphony.evaluation import evaluate
 from symphony.modules import SeededNoise
 from symphony.simulation import simulate
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import simulated
+from symphony.simulation.driving import simulated, simulation
 from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of
 from symphony.simulation.search import ENDED, flag_score, search
 
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=3)
 KINDS = ("none", "tree", "oracle", "best")
+at_the_end = Aggregate("last")
 
 
 def make_agent(seed: int = 0, discriminator: int = 0, **changes: Any) -> Agent:
@@ -252,6 +253,38 @@ def test_no_rollout_depends_on_the_order_of_segments(dataset: SceneDataset, agen
         (mixed.collision, sorted_.collision[order]),
     ):
         assert torch.equal(a[real], b[real])
+
+
+@pytest.mark.parametrize(
+    ("rule", "trees", "aggregate"),
+    [("replace", 1, "max_then_sum"), ("replace", 2, "mean_then_sum"), ("best", 2, "mean_then_sum")],
+)
+def test_longer_segments_beside_it_choose_no_leaves(
+    dataset: SceneDataset, agent: Agent, rule: Any, trees: int, aggregate: str
+) -> None:
+    agent = searching(agent, rule=rule, aggregate=aggregate, threshold=0.1)
+    config = EvaluateConfig(rollouts=4, trees=trees)
+    scenes = dataset.scenes(range(4))
+    together = simulation(agent, scenes, config)
+    for item in range(4):
+        alone = simulation(agent, dataset.scenes([item]), config)
+        steps = alone.rollouts.state.shape[2]
+        assert torch.equal(together.rollouts.state[item][:, :steps], alone.rollouts.state[0])
+        assert torch.equal(together.goal[item], alone.goal[0])
+        assert together.search is not None
+        assert alone.search is not None
+        periods = alone.search.slots.shape[-2]
+        assert torch.equal(together.search.slots[item][:, :periods], alone.search.slots[0])
+        assert torch.equal(together.search.scores[item][:, :, : steps - 1], alone.search.scores[0])
+
+
+def test_the_best_is_the_best_up_to_the_end(dataset: SceneDataset, agent: Agent) -> None:
+    agent = searching(agent, aggregate=f"{__name__}:at_the_end")
+    config = EvaluateConfig(search="best", rollouts=2)
+    together = simulated(agent, dataset.scenes(range(4)), config)
+    for item in range(4):
+        alone = simulated(agent, dataset.scenes([item]), config)
+        assert torch.equal(together.state[item][:, : alone.state.shape[2]], alone.state[0])
 
 
 @pytest.mark.parametrize("kind", KINDS)

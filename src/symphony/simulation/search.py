@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,6 +25,7 @@ from symphony.collectors import (
     max_then_sum,
     mean_then_sum,
 )
+from symphony.collectors.result import ranking
 from symphony.collectors.rules import takes_groups
 from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
@@ -77,8 +80,21 @@ def pruning_rule(config: SearchConfig) -> PruningRule:
 
 
 def aggregate_of(config: SearchConfig) -> Callable[[Tensor], Tensor]:
-    """From scores of steps and agents to one per branch."""
-    return load_object(config.aggregate) if ":" in config.aggregate else AGGREGATES[config.aggregate]
+    """From scores of steps and agents to one per branch; what lies past a scene's end has no say in it."""
+    found = load_object(config.aggregate) if ":" in config.aggregate else AGGREGATES[config.aggregate]
+    # The largest score is none past the end anyway.
+    return found if found is max_then_sum else partial(_until_the_end, found)
+
+
+def _until_the_end(
+    aggregate: Callable[[Tensor], Tensor], scores: Float[Tensor, "*b S T N"]
+) -> Float[Tensor, "*b S"]:
+    """Totals of the steps before the scenes' ends; where none is, those of scores that are all the same."""
+    found, going = aggregate(scores), (scores != ENDED).all(-1).sum(-1)
+    for count in going.unique().tolist():
+        if 0 < count < scores.shape[-2]:
+            found = torch.where(going == count, aggregate(scores[..., :count, :].contiguous()), found)
+    return found
 
 
 def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
@@ -174,7 +190,7 @@ def search(
     also: Sequence[keys.Key] = (),
     tilt: Tilt | None = None,
 ) -> BeamSearchResult:
-    """Beam search from a start state [..., S] to the last logged step.
+    """Beam search from a start state [..., S] to the last logged step. Scenes beside each other change nothing.
 
     Args:
         env: the environment.
@@ -185,7 +201,7 @@ def search(
         rule: which branches go on.
         prune_every: T_p.
         aggregate: from scores of steps and agents to one per branch.
-        leaves: return only so many of each tree, the best of the last period; by default all.
+        leaves: return only so many of each tree, the best of their scene's last period; by default all.
         keep_tree: also return the pruned branches.
         retries: how often a period is simulated again, from its start, for branches that end it with a total above
             ``retry_above``.
@@ -195,7 +211,9 @@ def search(
         tilt: importance of rare manoeuvres.
     """
     steps = env.decisions
-    return beam_search(
+    # The last period of all says nothing of which leaves of a shorter scene are the best.
+    mixed = bool((env.scenes.last_step < steps).any())
+    found = beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
         realism_score(env, discriminator, ego=ego),
@@ -205,7 +223,7 @@ def search(
         rule=rule,
         aggregate=aggregate,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
-        leaves=leaves,
+        leaves=None if mixed else leaves,
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         group_key=keys.GOAL if takes_groups(rule) else None,
@@ -215,6 +233,27 @@ def search(
         retry_above=retry_above if retries else None,
         reseed=_reseed,
         tilt=tilt,
+    )
+    return found if leaves is None or not mixed else _best(env, found, start, leaves)
+
+
+def _best(env: DrivingEnv, found: BeamSearchResult, start: TensorDictBase, leaves: int) -> BeamSearchResult:
+    """Only so many leaves, the best of the last period of their scene."""
+    decisions = env.scenes.last_step[start.get(keys.SCENE)[..., 0, 0]]
+    last = (-(-decisions // found.prune_every) - 1).clamp_min(0)[..., None, None]
+
+    def at_the_end(values: Tensor) -> Tensor:
+        return values.gather(-2, last.expand(*last.shape[:-1], values.shape[-1]))[..., 0, :]
+
+    best = ranking(at_the_end(found.totals).detach(), at_the_end(found.slots))[..., :leaves]
+    rows = torch.meshgrid(*(torch.arange(k, device=best.device) for k in best.shape), indexing="ij")[:-1]
+    weights = found.log_weights
+    return replace(
+        found,
+        trajectories=found.trajectories[(*rows, best)],
+        scores=found.scores[(*rows, best)],
+        slots=found.slots.gather(-1, best[..., None, :].expand(*found.slots.shape[:-1], leaves)),
+        log_weights=None if weights is None else weights.gather(-1, best),
     )
 
 
