@@ -144,6 +144,16 @@ def test_planners_that_share_their_memory_are_taken_for_another() -> None:
     assert any("taken for another" in why for each in found.failed for why in each.values())
 
 
+def test_without_a_search_there_is_nothing_to_repeat() -> None:
+    once, repeated = (
+        simulated(odd([0.0] * 3), count=1, rollouts=2, retries=retries, retry_above=0.0) for retries in (0, 2)
+    )
+    assert torch.equal(once.rollouts.state, repeated.rollouts.state)
+    assert set(repeated.failed[0]) == {0, 1}
+    assert repeated.failed == once.failed
+    assert simulated(Locked, count=1, rollouts=2, retries=2).failed == ({},)
+
+
 def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
     assert simulated(Locked).failed == ({}, {})
     with pytest.raises(ConfigError, match=r"'mine' can't be copied.*--search none"):

@@ -122,8 +122,10 @@ def simulation(
     start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
     settings, planned = config.pruning(agent.search), None
     if egos is not None:
-        keep_every = settings.prune_every if config.retries else 0
-        forked = search_kind(agent, config) not in ("none", "log")
+        kind = search_kind(agent, config)
+        # Nothing else simulates a period again.
+        keep_every = settings.prune_every if config.retries and kind in ("tree", "oracle") else 0
+        forked = kind not in ("none", "log")
         start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
