@@ -202,6 +202,19 @@ def test_progress_is_along_the_route_and_relative_to_the_log() -> None:
     assert found[1]["log_distance"] == pytest.approx(0.5 * 2 * np.arange(1, 11).mean(), rel=1e-5)
 
 
+@pytest.mark.parametrize("known", [slice(0, 5), slice(3, 11)])
+@pytest.mark.parametrize("routes", [[], [np.array([[-50, 0], [300, 0.0]])]])
+def test_progress_is_relative_to_the_log_while_there_is_one(known: slice, routes: list[Any]) -> None:
+    """Who drives as the log does gets on as far, also where the log has lost it for a part of the time."""
+    segment = driving((0, 0, 0, 10), steps=11)
+    saved, valid = played(segment), np.zeros_like(segment.valid)
+    valid[:, known] = True
+    lines, goal = Polylines.of(routes), np.full((1, 1), len(routes) - 1)
+    (row,) = rows(dataclasses.replace(saved, segment=segment.replace(valid=valid), routes=lines, goal=goal))
+    assert row["progress"] == pytest.approx(20 if valid[0, 0] else 18, abs=1e-4)
+    assert row["progress_ratio"] == pytest.approx(1)
+
+
 def red(states: Any = SignalState.STOP, **changes: Any) -> list[tuple[int, int]]:
     """Step and light of every red light that a car runs which comes from the south and goes straight on."""
     segment = crossing(1, steps=31, seed=0, **changes)

@@ -125,9 +125,10 @@ def wrong_way(world: World, evaluated: Indices, graph: LaneGraph) -> Bools:
 
 
 class Progress(NamedTuple):
-    """Metres [K, M] that evaluated agents got on, and that the log got on likewise."""
+    """Metres [K, M] that evaluated agents got on in all, that they did while the log has them, and the log itself."""
 
     driven: Reals
+    compared: Reals
     logged: Reals
 
 
@@ -149,11 +150,14 @@ def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     lines = [np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in routes]
     has = np.append(counts > 1, False)[goal]
     along = np.array(lines, np.float64).reshape(-1, most, 2)[np.cumsum(counts > 0)[goal[has]] - 1]
-    driven, logged = _length(path, there), np.broadcast_to(_length(log, seen), goal.shape).copy()
-    driven[has] = _advance(along, path[has], there[has])
+    both = there & seen
+    driven, compared = _length(path, there), _length(path, both)
+    logged = np.broadcast_to(_length(log, seen), goal.shape).copy()
+    places = stations_along(along, path[has], there[has])
+    driven[has], compared[has] = _advance(places, there[has]), _advance(places, both[has])
     number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)[has]
-    logged[has] = _advance(along, log[number], seen[number])
-    return Progress(driven, logged)
+    logged[has] = _advance(stations_along(along, log[number], seen[number]), seen[number])
+    return Progress(driven, compared, logged)
 
 
 def _length(path: Reals, valid: Bools) -> Reals:
@@ -162,11 +166,10 @@ def _length(path: Reals, valid: Bools) -> Reals:
     return np.where(valid[..., 1:] & valid[..., :-1], strides, 0).sum(-1)
 
 
-def _advance(lines: Reals, path: Reals, valid: Bools) -> Reals:
-    """Metres [R] along lines [R, P, 2] from the first to the last valid point of paths [R, U, 2]."""
-    row, last = np.arange(len(path)), valid.shape[1] - 1 - valid[:, ::-1].argmax(1)
-    along = stations_along(lines, path, valid)
-    return np.where(valid.any(1), along[row, last] - along[row, valid.argmax(1)], 0.0)
+def _advance(places: Reals, counted: Bools) -> Reals:
+    """Metres [R] from the first to the last counted one of places along lines [R, U]."""
+    row, last = np.arange(len(places)), counted.shape[1] - 1 - counted[:, ::-1].argmax(1)
+    return np.where(counted.any(1), places[row, last] - places[row, counted.argmax(1)], 0.0)
 
 
 class Comfort(NamedTuple):

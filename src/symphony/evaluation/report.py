@@ -213,7 +213,7 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
                 "min_ttc": _finite(ttc.min(initial=math.inf)),
                 "low_ttc_time": _percent((ttc < LOW_TTC).sum(), steps),
                 "progress": float(moved.driven[k].mean()) if len(who) else None,
-                "progress_ratio": float(moved.driven[k].sum()) / logged_progress
+                "progress_ratio": float(moved.compared[k].sum()) / logged_progress
                 if logged_progress > 1
                 else None,
                 "max_acceleration": _peak(motion.acceleration[k]),
