@@ -20,6 +20,7 @@ from tensordict.nn import (
 from torch import nn
 from torch.distributions import Categorical, Independent, Normal
 from torch.nn import functional
+from torchrl.modules import MaskedCategorical, OneHotCategorical
 from torchrl.objectives import BCLoss as TorchRLBCLoss
 
 from symphony.objectives import BCLoss
@@ -309,6 +310,50 @@ def test_bad_inputs_are_refused():
     td[VALID] = td[VALID][:, :1]
     with pytest.raises(ValueError, match=r"mask .* has shape \(5, 1\).*\(5, 3\)"):
         loss(td)
+
+
+@pytest.mark.parametrize("shape", [(6, 1), (6, 6), (1,), ()])
+def test_an_action_of_another_shape_is_refused_where_it_would_be_broadcast(shape):
+    loss, td = BCLoss(categorical_actor(action="action"), use_mask=False), TensorDict(batch_size=[])
+    loss.set_keys(action="action")
+    td[OBSERVATION], td["action"] = torch.randn(6, 4), torch.zeros(shape, dtype=torch.int64)
+    with pytest.raises(ValueError, match="action 'action' has shape"):
+        loss(td)
+    loss = BCLoss(gaussian_actor())
+    loss.set_keys(action="action")
+    with pytest.raises(ValueError, match=r"has shape \(5, 1\), the actor's are \(5, 2\)"):
+        loss(TensorDict(observation=torch.randn(5, 4), action=torch.randn(5, 1), batch_size=[5]))
+
+
+def other_actor(kind):
+    """Logits [..., 7] of the network are those of another categorical, one that may have a mask."""
+    actor = categorical_actor()
+    keys = {"logits": LOGITS, "mask": "mask"} if kind is MaskedCategorical else {"logits": LOGITS}
+    head = ProbabilisticTensorDictModule(in_keys=keys, out_keys=[ACTION], distribution_class=kind)
+    return ProbabilisticTensorDictSequential(actor[0], head)
+
+
+@pytest.mark.parametrize("agents", [3, 7])
+@pytest.mark.parametrize("smoothing", [0.0, 0.2])
+def test_one_hot_actions_are_those_of_their_indices(agents, smoothing):
+    td = batch(4, agents=agents)
+    one_hot = td.clone().set(ACTION, functional.one_hot(td[ACTION], 7))
+    wanted = BCLoss(categorical_actor(), label_smoothing=smoothing)(td)
+    found = BCLoss(other_actor(OneHotCategorical), label_smoothing=smoothing)(one_hot)
+    torch.testing.assert_close(dict(found.items()), dict(wanted.items()))
+
+
+def test_label_smoothing_expects_nothing_of_categories_that_are_impossible():
+    td = batch(5)
+    td[ACTION] = td[ACTION] % 4
+    td["mask"] = (torch.arange(7) < 4).expand(5, 3, 7)
+    found = BCLoss(other_actor(MaskedCategorical), label_smoothing=0.2)(td)
+    found["loss_bc"].backward()
+    actor = categorical_actor()
+    last = actor[0].module[-1]
+    last.weight, last.bias = nn.Parameter(last.weight[:4]), nn.Parameter(last.bias[:4])
+    fewer = BCLoss(actor, label_smoothing=0.2)(td)
+    torch.testing.assert_close(found["loss_bc"], fewer["loss_bc"])
 
 
 def test_it_works_where_nothing_knows_of_driving():

@@ -156,7 +156,8 @@ class ActorLoss(MaskedLoss):
     Args:
         actor_network: probabilistic module with a `get_dist`.
         reduction: see :class:`MaskedLoss`.
-        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
+        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
+            only.
         use_mask: see :class:`MaskedLoss`.
     """
 
@@ -190,6 +191,14 @@ class ActorLoss(MaskedLoss):
         with self.actor_network_params.to_module(self.actor_network):
             dist = self.actor_network.get_dist(tensordict.copy())
         counted = self._counted(tensordict, dist.batch_shape, action.device)
+        # TorchRL's one-hot categoricals are Categoricals, too, and give the shape of an index as their own.
+        one_hot = isinstance(dist, Categorical) and action.shape == dist.logits.shape != counted.shape
+        if not one_hot and action.shape != dist.batch_shape + dist.event_shape:
+            # It would be broadcast, to the mean over pairs of actions and distributions of others.
+            expected = tuple(dist.batch_shape + dist.event_shape)
+            raise ValueError(
+                f"action {self.tensor_keys.action!r} has shape {tuple(action.shape)}, the actor's are {expected}"
+            )
         # A padded entry may hold anything, such as an index that is none.
         fitted = counted.reshape(counted.shape + (1,) * (action.ndim - counted.ndim))
         action = torch.where(fitted, action, torch.zeros_like(action))
@@ -198,9 +207,10 @@ class ActorLoss(MaskedLoss):
             return Fit(cost, cost.detach(), counted, None, None)
         nll = cost.detach()
         if self.label_smoothing:
-            cost = (1.0 - self.label_smoothing) * cost - self.label_smoothing * dist.logits.mean(-1)
+            cost = (1.0 - self.label_smoothing) * cost + self.label_smoothing * _even(dist.logits)
         with torch.no_grad():
-            hit = (dist.logits.argmax(-1) == action).to(dist.logits.dtype)
+            index = action.argmax(-1) if one_hot else action
+            hit = (dist.logits.argmax(-1) == index).to(dist.logits.dtype)
             return Fit(cost, nll, counted, dist.entropy(), hit)
 
     def _statistics(self, fit: Fit, counted: Bool[Tensor, "*b"]) -> dict[str, Float[Tensor, "*_"]]:
@@ -214,8 +224,14 @@ class ActorLoss(MaskedLoss):
         }
 
 
+def _even(logits: Float[Tensor, "*b C"]) -> Float[Tensor, "*b"]:
+    """Negative log-likelihood of a target spread evenly over all categories that are possible at all."""
+    possible = logits > -torch.inf
+    return -torch.where(possible, logits, 0.0).sum(-1) / possible.sum(-1)
+
+
 def _is_categorical(actor: Any) -> bool:
-    """Whether the actor's distribution is a torch Categorical (over indices)."""
+    """Whether the actor's distribution is a torch Categorical (over indices, or one-hot as TorchRL's)."""
     heads = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
     kind = heads[-1].distribution_class if heads else None
     return isinstance(kind, type) and issubclass(kind, Categorical)

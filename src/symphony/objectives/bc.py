@@ -21,7 +21,8 @@ class BCLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`.
         reduction: `"mean"` over the valid entries (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[...]` of the log-probability, with zeros at invalid entries.
-        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
+        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
+            only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_bc`, and for categorical actors, detached, `entropy` of the actor and `accuracy` of its mode
@@ -29,7 +30,7 @@ class BCLoss(ActorLoss):
 
     Raises:
         KeyError: at the call, if the action or the mask is missing.
-        ValueError: for a bad `label_smoothing` or `reduction`, or a mask of another shape than the log-probability.
+        ValueError: for a bad `label_smoothing` or `reduction`, or an action or a mask of another shape.
     """
 
     @dataclass

@@ -25,7 +25,8 @@ class DistillationLoss(ActorLoss):
         survivors: rollouts to learn from: `"all"` that survived, or of each tree only the `"best"`.
         reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
             `[...]` of the log-probability: rollout entries times the weight, zeros where an entry does not count.
-        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
+        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
+            only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted, without label smoothing);
@@ -34,7 +35,7 @@ class DistillationLoss(ActorLoss):
 
     Raises:
         KeyError: at the call, if the action, a flag or the mask is missing.
-        ValueError: for a bad argument, or flags of another shape than the log-probability.
+        ValueError: for a bad argument, or an action or flags of another shape.
     """
 
     @dataclass
