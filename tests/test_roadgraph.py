@@ -137,6 +137,15 @@ def test_wrong_way_and_far_away_have_no_lane():
     assert starting_lanes(graph, [20, 0], np.pi) == []
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_what_is_not_finite_is_on_no_lane_and_not_silently(number):
+    graph = LaneGraph(crossing()[0])
+    for vehicle in ([number, 0.0, 0.0], [0.0, 0.0, number]):
+        states = np.array([[0.0, 0.0, 0.0], vehicle])
+        with pytest.raises(ValueError, match="vehicle \\[1\\]"):
+            lane_of(graph, states[:, :2], states[:, 2])
+
+
 def test_heading_decides_between_overlapping_lanes():
     lines = {"east": straight((-20, 0), (20, 0)), "slant": straight((-20, -10), (20, 10))}
     road, name = make_road(lines)

@@ -42,8 +42,14 @@ def lane_of(
         heading: [...] radians.
         tolerance: largest distance from the centre line, metres.
         max_turn: largest angle to the lane, radians.
+
+    Raises:
+        ValueError: a position or heading that is not finite; names the vehicle.
     """
     position = np.asarray(position, dtype=np.float64)
+    wrong = np.argwhere(~(np.isfinite(position).all(-1) & np.isfinite(heading)))
+    if len(wrong):
+        raise ValueError(f"vehicle {wrong[0].tolist()}: a position or heading that is not finite")
     result = np.full(position.shape[:-1], -1, dtype=np.int64)
     near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance, max_turn)
     smallest = np.full(result.size, np.inf)
