@@ -16,7 +16,7 @@ from helpers_segments import crossing, hide, straight_road
 from symphony.cli import main
 from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.data.sources.commonroad import CommonRoadReader
-from symphony.simulation.export import commonroad
+from symphony.simulation.export import commonroad, to_dict
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_files import About, save_rollouts
 from symphony.simulation.world import World, world_of
@@ -102,6 +102,13 @@ def test_agents_that_are_lost_and_odd_ids_stay_apart(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first | second, segment.valid[2])
     assert not (first & second).any()
     assert AgentType.CYCLIST in again.agent_type
+
+
+def test_a_run_that_failed_at_once_is_a_scenario_without_anybody() -> None:
+    saved = played(straight_road(1), failed={0: "why"})
+    saved.counted[:] = False
+    assert "dynamicObstacle" not in commonroad(saved, 0)
+    assert to_dict(saved, 0)["agents"] == []
 
 
 def test_the_command_writes_a_file_for_each_rollout(

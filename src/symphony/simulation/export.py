@@ -68,9 +68,9 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
         _text(location, tag, value)
     ET.SubElement(ET.SubElement(root, "scenarioTags"), "simulated")
     obstacles = _obstacles(saved, rollout)
-    _Network(
-        segment, slice(saved.start, saved.last + 1), 1 + max(int(o.get("id", 0)) for o in obstacles)
-    ).add(root)
+    # Of a run that failed at once nobody may be left.
+    taken = max((int(obstacle.get("id", 0)) for obstacle in obstacles), default=0)
+    _Network(segment, slice(saved.start, saved.last + 1), 1 + taken).add(root)
     root.extend(obstacles)
     ET.indent(root)
     return "<?xml version='1.0' encoding='UTF-8'?>\n" + ET.tostring(root, encoding="unicode") + "\n"
