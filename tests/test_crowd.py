@@ -440,7 +440,7 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:
     config = EvaluateConfig(rollouts=2, search="none")
     goal = simulation(tiny(), scenes, config, given=chosen).goal
     assert (goal[..., 1] == chosen[0, 1]).all()
-    for bad in ("7", "7=", "x=1,2", "7=1", "7=a,b", "7=lane:99", "12345=lane:100", "7=9e9,0"):
+    for bad in ("7", "7=", "x=1,2", "7=1", "7=a,b", "7=lane:99", "12345=lane:100", "7=9e9,0", "--7=1,2"):
         with pytest.raises(ConfigError, match="goal"):
             given_goals([bad], [segment], scenes)
     with pytest.raises(ConfigError, match="planner drives"):

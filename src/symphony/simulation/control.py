@@ -81,7 +81,7 @@ def given_goals(
     found = torch.full(scenes.interactive.shape, -1, dtype=torch.int64)
     for goal in goals:
         agent, _, where = goal.partition("=")
-        if not agent.lstrip("-").isdecimal() or not where:
+        if not agent.removeprefix("-").isdecimal() or not where:
             raise ConfigError(f"a goal is AGENT=lane:ID or AGENT=X,Y, not '{goal}'")
         for b, segment in enumerate(segments):
             row = np.flatnonzero(segment.agent_id == int(agent))
