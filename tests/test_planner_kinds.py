@@ -223,6 +223,7 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
         assert agents.id.tolist() == segment.agent_id[others].tolist()
         assert set(agents.type) == {"vehicle"}
         assert len(one.lanes) == len(segment.road.lanes)
+        assert not any(lane.points.flags.writeable for lane in one.lanes)
         assert {n for lane in one.lanes for n in lane.successors} <= {lane.id for lane in one.lanes}
         assert one.route.ndim == 2
 

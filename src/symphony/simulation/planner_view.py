@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, SignalState
-from symphony.simulation.planner import Reals, Scenario, Traffic
+from symphony.simulation.planner import Reals, Scenario, Traffic, fixed
 
 TYPES = np.array([kind.name.lower() for kind in AgentType])
 STATES = np.array([state.name.lower() for state in SignalState])
@@ -105,7 +105,7 @@ def lanes_of(scenario: Scenario) -> tuple[Lane, ...]:
     return tuple(
         Lane(
             int(road.lane_id[k]),
-            road.lanes[k][:, :2].astype(np.float64),
+            fixed(road.lanes[k][:, :2].astype(np.float64)),
             float(road.speed_limit[k]),
             tuple(after.get(k, ())),
         )
