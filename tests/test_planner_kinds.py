@@ -316,6 +316,24 @@ def test_a_first_place_is_clear_only_beyond_two_standard_errors() -> None:
     assert "b is first, within the error, 3.3" in close
 
 
+def test_damaged_records_of_planners_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "record.json"
+    whole = json.loads((Path(__file__).parents[1] / "results/planners/0-log-idm.json").read_text())
+    file.write_text(json.dumps(whole))
+    assert read_planner_record(file) == whole
+    runs = whole["per_run"]
+    for field, value in (
+        ("settings", None),
+        ("store", {}),
+        ("score", "high"),
+        ("per_run", {}),
+        ("per_run", [*runs[:-1], {"segment": "a"}]),
+    ):
+        file.write_text(json.dumps(whole | {field: value}))
+        with pytest.raises(DataError, match=rf"record\.json, field {field}"):
+            read_planner_record(file)
+
+
 def test_a_search_that_is_kept_says_whether_it_flatters_the_ego(store: Path, tmp_path: Path) -> None:
     folder = run(store, tmp_path / "sim", "idm", search="tree", branches=4, rule="best", prune_every=4)
     found = planner_record(folder)["search"]

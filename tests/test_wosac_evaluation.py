@@ -265,6 +265,15 @@ def test_the_table_of_scores(
     two.write_text("{}")
     with pytest.raises(DataError, match=r"two\.json, field config: is missing"):
         read_wosac(two)
+    for part, name, damaged in (
+        ("agents", f"{RANDOM}.segments", {RANDOM: {}}),
+        ("agents", f"{RANDOM}.order.kept", {RANDOM: numbers | {"order": None}}),
+        ("how", "search", {}),
+        ("data", "checksum", {"name": "made"}),
+    ):
+        two.write_text(json.dumps(alone | {part: damaged}))
+        with pytest.raises(DataError, match=rf"two\.json, field {part}\.{name}: is missing"):
+            read_wosac(two)
 
 
 def test_words() -> None:

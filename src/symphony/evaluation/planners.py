@@ -46,6 +46,8 @@ FREE = ("planner", "planner_seconds", "rollouts")
 BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
 """Those that mean something where all others play back their log."""
 
+_NUMBER = (int, float, type(None))
+
 Record = dict[str, Any]
 
 
@@ -155,6 +157,15 @@ def read_planner_record(path: Path) -> Record:
     missing = [name for name in needed if name not in found]
     if missing:
         raise DataError("missing in this record of a planner", file=path, field=missing[0])
+    kinds = {"settings": dict, "store": dict, "per_run": list} | {name: _NUMBER for name, _, _ in COLUMNS}
+    wrong = [name for name, kind in kinds.items() if not isinstance(found[name], kind)]
+    runs = [] if wrong else found["per_run"]
+    if wrong or "checksum" not in found["store"]:
+        raise DataError(
+            "is not what a record of a planner has", file=path, field=(*wrong, "store.checksum")[0]
+        )
+    if not all(isinstance(run, dict) and run.keys() >= set(_KEPT) for run in runs):
+        raise DataError("has a run without one of its numbers", file=path, field="per_run")
     return found
 
 

@@ -58,7 +58,19 @@ def read_wosac(file: Path) -> dict[str, Any]:
             raise DataError("is missing; is this a record of symphony wosac evaluate?", file=file, field=name)
     if record["agent"] not in record["agents"]:
         raise DataError(f"without the agent {record['agent']}", file=file, field="agents")
+    _demand(record, ("recordings", "how.search", "data.name", "data.checksum"), file)
+    numbers = [name for column in COLUMNS for name in (column.key, f"{column.key}_se")]
+    for name, held in record["agents"].items():
+        _demand(held, ("segments", "order.kept", "order.pairs", *numbers), file, f"agents.{name}.")
     return record
+
+
+def _demand(held: Any, names: Sequence[str], file: Path, where: str = "") -> None:
+    for name in names:
+        part, _, inner = name.partition(".")
+        found = isinstance(held, dict) and part in held
+        if not found or (inner and (not isinstance(held[part], dict) or inner not in held[part])):
+            raise DataError("is missing", file=file, field=f"{where}{name}")
 
 
 def wosac_grid(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> Grid:
