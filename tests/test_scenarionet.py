@@ -15,8 +15,10 @@ import pytest
 from helpers_scenarionet import FAR, STEPS, line, ring, scenario, track, write
 from helpers_sources import off_road, read_error, read_one
 from symphony.data.conformance import check_reader
+from symphony.data.convert import convert
 from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, SignalState, validate
 from symphony.data.sources import get_reader
+from symphony.data.store import SegmentStore
 
 LANES = ["right", "left", "on", "end"]
 
@@ -287,6 +289,17 @@ def test_broken_scenarios_are_refused_by_name(name: str, tmp_path: Path) -> None
     assert error.field == field
     assert message in error.message
     assert error.file == tmp_path / "sd_made.pkl"
+
+
+@pytest.mark.parametrize("key", ["id", "map_features/\ud800"])
+def test_names_that_can_not_be_written_end_no_conversion(key: str, tmp_path: Path) -> None:
+    tree = scenario()
+    change(key, "\ud800" if key == "id" else {"type": "STOP_SIGN"})(tree)
+    write(tmp_path, tree).rename(tmp_path / "0.pkl")
+    report = convert("scenarionet", [tmp_path / "0.pkl", write(tmp_path)], tmp_path / "out", interactive=1)
+    assert (report.converted, report.files) == (1, 2)
+    (skipped,) = SegmentStore(tmp_path / "out").report["skipped"]
+    assert "\\ud800" in skipped["segment"] + skipped["field"]
 
 
 def test_lists_within_lists_do_not_grow(tmp_path: Path) -> None:
