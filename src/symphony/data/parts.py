@@ -125,9 +125,11 @@ def tags_of(segment: RunSegment) -> dict[str, Any]:
 
 def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:
     """What the report says of a record that failed."""
-    texts = (error.message, path, error.segment or segment, error.field or "")
+    found = Skip(error.message, path, error.segment or segment, error.field or "", exclusion)
     # Half a character, as damaged text may hold, could not be written, and would end the conversion.
-    return Skip(*(text.encode(errors="backslashreplace").decode() for text in texts), exclusion)
+    return Skip(
+        **{name: text.encode(errors="backslashreplace").decode() for name, text in vars(found).items()}
+    )
 
 
 @functools.lru_cache(maxsize=1)
