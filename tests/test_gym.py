@@ -144,6 +144,9 @@ def test_actions_and_segments_that_are_none(store: Path) -> None:
         gymnasium.make(NAME, data=store, duration=-1.0)
     discrete = gymnasium.make(NAME, data=store, observation=SMALL).unwrapped
     discrete.reset(options={"segment": 1})
-    for action in (-1, discrete.action_space.n):
+    for number in (1.5, [1], True):
+        with pytest.raises(ConfigError, match="an id or a number"):
+            discrete.reset(options={"segment": number})
+    for action in (-1, discrete.action_space.n, 1.5, np.nan, np.array([1]), "1"):
         with pytest.raises(ConfigError, match="is not one of"):
             discrete.step(action)

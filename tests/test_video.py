@@ -72,6 +72,12 @@ def test_frames_are_the_steps_or_evenly_fewer_in_real_time(steps: int, start: in
     assert file.stat().st_size < 1_000_000
 
 
+def test_steps_of_no_whole_hundredths_are_in_real_time_too(tmp_path: Path) -> None:
+    file = tmp_path / "a.gif"
+    frames([clip(crossing(3, steps=11).replace(dt=1 / 30), [0])], file)
+    assert sum(durations(file)) == pytest.approx(11 / 30, abs=0.006)
+
+
 def test_nothing_changes_but_where_something_moves(tmp_path: Path) -> None:
     """One agent of a straight road drives: above and below it all stays as it is, but for the clock."""
     segment = standing(straight_road(3, steps=8), [0])

@@ -102,6 +102,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
 
         Raises:
             DataError: the segment that was asked for is not there, or its ego is not seen at its first step.
+            ConfigError: what was asked for is neither an id nor a number.
         """
         super().reset(seed=seed)
         wanted = (options or {}).get("segment")
@@ -110,7 +111,10 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             while not _usable(self.store[number]):
                 number = int(self.np_random.integers(len(self.store)))
         else:
-            number = self.store.index_of(wanted if isinstance(wanted, str) else int(wanted))
+            named = wanted if isinstance(wanted, str) else _whole(wanted)
+            if named is None:
+                raise ConfigError(f"a segment is an id or a number, not {wanted!r}")
+            number = self.store.index_of(named)
             if not _usable(self.store[number]):
                 name = self.store.ids[number]
                 raise DataError("the ego is not seen at the first step", segment=name, field="valid")
@@ -125,9 +129,10 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             ConfigError: the action is none of the space; continuous ones beyond it are clipped.
         """
         if isinstance(self.dynamics, Bicycle):
-            if not 0 <= int(action) < self.dynamics.num_actions:
+            number = _whole(action)
+            if number is None or not 0 <= number < self.dynamics.num_actions:
                 raise ConfigError(f"action {action} is not one of {self.dynamics.num_actions}")
-            chosen = torch.tensor([int(action)])
+            chosen = torch.tensor([number])
         else:
             numbers = np.asarray(action, np.float32)
             if numbers.shape != (2,) or not np.isfinite(numbers).all():
@@ -185,6 +190,12 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
 
 def _usable(segment: RunSegment) -> bool:
     return bool(segment.valid[segment.ego, 0])
+
+
+def _whole(value: Any) -> int | None:
+    """A single whole number, such as an int, a NumPy scalar or a tensor; None for anything else."""
+    number = np.asarray(value)
+    return int(number) if number.shape == () and number.dtype.kind in "iu" else None
 
 
 def _space(value: NDArray[Any]) -> spaces.Space[Any]:

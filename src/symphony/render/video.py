@@ -259,13 +259,15 @@ def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> 
     images = [
         Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE) for pixels in frames
     ]
+    # The format counts in hundredths: rounded frame by frame, the error would grow.
+    ends = np.rint(100 * interval * np.arange(len(images) + 1)).astype(int)
     with replacing(path) as draft:
         images[0].save(
             draft,
             format="GIF",
             save_all=True,
             append_images=images[1:],
-            duration=round(1000 * interval),
+            duration=(10 * np.diff(ends)).tolist(),
             loop=0,
             optimize=True,
         )
