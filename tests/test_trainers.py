@@ -259,6 +259,13 @@ def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
         EvaluateConfig(interactive=129)
     with pytest.raises(ConfigError, match="unknown device"):
         train(config(store, tmp_path / "x", device="tpu-like"))
+    for device, why in (
+        ("meta", "can't be used"),
+        ("vulkan", "can't be used"),
+        ("cuda:99", "no such CUDA device"),
+    ):
+        with pytest.raises(ConfigError, match=f"device '{device}'.*{why}"):
+            train(config(store, tmp_path / "x", device=device))
     assert not (tmp_path / "x").exists()
 
 

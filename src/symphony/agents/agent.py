@@ -165,8 +165,15 @@ def usable_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError as error:
         raise ConfigError(f"unknown device '{name}'") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device '{name}': this PyTorch sees no CUDA device")
+    if device.type == "cuda":
+        if (device.index or 0) >= torch.cuda.device_count():
+            raise ConfigError(f"device '{name}': this PyTorch sees no such CUDA device")
+        return device
+    try:
+        # Not asked of CUDA, where each process would begin to use the first device.
+        torch.zeros(1, device=device).item()
+    except Exception as error:  # each kind of device has its own
+        raise ConfigError(f"device '{name}' can't be used: {' '.join(str(error).split())[:160]}") from error
     return device
 
 
