@@ -186,6 +186,16 @@ def test_methods_that_met_other_traffic_are_not_compared(name: str, value: Any) 
         compare(entries, "main")
 
 
+def test_whole_segments_stand_beside_their_first_seconds_only_where_these_are_all() -> None:
+    """An agent without a duration of its own is simulated to the end of each segment, which may last 20 s."""
+    entries = [make_entry("bc"), make_entry("bc_h")]
+    entries[1].record["config"]["duration"] = 10
+    compare(entries, "main")
+    entries[1].record["constant_velocity"]["ade"] /= 3
+    with pytest.raises(ConfigError, match=r"\(duration\)"):
+        compare(entries, "main")
+
+
 # --- the paper's own figures ---
 
 BOLD = {
