@@ -235,6 +235,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
     ),
     "no widths": (change("tracks/ego/state/width", ...), "tracks ego: width", "expected an array"),
     "words": (change("tracks/ego/state/heading", np.array(STEPS * ["a"])), "tracks ego: heading", "numbers"),
+    "a place that is no text": (change("metadata/map", "\ud800"), "group", "can't be printed"),
     "not finite": (
         change("tracks/ego/state/heading", np.full(STEPS, np.inf)),
         "heading",

@@ -295,6 +295,7 @@ ABSURD = {
     "origin": lambda s: s.replace(origin=s.origin + 1e30),
     "valid": lambda s: s.replace(valid=np.ones((s.num_agents, 10_001), bool)),
     "segment_id": lambda s: s.replace(segment_id="a\x1b[31m"),
+    "group": lambda s: s.replace(group="\ud800"),
     "file": lambda s: s.replace(file="x" * 300),
     "source": lambda s: s.replace(source="\udc80"),
     "road.lanes": lambda s: _road(s, "lanes", 1e30),

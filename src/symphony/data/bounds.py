@@ -36,7 +36,7 @@ MAX_HEADING = 1000.0
 MAX_WIDTH = 1000.0
 """Metres of a lane."""
 MAX_NAME = 200
-"""Characters of a segment's id, its source and the name of its file."""
+"""Characters of a segment's id, its source, its group and the name of its file."""
 
 MAX_STEPS = 10_000
 """Steps of a segment: a quarter of an hour at 10 Hz."""
@@ -93,7 +93,7 @@ def size_checks(s: RunSegment) -> Iterator[Check]:
     states = agents * steps
     yield "agent_id", agents <= MAX_AGENTS, f"{agents} agents, at most {MAX_AGENTS}"
     yield "valid", states <= MAX_STATES, f"{states} states, at most {MAX_STATES}: cut the log"
-    for name in ("segment_id", "source", "file"):
+    for name in ("segment_id", "source", "file", "group"):
         text = getattr(s, name)
         yield name, len(text) <= MAX_NAME, f"{len(text)} characters, at most {MAX_NAME}"
         yield name, not text or text.isprintable(), "holds characters that can't be printed"
