@@ -123,9 +123,23 @@ def test_tilted_odds_times_weights_are_the_odds_without_a_tilt() -> None:
     generator = torch.Generator().manual_seed(0)
     totals, lift = 5 * torch.randn(2, 50, 6, generator=generator, dtype=torch.float64)
     for temperature in (0.3, 1.0, 4.0):
-        tilted, weight = _tilted(totals, lift, temperature)
+        tilted, weight = _tilted(Systematic(temperature), totals, lift)
         odds = (-tilted / temperature).softmax(-1)
         torch.testing.assert_close(odds * weight.exp(), (-totals / temperature).softmax(-1))
+
+
+@pytest.mark.parametrize(
+    "odd", [[math.nan], [math.inf], [-math.inf], [-math.inf] * 2, [math.nan] * 5, [math.nan, math.inf]]
+)
+def test_totals_that_are_not_finite_spoil_no_weights(odd: list[float]) -> None:
+    rule, lift = Systematic(0.6), torch.tensor([2.0, 0.0, 1.0, 2.0, 0.5])
+    totals = torch.cat([torch.tensor(odd), torch.tensor([0.3, 1.0, -2.0, 0.0, 1.5])])[:5]
+    tilted, weight = _tilted(rule, totals, lift)
+    odds = rule.log_weights(tilted).softmax(-1)
+    assert bool(weight.isfinite().all())
+    torch.testing.assert_close(
+        odds * weight.exp(), rule.log_weights(totals).softmax(-1), atol=1e-6, rtol=1e-5
+    )
 
 
 def test_a_tilt_of_nothing_changes_nothing() -> None:

@@ -141,7 +141,7 @@ def beam_search(
                 parents.append(torch.arange(start.shape[-1], device=run.totals.device).expand(start.shape))
                 break
             if tilt is not None and isinstance(rule, Systematic):
-                compared, weight = _tilted(compared, tilt(run.records), rule.temperature)
+                compared, weight = _tilted(rule, compared, tilt(run.records))
                 weights.append(weight)
             parents.append(prune(rule, compared, noises[period], members, groups))
             groups = None if groups is None else groups.gather(-1, parents[-1])
@@ -192,14 +192,16 @@ def _tiltable(
 
 
 def _tilted(
-    totals: Float[Tensor, "*b S"], lift: Float[Tensor, "*b S"], temperature: float
+    rule: Systematic, totals: Float[Tensor, "*b S"], lift: Float[Tensor, "*b S"]
 ) -> tuple[Float[Tensor, "*b S"], Float[Tensor, "*b S"]]:
-    """Totals whose weights exp(-total / temperature) are exp(lift) times as large, and the logarithm of what a copy
-    of each branch then weighs, so that the mean over copies stays what it was.
+    """Totals whose weights are exp(lift) times as large, and the logarithm of what a copy of each branch then weighs,
+    so that the mean over copies stays what it was.
     """
-    usual = -totals.double() / temperature
+    usual = rule.log_weights(totals)
+    # Nothing makes up for what is infinitely bad or good.
+    lift = torch.where(totals.isfinite(), lift, 0.0)
     weight = (usual + lift).logsumexp(-1, keepdim=True) - usual.logsumexp(-1, keepdim=True) - lift
-    return totals - temperature * lift, weight
+    return totals - rule.temperature * lift, weight
 
 
 def score_state(
