@@ -349,6 +349,8 @@ def with_nan(values: Any) -> Any:
     (arrays(z=with_nan(ROLLOUTS["aaaa"].z)), "z", "agent 102, rollout 1, future step 3: not finite"),
     (arrays(y=ROLLOUTS["aaaa"].y.astype(float) * 1e40), "y", "not finite"),
     (arrays(object_id=np.array([100, 101, 100])), "object_id", "agent 100 more than once"),
+    (arrays(object_id=np.array([100, 101, 2**31])), "object_id", "agent 2147483648 has no number of 32 bits"),
+    (arrays(object_id=np.array([[100], [101], [102]])), "object_id", "has shape"),
 ])  # fmt: skip
 def test_rollouts_that_are_not_written(
     tmp_path: Path, rollouts: RolloutArrays, field: str, text: str

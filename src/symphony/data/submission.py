@@ -142,13 +142,19 @@ def scenario_message(scenario_id: str, rollouts: RolloutArrays) -> pb.ScenarioRo
     """The message of a scenario's rollouts.
 
     Raises:
-        DataError: not 32 rollouts of 80 steps of finite numbers, or an agent twice; names scenario, field and agent.
+        DataError: not 32 rollouts of 80 steps of finite numbers, an agent twice, or an id that the format has no room
+            for; names scenario, field and agent.
     """
 
     def error(message: str, field: str) -> DataError:
         return DataError(message, segment=scenario_id, field=field)
 
     ids = np.asarray(rollouts.object_id)
+    if ids.ndim != 1:
+        raise error(f"has shape {ids.shape}, expected (agents,)", "object_id")
+    wide = ids[(ids < -(2**31)) | (ids >= 2**31)]
+    if len(wide):
+        raise error(f"agent {wide[0]} has no number of 32 bits", "object_id")
     values, counts = np.unique(ids, return_counts=True)
     if (counts > 1).any():
         raise error(f"agent {values[counts > 1][0]} more than once", "object_id")
