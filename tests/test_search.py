@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from helpers_segments import crossing, make_road, make_segment, straight_road
-from symphony import keys
+from symphony import collectors, keys
 from symphony.agents import Agent, build_agent
 from symphony.collectors import Aggregate, BeamSearchResult, KeepAll, KeepBest
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
@@ -33,7 +33,7 @@ from symphony.simulation import simulate
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import simulated, simulation
 from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of
-from symphony.simulation.search import ENDED, flag_score, search
+from symphony.simulation.search import AGGREGATES, ENDED, flag_score, search
 
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=3)
 KINDS = ("none", "tree", "oracle", "best")
@@ -253,6 +253,16 @@ def test_no_rollout_depends_on_the_order_of_segments(dataset: SceneDataset, agen
         (mixed.collision, sorted_.collision[order]),
     ):
         assert torch.equal(a[real], b[real])
+
+
+@pytest.mark.parametrize("name", AGGREGATES)
+def test_totals_are_the_same_bits_beside_any_padding(name: str) -> None:
+    """And those of the searches that know nothing of driving, but for rounding."""
+    scores = torch.randn(3, 4, 5, 31, generator=torch.Generator().manual_seed(0))
+    total = AGGREGATES[name](scores)
+    for more in range(1, 34):
+        assert torch.equal(AGGREGATES[name](torch.nn.functional.pad(scores, (0, more))), total)
+    torch.testing.assert_close(total, getattr(collectors, name)(scores))
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,6 @@ from symphony.collectors import (
     ReplaceBad,
     Systematic,
     beam_search,
-    max_then_sum,
-    mean_then_sum,
 )
 from symphony.collectors.result import ranking
 from symphony.collectors.rules import takes_groups
@@ -36,9 +34,7 @@ from symphony.simulation.importance import Tilt
 from symphony.streams import fold_in, uniform
 
 ENDED = -100.0
-"""Score past a scene's last logged step, below all others: it decides no maximum, and in a mean or sum it weighs
-equally on all branches.
-"""
+"""Score past a scene's last logged step, below all others: it decides no maximum, and other totals leave it out."""
 _PRUNING = (1 << 40) + 1
 _RETRIES = (1 << 40) + 2
 """Numbers of the streams that prunings and repeats draw from, far above those of rollouts and agents."""
@@ -62,6 +58,18 @@ KEPT: Sequence[keys.Key] = [
 def kept_keys(env: DrivingEnv, also: Sequence[keys.Key] = ()) -> list[keys.Key]:
     """:data:`KEPT`, with the personas of agents that have them."""
     return [*KEPT, *([keys.PERSONA] if env.observation.persona else []), *also]
+
+
+def max_then_sum(scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
+    """The paper's total: the worst moment of each agent, added up. One by one: how many padded agents follow would
+    change the last bit of a sum.
+    """
+    return scores.amax(-2).cumsum(-1)[..., -1]
+
+
+def mean_then_sum(scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
+    """The average of each agent over the period, added up likewise."""
+    return (scores.cumsum(-2)[..., -1, :] / scores.shape[-2]).cumsum(-1)[..., -1]
 
 
 AGGREGATES = {"max_then_sum": max_then_sum, "mean_then_sum": mean_then_sum}
