@@ -74,7 +74,7 @@ def test_frames_are_the_steps_or_evenly_fewer_in_real_time(steps: int, start: in
 
 def test_steps_of_no_whole_hundredths_are_in_real_time_too(tmp_path: Path) -> None:
     file = tmp_path / "a.gif"
-    frames([clip(crossing(3, steps=11).replace(dt=1 / 30), [0])], file)
+    frames([clip(crossing(3, steps=11).replace(dt=1 / 30), [0], start=0)], file)
     assert sum(durations(file)) == pytest.approx(11 / 30, abs=0.006)
 
 
