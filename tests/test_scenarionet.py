@@ -18,6 +18,7 @@ from symphony.data.conformance import check_reader
 from symphony.data.convert import convert
 from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, SignalState, validate
 from symphony.data.sources import get_reader
+from symphony.data.sources.scenarionet_map import read_features
 from symphony.data.store import SegmentStore
 
 LANES = ["right", "left", "on", "end"]
@@ -167,6 +168,15 @@ def test_long_outlines_that_were_cut_up_leave_no_islands_as_road(tmp_path: Path)
     assert (off_road(road, spots) < 0).tolist() == [True, True, False, False]
     assert road.mark_type.tolist() == [MarkType.ROAD_LINE] * 4
     assert np.isnan(road.speed_limit).all()
+
+
+def test_outlines_are_closed_wherever_a_city_lies() -> None:
+    """Coordinates of map projections are millions: a hundred-thousandth of them is a street."""
+    corners = np.array([(0, 0), (60, 0), (60, 60), (0, 60), (0, 20)]) + np.array([480_000, 5_400_000])
+    lane = {"type": "LANE_SURFACE_STREET", "polyline": corners[:2]}
+    for ring, outlines in ((corners, 0), (np.concatenate([corners, corners[:1]]), 1)):
+        found = read_features({"boundary_0": {"type": "x", "polyline": ring}, "lane": lane}, "any")
+        assert (len(found.outlines), len(found.marks)) == (outlines, 1 - outlines)
 
 
 def test_what_scenarionet_makes_of_nuplan(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
             place = points([node.get("position", ())], f"{field}: position")
             marks.append((place, MarkType.STOP_SIGN))
         elif str(key).startswith("boundary_") and len(line) > 1:
-            closed = len(line) > 3 and np.allclose(line[0], line[-1])
+            closed = len(line) > 3 and bool((np.abs(line[0] - line[-1]) < 0.01).all())
             (outlines if closed else pieces).append(line[:, :2])
         elif kind.startswith("ROAD_LINE") and len(line) > 1:
             marks.append((line, MarkType.ROAD_LINE))
