@@ -174,8 +174,8 @@ def test_outlines_are_closed_wherever_a_city_lies() -> None:
     """Coordinates of map projections are millions: a hundred-thousandth of them is a street."""
     corners = np.array([(0, 0), (60, 0), (60, 60), (0, 60), (0, 20)]) + np.array([480_000, 5_400_000])
     lane = {"type": "LANE_SURFACE_STREET", "polyline": corners[:2]}
-    for ring, outlines in ((corners, 0), (np.concatenate([corners, corners[:1]]), 1)):
-        found = read_features({"boundary_0": {"type": "x", "polyline": ring}, "lane": lane}, "any")
+    for outline, outlines in ((corners, 0), (np.concatenate([corners, corners[:1]]), 1)):
+        found = read_features({"boundary_0": {"type": "x", "polyline": outline}, "lane": lane}, "any")
         assert (len(found.outlines), len(found.marks)) == (outlines, 1 - outlines)
 
 
