@@ -253,6 +253,18 @@ def test_the_log_of_steady_traffic_is_constant_velocity() -> None:
     assert scored(scenario, log)["metametric"] > 0.7
 
 
+def test_a_world_with_a_far_origin_is_scored_as_one_about_its_own() -> None:
+    """Scores are in float32, which at 4 000 km, as in UTM coordinates, has steps of a quarter of a metre."""
+    segment, found = crossing(num_agents=3), []
+    for origin in ((0.0, 0.0, 0.0), (664_430.0, 3_998_210.0, 600.0)):
+        moved = segment.replace(origin=np.array(origin))
+        window = validate(wosac_window(moved))
+        found.append(scored(wosac_scenario(moved), constant_velocity(window)))
+    assert found[0] == found[1]
+    near = segment.replace(origin=np.array([7000.0, -3000.0, 20.0]))
+    assert wosac_window(near).origin.tolist() == near.origin.tolist()
+
+
 def test_lost_agents_are_nobodys_obstacle() -> None:
     segment = straight_road(num_agents=4)
     lost = hide(segment, 3, slice(20, None))

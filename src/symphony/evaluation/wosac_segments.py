@@ -17,6 +17,8 @@ from symphony.simulation.wosac import between_decisions
 
 _AWAY, _APART = 1e5, 1e3
 """Metres from the origin, and from one another, at which agents do not meet anyone."""
+_FAR = 1e5
+"""Metres from the world's origin beyond which float32, in which all is scored, has steps of a centimetre and more."""
 _TIMED = ("position", "heading", "velocity", "valid", "signal_state")
 
 
@@ -25,7 +27,8 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
 
     Other time steps are brought to 0.1 s by :func:`symphony.data.resample.resample`. Of a segment between 8 and 9 s
     the future is kept whole and the history is shorter: its first steps are valid for nobody, and go back from the
-    first logged one at its velocity, so that there is no jump in speed.
+    first logged one at its velocity, so that there is no jump in speed. Where the world's origin is more than 100 km
+    away, as in maps with UTM coordinates, that of the segment takes its place.
 
     Args:
         segment: of any time step.
@@ -54,7 +57,8 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
     found["position"][:, :missing] = tenth.position[:, :1]
     found["position"][:, :missing, :2] += tenth.velocity[:, :1] * back
     found["heading"][:, :missing] = tenth.heading[:, :1]
-    return tenth.replace(dt=DT, current_step=CURRENT, **found)
+    origin = np.where(np.abs(tenth.origin).max() > _FAR, 0.0, tenth.origin)
+    return tenth.replace(dt=DT, current_step=CURRENT, origin=origin, **found)
 
 
 def wosac_scenario(segment: RunSegment, future: int = FUTURE) -> WosacScenario:
