@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers_segments import crossing, straight_road
+from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.cli import main
@@ -289,6 +289,19 @@ def test_the_command_compares_planners_among_crowds(
     assert sorted(line.split(" | ")[1] for line in table[2:4]) == ["idm", "log"]
     assert table[-1] == winners(records)[0]
     assert main(["planners", str(store)]) == 1
+
+
+def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> None:
+    late = hide(straight_road(3, seed=5, steps=16), 0, slice(0, 2))
+    found = zip([crossing(3, steps=16), late, straight_road(3, steps=16)], "aab", strict=True)
+    fill(tmp_path / "store", [segment.replace(group=group) for segment, group in found])
+    record = planner_record(run(tmp_path / "store", tmp_path / "sim", "log", "playback", rollouts=1))
+    assert {bool(one["failed"]): one["group"] for one in record["per_run"][1:]} == {False: "b", True: "a"}
+    scores = {one["group"]: [] for one in record["per_run"]}
+    for one in record["per_run"]:
+        scores[one["group"]].append(run_score(one) - record["score"])
+    apart = np.array([sum(scores["a"]), sum(scores["b"])]) / 1.5
+    assert record["score_se"] == pytest.approx(np.sqrt((apart**2).sum() / 2))
 
 
 def test_a_first_place_is_clear_only_beyond_two_standard_errors() -> None:

@@ -132,7 +132,7 @@ def report(
     for failure in folder.failures:
         empty = dict.fromkeys(_NUMBERS)
         for k in range(failure.rollouts):
-            found.rows.append(_row(failure.segment, k, "", failure.failed or "failed", empty))
+            found.rows.append(_row(failure.segment, k, failure.group, failure.failed or "failed", empty))
     return found
 
 

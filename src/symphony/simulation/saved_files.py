@@ -36,6 +36,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "sha256": (str,),
     "dt": (int, float),
     "failed": (str, NoneType),
+    "group": (str,),
 }
 """Of the values of an entry."""
 
@@ -82,7 +83,9 @@ class About:
 
 @dataclass(frozen=True)
 class Entry:
-    """One run segment of a folder; ``failed`` says why there are no rollouts of it, and is None else."""
+    """One run segment of a folder; ``failed`` says why there are no rollouts of it, and is None else; then ``group``
+    is that of the segment, as no file tells.
+    """
 
     segment: str
     rollouts: int
@@ -90,6 +93,7 @@ class Entry:
     sha256: str = ""
     dt: float = math.nan
     failed: str | None = None
+    group: str = ""
 
 
 class RolloutWriter:
@@ -151,13 +155,15 @@ class RolloutWriter:
         digest = hashlib.sha256(data).hexdigest()
         self._record(Entry(name, saved.rollouts, file, digest, saved.segment.dt))
 
-    def fail(self, segment_id: str, rollouts: int, reason: str) -> None:
+    def fail(self, segment_id: str, rollouts: int, reason: str, group: str = "") -> None:
         """Put on record that a segment could not be simulated; it is tried again when the folder is continued."""
-        self._record(Entry(segment_id, rollouts, failed=reason))
+        self._record(Entry(segment_id, rollouts, failed=reason, group=group))
 
     def _record(self, entry: Entry) -> None:
         path = self.path / INDEX
         given = dataclasses.asdict(entry)
+        if not entry.group:
+            del given["group"]
         # A failure has neither file nor time step.
         values = {name: given[name] for name in given if entry.failed is None or given[name] == given[name]}
         with naming(path), path.open("a", encoding="utf-8") as file:

@@ -159,7 +159,7 @@ def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int]
         if usable:
             found.append(i)
         else:
-            writer.fail(segment.segment_id, rollouts, why)
+            writer.fail(segment.segment_id, rollouts, why, segment.group)
     return found
 
 
