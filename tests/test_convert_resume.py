@@ -270,6 +270,20 @@ def test_other_arguments_do_not_go_on(
     assert (tmp_path / "store.partial" / "journal.jsonl").is_file()
 
 
+def test_a_folder_of_somebodys_own_is_left_alone(logs: list[Path], tmp_path: Path) -> None:
+    """Of the name that unfinished work gets: a folder with notes, and a store."""
+    notes = tmp_path / "store.partial"
+    notes.mkdir()
+    (notes / "notes.txt").write_text("mine")
+    convert(FakeReader(), logs[1:2], tmp_path / "other.partial")
+    before = content(tmp_path / "other.partial")
+    for name in ("store", "other"):
+        with pytest.raises(DataError, match="no conversion left"):
+            convert(FakeReader(), logs, tmp_path / name)
+    assert (notes / "notes.txt").read_text() == "mine"
+    assert content(tmp_path / "other.partial") == before
+
+
 def test_what_is_in_the_way_is_told(logs: list[Path], tmp_path: Path) -> None:
     out, partial = tmp_path / "store", tmp_path / "store.partial"
     logs[3].write_text("straight 9\ninterrupt")

@@ -43,7 +43,7 @@ def merge(
     if read_journal(folder_of(out)) is not None:
         raise DataError(f"an unfinished conversion to that name lies in {folder_of(out)}", file=out)
     draft = out.with_name(f"{out.name}.merging")
-    if draft.exists():  # of a merge that was killed, or of one that goes on, which is told
+    if (draft / store_format.HEADER).is_file():  # of a merge that was killed, or goes on, which is told
         with store_format.lock(draft):
             shutil.rmtree(draft)
     total, done = sum(map(len, stores)), 0

@@ -117,7 +117,7 @@ class Draft:
 
     Raises:
         ConfigError: another conversion was begun there.
-        DataError: another process is at it, or the folder is damaged.
+        DataError: another process is at it, or the folder is damaged, or holds something else.
     """
 
     def __init__(self, out: Path, job: Job) -> None:
@@ -135,6 +135,7 @@ class Draft:
         begun = read_journal(self.folder)
         self.resumed = begun is not None
         if begun is None:
+            _check_own(self.folder)
             _clear(self.folder)  # left by a process that died before it had begun, or while it tidied up
             begun = Begun(job, Report(settings=dict(job.settings)))
         else:
@@ -277,6 +278,14 @@ def read_journal(folder: Path) -> Begun | None:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(f"not the journal of a conversion: {error}", file=path) from error
     return Begun(job, report, segments, finished, size)
+
+
+def _check_own(folder: Path) -> None:
+    """Refuse a folder of the same name that is somebody's own: it is about to be cleared."""
+    foreign = {child.name for child in folder.iterdir()} - {JOURNAL, STORE, PARTS, store_format.LOCK}
+    if foreign:
+        message = f"no conversion left {min(foreign)!r} there: give the folder, or the store, another name"
+        raise DataError(message, file=folder)
 
 
 def _clear(folder: Path, keep: str = store_format.LOCK) -> None:
