@@ -93,6 +93,15 @@ def test_divergences_must_differ_by_more_than_sampling(shift: float, held: bool)
     assert found.error == pytest.approx(0.001 * np.sqrt(2 / 40), rel=0.4)
 
 
+def test_divergences_that_a_single_recording_makes_have_no_error_and_are_not_compared() -> None:
+    """Without it there is no turn left, so the jackknife has no number for it, and the same one for all others."""
+    entries = [entry("bc"), entry("bc_ts")]
+    for one, value in zip(entries, (0.01, 0.02), strict=True):
+        one.record["curvature"]["parts"] = {"a": None, "b": value, "c": value}
+    found = of(relations(entries), "curvature_jsd", "bc", "bc_ts")
+    assert found.held is None
+
+
 def test_what_stays_the_same_does_not_fall() -> None:
     found = relations([entry(method, collision_rate=3.0) for method in ("bc", "bc_ts", "mgail")])
     assert of(found, "collision_rate", "bc", "bc_ts").held is False

@@ -189,6 +189,8 @@ def _divergence(before: Sequence[Entry], after: Sequence[Entry]) -> tuple[float,
         return None
     names = sorted(set.intersection(*(set(one) for each in parts for one in each)))
     means = [np.mean([_row(one, names) for one in each], axis=0) for each in parts]
+    if np.isnan(means).any():  # all turns are of one recording, or there is but one
+        return math.nan, math.nan
     return clustered_mean(means[1] - means[0], np.arange(len(names)))
 
 
