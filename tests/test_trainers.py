@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import shutil
@@ -14,7 +15,7 @@ import torch
 from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
 from symphony import keys
-from symphony.agents import load_agent
+from symphony.agents import build_agent, load_agent, observation_of
 from symphony.agents.checkpoint import checkpoints
 from symphony.cli import main
 from symphony.config import (
@@ -33,10 +34,12 @@ from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.metrics import collisions, offroad
+from symphony.objectives import GoalLoss
 from symphony.recipes import train
 from symphony.simulation import simulate
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.experts import experts
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
 from symphony.training.logging import read_metrics
 
 TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
@@ -105,6 +108,26 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path)
         train(config(store, run))
     with pytest.raises(ConfigError, match="another seed"):
         train(config(store, run, resume=True, seed=5))
+
+
+def test_a_recipe_of_ones_own_may_leave_the_policy_as_it_is(store: Path, tmp_path: Path) -> None:
+    settings, rng = config(store, tmp_path / "goals", method="bc_h"), torch.Generator()
+    data = SceneDataset(SegmentStore(store), routes=True, **settings.scenes)
+    spec = settings.spec("bicycle", data.dt, goals=True)
+    agent = build_agent("goals", spec)
+    before, loss = copy.deepcopy(agent.policy.state_dict()), GoalLoss(agent.goals)
+
+    def update(step: int) -> Updates:
+        batch = data.sample_goals(data.draw(2, rng), 8, observation_of(spec), rng)
+        yield "goals", loss(batch)
+
+    phases = [Phase(settings.steps, update, cosine({"goals": 0.01}, settings.steps))]
+    optimizers = {"goals": torch.optim.Adam(agent.goals.parameters())}
+    alone = Processes(torch.device("cpu"))
+    out = Trainer(settings, agent, data, phases, optimizers, rng, alone).run()
+    assert [r["step"] for r in read_metrics(out) if "loss_goals" in r] == [1, 2, 3, 4, 5, 6]
+    after = load_agent(str(out)).policy.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
 
 
 def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:

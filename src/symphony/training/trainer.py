@@ -243,8 +243,10 @@ class Trainer:
 
     def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
         """What the loop adds to a record, and shows."""
-        rate = self.optimizers["policy"].param_groups[0]["lr"]
-        added: dict[str, float | str] = {"learning_rate": rate, "skipped_updates": self.skips.total}
+        added: dict[str, float | str] = {}
+        if "policy" in self.optimizers:
+            added["learning_rate"] = self.optimizers["policy"].param_groups[0]["lr"]
+        added["skipped_updates"] = self.skips.total
         loss = loss_of("policy")
         if loss in numbers:
             self.progress.update(self.task, loss=f"{numbers[loss]:.3f}")
