@@ -16,7 +16,7 @@ from helpers_runs import tiny
 from helpers_segments import straight_road
 from helpers_store import fill
 from symphony.cli import main
-from symphony.cli.tables import print_table
+from symphony.cli.tables import KINDS, print_metrics, print_table
 from symphony.cli.train import last_words
 from symphony.config import ValidationConfig
 from symphony.recipes import train
@@ -35,6 +35,24 @@ def test_tables_never_break_a_name(width: int) -> None:
     assert sum(name in line for line in lines) == 1
     assert sum(title in line for line in lines) == 1
     assert console.width == width
+
+
+def test_help_is_not_broken_where_its_source_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "600")
+    assert main(["evaluate", "--help"]) == 0
+    told = capsys.readouterr().out
+    assert "along the route of the log) or the agent itself" in told
+    assert "must come in the log to be driven; 0: no limit." in told
+
+
+def test_only_kinds_of_collision_that_happened_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    row: dict[str, Any] = dict.fromkeys(("offroad_time", "ade", "min_sade", "curvature_jsd"), 0.0)
+    row |= dict.fromkeys((f"collision_{kind}" for kind, _ in KINDS), 0.0)
+    row |= {"agent": "runs/bc", "collision_rate": 12.5, "collision_crossing": 12.5, "search": "log"}
+    print_metrics([row | {"interactive": 2, "rollouts": 4, "segments": 2, "groups": 2, "seed": 0}])
+    assert "bc: collisions, % of rollouts: 12.5 crossing\n" in capsys.readouterr().out
 
 
 def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -316,6 +316,16 @@ def test_text_fits_a_terminal_and_shows_the_best_in_bold() -> None:
             assert not held or "±".join(f"{number:.2f}" for number in held) in plain
 
 
+def test_many_columns_leave_names_whole() -> None:
+    comparison = compare(full_table(1), "main", "womd", ("split", "standing", "corrected", "goals"))
+    for width in (80, 200):
+        file = io.StringIO()
+        print_text(comparison, Console(file=file, width=width))
+        text = file.getvalue()
+        assert "MGAIL+TS+H" in text
+        assert "…" not in text
+
+
 # --- which runs and evaluations count ---
 
 

@@ -36,6 +36,7 @@ from symphony.cli import (
     view,
     wosac,
 )
+from symphony.cli.helps import PARAGRAPHS
 from symphony.errors import ConfigError, DataWarning, SymphonyError, printable
 from symphony.files import check_writable
 
@@ -92,6 +93,7 @@ def main(args: Sequence[str] | None = None) -> int:
             description=DESCRIPTION,
             args=args,
             config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            registry=PARAGRAPHS,
         )
     except ConfigError as error:
         return _complain(error, USAGE)

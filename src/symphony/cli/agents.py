@@ -15,8 +15,10 @@ from symphony.cli.tables import COLUMNS, number_cell, print_table, write_numbers
 class Agents:
     """Print the model cards of the agents that come with the package: data, seeds, scores and limits."""
 
-    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="pretrained:NAME")] = ()
-    """Only these agents."""
+    names: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[pretrained:NAME ...]")
+    ] = ()
+    """Only these agents; by default all."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File to write all numbers to; - for standard output, in place of the cards."""
 

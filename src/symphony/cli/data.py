@@ -303,7 +303,7 @@ def _print_info(found: dict[str, Any]) -> None:
             return "none"
         if values["min"] == values["max"]:
             return f"{values['min']:g}{unit}"
-        return f"{values['min']:g} to {values['max']:g}{unit} (mean {values['mean']:g})"
+        return f"{values['min']:g} to {values['max']:g}{unit} (mean {values['mean']:.4g})"
 
     sources = ", ".join(f"{count} from {source}" for source, count in found["sources"].items())
     rows = [

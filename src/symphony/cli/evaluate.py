@@ -44,7 +44,7 @@ class Evaluate:
     """Evaluate a planner as the ego instead, among agents that the agent drives (among the log with `playback`): see
     `symphony simulate`. Its numbers are those of `symphony planners`; no folder of a run is touched."""
     planner_seconds: float = 60.0
-    """That it has for one answer; more fails the run."""
+    """Seconds that it has for one answer; a longer one fails the run."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None

@@ -20,7 +20,7 @@ class Export:
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Where the files go; by default the folder `export` within SIM."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
-    """Only these run segments."""
+    """Only these run segments, by their ids."""
     rollouts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="K ...")] = ()
     """Only these of each, counted from 0."""
 

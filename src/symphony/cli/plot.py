@@ -68,7 +68,7 @@ class Rollouts:
     """Store of run segments."""
     out: Path
     """Picture to write (.png, .pdf or .svg), or animation (.gif)."""
-    segments: tuple[str, ...] = ()
+    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
     """Their ids, or their numbers in the store; by default some, spread evenly over the store."""
     panels: int = 3
     """How many, if none are named."""
@@ -119,7 +119,7 @@ class Curves:
     """Folders of runs, still training or done."""
     out: Path
     """Picture to write (.png, .pdf or .svg)."""
-    metrics: tuple[str, ...] = ()
+    metrics: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Draw these metrics only; by default all there are."""
     window: float = 0.1
     """Share of a run's records that a point of the smoothed line is averaged over; 0 for not smoothing."""

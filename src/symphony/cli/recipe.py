@@ -12,6 +12,7 @@ import tyro
 
 from symphony.cli import settle
 from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
+from symphony.cli.helps import PARAGRAPHS
 from symphony.cli.profiles import WORDS, expanded
 from symphony.config import EvaluateConfig, Method, Profile, TrainConfig
 
@@ -39,7 +40,9 @@ def run(method: Method, description: str | None, args: Sequence[str] | None = No
     from symphony.recipes import train
 
     given = list(sys.argv[1:] if args is None else args)
-    settings = tyro.cli(Arguments, description=description, args=expanded([method, *given]))
+    settings = tyro.cli(
+        Arguments, description=description, args=expanded([method, *given]), registry=PARAGRAPHS
+    )
     folder, store = train(settings.training), SegmentStore(settings.test)
     config = EvaluateConfig(
         rollouts=settings.rollouts, seed=settings.training.seed, device=settings.training.device

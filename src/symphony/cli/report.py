@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from symphony.cli.tables import print_table
+from symphony.cli.tables import number_cell, print_table
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Report:
         for name, value in found.totals().items():
             if not name.endswith("_se") and isinstance(value, float):
                 error = plain.get(f"{name}_se")
-                table.add_row(name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}"))
+                table.add_row(name, number_cell(value, error, 2))
         print_table(table, Console())
         if not table.row_count:
             Console().print("no run could be evaluated")

@@ -32,19 +32,19 @@ class Simulate:
     """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
     agents: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
     """The same, by name."""
-    segments: tuple[str, ...] = ()
-    """Ids of the run segments, or their numbers in the store; by default all."""
+    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
+    """Only these run segments, by their ids or their numbers in the store."""
     runs: int = 0
-    """Simulate so many runs (rollouts of a segment), or a few more where no number of them per segment divides it: of
-    as many segments as there are, evenly spread, and as few of each as it takes, in place of `rollouts`. 0: all
-    segments."""
+    """Simulate so many runs (a run is one rollout of one segment) in place of `rollouts`: of as many segments as
+    there are, evenly spread, and as few of each as it takes; a few more where the number can't be divided so. 0: all
+    segments, `rollouts` of each."""
     planner: str = ""
-    """Drives the ego, the agent the other interactive agents: `idm`, `log`, or one of your own: a file `my.py:plan`,
-    an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as the agent all others play
-    back the log."""
+    """What drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your own: a
+    file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as the
+    agent all others play back the log."""
     planner_seconds: float = 60.0
-    """That a planner has for one answer; more fails the run."""
-    goal: tuple[str, ...] = ()
+    """Seconds that a planner has for one answer; a longer one fails the run."""
+    goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID=PLACE ...")] = ()
     """Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them."""
     tree: bool = True

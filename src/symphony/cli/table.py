@@ -40,7 +40,7 @@ class Table:
     paper: PaperData | None = None
     """Show the paper's own figures on this data set beside ours."""
     paired: Annotated[Method | None, tyro.conf.arg(metavar="METHOD")] = None
-    """Also print every method less this one, paired over run segments."""
+    """Also print every method less this one, paired over run segments, to standard error."""
     relations: bool = False
     """Print, instead of the table, which of the paper's relations between the methods hold, with paired errors."""
     format: TableFormat = "text"

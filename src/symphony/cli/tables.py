@@ -81,7 +81,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
     first = rows[0]
     for row in rows:
         if row["collision_rate"] > 0 and "collision_into_leader" in row:
-            parts = ", ".join(f"{row[name]:.1f} {text}" for name, text in _kinds_of(row))
+            kinds = ((row[name], text) for name, text in _kinds_of(row))
+            parts = ", ".join(f"{value:.1f} {text}" for value, text in kinds if value > 0)
             console.print(
                 f"{escape(short_name(str(row['agent'])))}: collisions, % of rollouts: {parts}", style="dim"
             )

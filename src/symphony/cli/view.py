@@ -32,7 +32,7 @@ class View:
     """File to write: a page (.html), a picture (.png, .pdf or .svg), an animation (.gif) or a film (.mp4, which needs
     `pip install 'symphony-traffic[video]'`). By default view.html in the folder."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
-    """Only these run segments; of a picture by default the first few."""
+    """Only these run segments, by their ids; of a picture by default the first few."""
     rollouts: int = 0
     """Of each segment in a picture or film, at most; 0: all in a picture, the first one in a film."""
 

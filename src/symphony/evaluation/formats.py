@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -51,7 +53,11 @@ def print_text(comparison: Comparison, console: Console) -> None:
         # Families stand apart, as in the paper.
         apart = following is not None and family(row.method) != family(following.method)
         table.add_row(label, str(len(row.seeds) or ""), *cells, end_section=apart)
-    console.print(table)
+    # As wide as what is in it: neither names nor numbers are cut.
+    before, unlimited = console.width, console.options.update(max_width=sys.maxsize)
+    console.width = max(before, Measurement.get(console, unlimited, table).maximum)
+    console.print(table, crop=False)
+    console.width = before
     for note in comparison.notes:
         console.print(
             note if console.is_terminal else note.replace("bold:", "*:"),
