@@ -339,6 +339,17 @@ def test_the_order_of_segments_changes_no_bit_of_a_metric_of_ones_own():
         assert metrics.mean({name: values[name] for name in names}) == metrics.mean(values)
 
 
+def test_a_metric_of_ones_own_that_is_infinite_somewhere_has_an_infinite_mean():
+    """Left out, the rest would pass for the mean."""
+    metrics = scored(random_inputs(6))
+    values = dict.fromkeys(metrics.segments, 2.0)
+    names = list(values)
+    assert metrics.mean(values | {names[0]: math.nan}) == (2.0, 0.0)
+    mean, error = metrics.mean(values | {names[0]: math.nan, names[1]: math.inf})
+    assert mean == math.inf
+    assert math.isnan(error)
+
+
 def test_a_group_without_anything_to_count_is_no_sample():
     """Of two recordings of which one has no step to compare there is no error, as of one alone."""
     inputs = random_inputs(7, batch=4) | {"groups": ["a", "a", "b", "c"]}

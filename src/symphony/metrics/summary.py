@@ -160,9 +160,11 @@ class RolloutMetrics:
 
     def mean(self, values: Mapping[str, float]) -> tuple[float, float]:
         """Mean of another number of every segment, and its standard error over the same groups; NaN is left out."""
-        known = {name: value for name, value in sorted(values.items()) if math.isfinite(value)}
+        known = {name: value for name, value in sorted(values.items()) if not math.isnan(value)}
         if not known:
             return math.nan, math.nan
+        if any(map(math.isinf, known.values())):
+            return sum(known.values()), math.nan
         member = group_numbers([self.segments[name] for name in known])
         return ratio(np.array(list(known.values())), np.ones(len(known)), member)
 
