@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 from symphony.evaluation.pictures import search_tree
 from symphony.evaluation.planners import check_crowds, winners
 from symphony.recipes import train
@@ -70,6 +71,48 @@ def test_a_planner_that_was_changed_is_another_simulation(store: Path, told: Any
     assert code == 1
     assert "another simulation, which differs in settings" in words
     assert told(*drive(store, "--planner", "mine.py:plan", "--out", "b"))[0] == 0
+
+
+def steady(gain: float, seen: Any) -> tuple[float, float]:
+    return gain, 0.0
+
+
+class Steady:
+    def __init__(self, gain: Any = 0.0) -> None:
+        self.gain = gain
+
+    def reset(self, scenario: Any) -> None:
+        """Nothing to remember."""
+
+    def plan(self, traffic: Any) -> tuple[float, float]:
+        return self.gain, 0.0
+
+
+def test_a_planner_with_other_parameters_is_another_simulation(store: Path, tmp_path: Path) -> None:
+    agent, config = load_agent("playback"), EvaluateConfig(rollouts=1)
+    data = crowd_dataset(SegmentStore(store), agent, config, [0], default=1, routes=True)
+
+    def drive(gain: float) -> float:
+        folder = save_simulation(tmp_path / "sim", agent, data, config, planner=partial(steady, gain))
+        assert folder.about.drivers["ego"] == f"{__name__}:steady"
+        return float(folder[0].state[0, -1, 0, 3] - folder[0].state[0, 0, 0, 3])
+
+    assert drive(1.0) == drive(1.0) > 0.5
+    with pytest.raises(DataError, match=r"differs in settings\.planner"):
+        drive(2.0)
+    sources = [source_of(partial(Steady, **told)) for told in ({}, {"gain": 1.0}, {"gain": 2.0})]
+    sources.append(source_of(partial(Steady, 1.0)))
+    assert len(set(sources)) == len(sources)
+    assert source_of(partial(Steady, object())) == source_of(partial(Steady, object()))
+
+
+def test_a_command_is_what_it_starts_and_what_that_reads(tmp_path: Path) -> None:
+    script = tmp_path / "mine.py"
+    found = []
+    for text in ("a", "b"):
+        script.write_text(text)
+        found += [source_of(f"pipe:{sys.executable} {script}"), source_of(f"pipe:python {script}")]
+    assert len(set(found)) == 4
 
 
 def test_other_weights_under_the_same_name_are_another_simulation(store: Path, run: Path, told: Any) -> None:

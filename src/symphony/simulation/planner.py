@@ -203,6 +203,8 @@ def planner_name(planner: str | Callable[..., Any]) -> str:
     """What a planner is called in records."""
     if isinstance(planner, str):
         return planner
+    if isinstance(planner, partial):
+        return planner_name(planner.func)
     return f"{getattr(planner, '__module__', '')}:{getattr(planner, '__qualname__', type(planner).__name__)}"
 
 

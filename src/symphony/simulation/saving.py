@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import inspect
+import re
 import shlex
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -25,12 +26,14 @@ from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.planned import EgoPlanners
 from symphony.simulation.planner import PIPE, planner_maker, planner_name
 from symphony.simulation.planner_calls import SECONDS
+from symphony.simulation.planner_view import FunctionPlanner
 from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
 from symphony.simulation.workers import batches, naming, shared
 
 _MEMORY = ("batch", "device", "metric", "workers", "engine")
 """Settings that change no rollout."""
+_PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 
 
 def save_simulation(
@@ -176,14 +179,28 @@ def weights_of(agent: Agent) -> dict[str, str]:
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """A digest of the code that a planner is made of, as far as its name tells: one that was changed is another one.
+    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it by
+    ``functools.partial``: one that was changed is another one.
 
-    Of a command the first word that is a file. Empty for what comes with the package, and where no source is known.
+    Of a command what it starts, where that is a file, and the first other word that is one. Empty for what comes with
+    the package, and where no source is known.
     """
     if isinstance(planner, str) and planner.startswith(PIPE):
-        return next(filter(None, map(_digest, shlex.split(planner.removeprefix(PIPE)))), "")
-    made = planner_maker(planner)
-    given = made.args[0] if isinstance(made, partial) and made.args else made
+        words = shlex.split(planner.removeprefix(PIPE))
+        found = [_digest(words[0]), next(filter(None, map(_digest, words[1:])), "")]
+        return _short("".join(found).encode()) if all(found) else "".join(found)
+    given, bound = planner_maker(planner), ""
+    if isinstance(given, partial) and given.func is FunctionPlanner:
+        given = given.args[0]
+    while isinstance(given, partial):
+        # Where an object lies in memory is nothing of it.
+        bound += _PLACE.sub("", repr((given.args, given.keywords)))
+        given = given.func
+    code = _code_of(given)
+    return _short((code + bound).encode()) if bound else code
+
+
+def _code_of(given: Any) -> str:
     module = inspect.getmodule(given)
     if module is None or module.__name__.partition(".")[0] == "symphony":
         return ""
@@ -191,15 +208,19 @@ def source_of(planner: str | Callable[..., Any]) -> str:
     if file is not None:
         return _digest(file)
     try:  # of a notebook, say
-        return hashlib.sha256(inspect.getsource(given).encode()).hexdigest()[:12]
+        return _short(inspect.getsource(given).encode())
     except (OSError, TypeError):
         return ""
+
+
+def _short(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:12]
 
 
 def _digest(file: str) -> str:
     """Of what a file holds; empty where there is none that can be read."""
     try:
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12] if Path(file).is_file() else ""
+        return _short(Path(file).read_bytes()) if Path(file).is_file() else ""
     except OSError:
         return ""
 
