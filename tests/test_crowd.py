@@ -443,6 +443,8 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:
     for bad in ("7", "7=", "x=1,2", "7=1", "7=a,b", "7=lane:99", "12345=lane:100", "7=9e9,0", "--7=1,2"):
         with pytest.raises(ConfigError, match="goal"):
             given_goals([bad], [segment], scenes)
+    with pytest.raises(ConfigError, match="given another one"):
+        given_goals([f"{name[0]}=lane:108", f"{name[0]}=lane:110"], [segment], scenes)
     with pytest.raises(ConfigError, match="planner drives"):
         given_goals([f"{name[0]}=lane:108"], [segment], scenes, planned=True)
 

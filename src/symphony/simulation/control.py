@@ -75,7 +75,7 @@ def given_goals(
         planned: whether a planner drives the ego, which then takes no goal.
 
     Raises:
-        ConfigError: a goal that can't be read, names an agent that is not driven or a lane that is not there, or that
+        ConfigError: a goal that can't be read, names an agent that is not driven or has one already, or a lane that is not there, or that
             no feasible route of the agent comes near.
     """
     found = torch.full(scenes.interactive.shape, -1, dtype=torch.int64)
@@ -91,6 +91,8 @@ def given_goals(
                 raise ConfigError(f"goal '{goal}': segment {segment.segment_id} has no driven agent {agent}")
             if planned and int(row[0]) == segment.ego:
                 raise ConfigError(f"goal '{goal}': agent {agent} is the ego, which a planner drives")
+            if int(found[b, place[0]]) >= 0:
+                raise ConfigError(f"goal '{goal}': agent {agent} has been given another one")
             target = _place(goal, where, segment)
             away = _distances(scenes, b, place[0], target)
             if not len(away) or away.min() > REACH:
