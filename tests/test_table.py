@@ -428,6 +428,12 @@ def test_notes_say_what_differs_and_what_is_outdated(tmp_path: Path) -> None:
     assert "runs of BC differ in steps, search.rule\n" in notes
     assert notes.count("was evaluated after") == 1
     assert "bc-1 was evaluated after 5 updates and has 6 now" in notes
+    assert "checkpoint" not in notes
+    entries = [make_entry("bc", seed) for seed in (0, 1)]
+    entries[1].record["run"] |= {"named": True, "checkpoint": 50}
+    notes = "\n".join(compare(entries, "main").notes)
+    assert "bc-1 was evaluated at its checkpoint 50, which it would not choose itself" in notes
+    assert notes.count("checkpoint") == 1
 
 
 @pytest.mark.parametrize(

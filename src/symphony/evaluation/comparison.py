@@ -362,6 +362,11 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
         then, now = entry.record["run"]["updates"], updates_done(entry.folder)
         if then and now and then != now:
             notes.append(f"{entry.folder} was evaluated after {then} updates and has {now} now")
+        if entry.record["run"].get("named"):
+            at = entry.record["run"]["checkpoint"]
+            notes.append(
+                f"{entry.folder} was evaluated at its checkpoint {at}, which it would not choose itself"
+            )
     if dataset is not None:
         notes.append(f"paper: Igl et al. 2022, {dataset} dataset, five seeds")
     return notes
