@@ -182,6 +182,47 @@ def test_memory_that_is_reused_is_never_handed_out(wrap) -> None:
     torch.testing.assert_close(pooled, expected)
 
 
+class Doubled(nn.Sequential):
+    """A network of plain layers that is more than these."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 2.0 * super().forward(x)
+
+
+def spectral(network: nn.Sequential) -> nn.Sequential:
+    nn.utils.spectral_norm(network[0])  # a hook makes the weight anew at each call
+    return network.eval()
+
+
+def watched(network: nn.Sequential) -> nn.Sequential:
+    network[1].register_forward_hook(lambda module, inputs, out: 0.5 * out)
+    return network
+
+
+def clipped(network: nn.Sequential) -> nn.Sequential:
+    network[2].register_full_backward_hook(lambda module, above, below: tuple(0.1 * g for g in above))
+    return network
+
+
+@pytest.mark.parametrize("change", [lambda network: Doubled(*network), spectral, watched, clipped])
+def test_what_a_network_does_beside_its_layers_is_done(change) -> None:
+    _, elements, mask = make(dtype=torch.float32)
+    network = change(mlp((5, 16, 16)))
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.mul_(3.0)
+        expected = network(elements)
+        torch.testing.assert_close(in_blocks(network, elements), expected)
+        dense, winner = (pool_elements(network, elements, mask, mode=mode) for mode in ("dense", "winner"))
+    torch.testing.assert_close(winner, dense)
+    found = []
+    for mode in ("dense", "winner"):
+        network.zero_grad()
+        pool_elements(network, elements, mask, mode=mode).square().sum().backward()
+        found.append([weight.grad.clone() for weight in network.parameters()])
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-4)
+
+
 def test_leading_dimensions_and_empty_inputs():
     network, elements, mask = make(n=6)
     pooled = pool_elements(network, elements.view(2, 3, 60, 5), mask.view(2, 3, 60))

@@ -56,11 +56,19 @@ def in_blocks(
 
 
 def plain_layers(function: Callable[[Tensor], Tensor]) -> list[nn.Linear]:
-    """The linear layers of an :func:`mlp`; of anything else none."""
-    layers = list(function) if isinstance(function, nn.Sequential) else []
+    """The linear layers of an :func:`mlp`; of anything else none, such as one with a normalisation of its weights."""
+    if type(function) is not nn.Sequential or any(map(_hooked, (function, *function))):
+        return []
+    layers = list(function)
     linears = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
     plain = bool(linears) and layers[::2] == linears and layers[-1] is linears[-1]
     return linears if plain and all(type(layer) is nn.ReLU for layer in layers[1::2]) else []
+
+
+def _hooked(module: nn.Module) -> bool:
+    """Whether a module does more, when it is called or differentiated, than its weights tell."""
+    names = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+    return any(getattr(module, name) for name in names)
 
 
 def reusing(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
