@@ -66,7 +66,7 @@ class CarFollower(TensorDictModuleBase):
 
     What :class:`symphony.simulation.planners.IDMPlanner` does for one vehicle, with its parameters, for many at a
     time: boxes of others are taken by their extent along and across the route, and only the nearest ones ahead are
-    looked at. One without a route keeps its heading and follows nobody.
+    looked at. One without a route goes straight on.
 
     Args:
         env: whose scenes have routes.

@@ -75,8 +75,8 @@ def given_goals(
         planned: whether a planner drives the ego, which then takes no goal.
 
     Raises:
-        ConfigError: a goal that can't be read, names an agent that is not driven or has one already, or a lane that is not there, or that
-            no feasible route of the agent comes near.
+        ConfigError: a goal that can't be read, names an agent that is not driven or has one already, or a lane that
+            is not there, or that no feasible route of the agent comes near.
     """
     found = torch.full(scenes.interactive.shape, -1, dtype=torch.int64)
     for goal in goals:
