@@ -460,6 +460,10 @@ def test_padded_agents_do_not_count():
     assert KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]
     with pytest.raises(KeyError, match="absent"):
         KeyScore("score", valid_key="absent")(td)
+    # A score of the whole branch would count once for each agent, another mask for other agents.
+    for shape in ((1,), (1, 1), (1, 3)):
+        with pytest.raises(ConfigError, match="'valid' is"):
+            KeyScore("one", valid_key="valid")(td.clone().set("one", torch.ones(shape)))
 
 
 def test_aggregates_by_hand():

@@ -66,7 +66,7 @@ class KeyScore:
     valid_key: NestedKey | None = None
 
     def __call__(self, tensordict: TensorDictBase) -> Float[Tensor, "*b S N"]:
-        """The scores; KeyError if an entry is absent."""
+        """The scores; KeyError if an entry is absent, ConfigError if the mask is not one of these agents."""
         if self.module is not None:
             # Modules write into what they are given, and whatever is in the state is carried to the next step.
             tensordict = self.module(tensordict.copy())
@@ -82,6 +82,11 @@ class KeyScore:
             valid = tensordict.get(self.valid_key)
             if valid is None:
                 raise KeyError(f"no entry {self.valid_key!r} to mask the score with")
+            if valid.shape != score.shape:
+                # Broadcast, the score of a branch would count for each of its agents.
+                raise ConfigError(
+                    f"{self.valid_key!r} is {list(valid.shape)}, scores of agents are {list(score.shape)}"
+                )
             # not a product: a padded agent may hold NaN
             score = score.where(valid, score.new_zeros(()))
         return score
