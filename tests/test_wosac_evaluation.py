@@ -197,6 +197,16 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return found
 
 
+def test_logs_too_short_for_the_score_are_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(tmp_path / "store", [straight_road(2), straight_road(2, seed=1, steps=12)])
+    assert main(["evaluate", "playback", "--data", str(tmp_path / "store"), "--metrics", "wosac"]) == 1
+    said = capsys.readouterr()
+    assert "the score needs 8" in said.err
+    assert said.out == ""
+
+
 def test_the_record_has_the_score(record: dict[str, Any]) -> None:
     whole = record["wosac"]["agents"]
     assert record["wosac_metametric"] == whole[RANDOM]["metametric"]

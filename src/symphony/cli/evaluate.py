@@ -99,11 +99,15 @@ class Evaluate:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
 
             check_picture(self.figure)
-        if self.metrics:
-            WosacSettings.of(self.config)  # or complain now
         agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         chosen = segment_indices(store, self.segments)
+        if self.metrics:
+            from symphony.evaluation.wosac_segments import wosac_scenario
+
+            future = WosacSettings.of(config).future
+            for item in chosen or range(len(store)):
+                wosac_scenario(store[item], future)  # or complain now, not after the work
         clips: ClipKeeper | None = None
         keepers: list[Callable[[EvaluatedBatch], None]] = []
         if self.figure is not None:
