@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +14,9 @@ from hypothesis import strategies as st
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import compare
 from symphony.evaluation.entries import Entry
-from symphony.evaluation.formats import as_markdown
+from symphony.evaluation.formats import as_latex, as_markdown
 from symphony.evaluation.paired import PAIRED, clustered_mean, differences
-from test_table import make_entry, row_of
+from test_table import make_entry, make_record, row_of
 
 
 def test_paired_differences_are_over_what_both_have_and_over_recordings() -> None:
@@ -72,3 +74,15 @@ def test_metrics_of_a_user_s_own_are_columns_where_all_evaluations_have_them() -
     for entry in entries[1:2]:
         entry.record["config"]["metric"] = []  # type: ignore[index]
     assert path not in {column.key for column in compare(entries, "main").columns}
+
+
+def test_latex_has_no_bare_special_letters() -> None:
+    path = "my.metrics:time_gap"
+    record = make_record(search="tree", branches=16, rule="best", logged_goals=True, metric=[path]) | {
+        path: 1.0
+    }
+    entry = Entry(Path("run"), {"method": "bc"}, "name", record, "tree-16-logged_goals")
+    table = as_latex(compare([entry], "main")).partition(r"\begin{tabular}")[2]
+    assert r"time\_gap" in table
+    assert r"logged\_goals" in table
+    assert not re.search(r"(?<!\\)[_%#$]", table.replace(r"$\times 10^{-3}$", ""))

@@ -272,18 +272,6 @@ def test_markdown_and_latex_read_back(seeds: int, dataset: Any) -> None:
     assert not re.search(r"(?<!\\)%", latex.partition(r"\begin{tabular}")[2])
 
 
-def test_latex_has_no_bare_special_letters() -> None:
-    path = "my.metrics:time_gap"
-    record = make_record(search="tree", branches=16, rule="best", logged_goals=True, metric=[path]) | {
-        path: 1.0
-    }
-    entry = Entry(Path("run"), {"method": "bc"}, "name", record, "tree-16-logged_goals")
-    table = as_latex(compare([entry], "main")).partition(r"\begin{tabular}")[2]
-    assert r"time\_gap" in table
-    assert r"logged\_goals" in table
-    assert not re.search(r"(?<!\\)[_%#$]", table.replace(r"$\times 10^{-3}$", ""))
-
-
 def test_json_reads_back_whole() -> None:
     comparison = compare(full_table(3), "many", "proprietary")
     read = json.loads(as_json(comparison))
