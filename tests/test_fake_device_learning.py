@@ -22,7 +22,7 @@ from symphony.modules import SeededNoise
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.rollouts import simulate, start_states
-from symphony.simulation.search import search
+from symphony.simulation.search import mean_then_sum, search
 
 LOGGED = 4  # a search of them prunes once
 SCENES = collate(
@@ -75,12 +75,13 @@ def test_searches_stay_on_the_device(rule: PruningRule) -> None:
 
         def run() -> Any:
             start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
-            return search(env, agent.policy, agent.discriminator, start, seed=0, rule=rule, prune_every=2)
+            how: Any = {"rule": rule, "prune_every": 2, "leaves": 3, "aggregate": mean_then_sum}
+            return search(env, agent.policy, agent.discriminator, start, seed=0, **how)
 
         run()
         device.waits.clear()
         found = run()
-        assert found.trajectories.shape == (2, 1, 4, LOGGED - 1)
+        assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
         assert found.totals.device.type == NAME
         assert device.waits == []
 

@@ -68,8 +68,10 @@ def max_then_sum(scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
 
 
 def mean_then_sum(scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
-    """The average of each agent over the period, added up likewise."""
-    return (scores.cumsum(-2)[..., -1, :] / scores.shape[-2]).cumsum(-1)[..., -1]
+    """The average of each agent over the period, up to its scene's end, added up likewise."""
+    going = scores != ENDED
+    mean = scores.where(going, 0.0).cumsum(-2)[..., -1, :] / going.sum(-2).clamp_min(1)
+    return mean.cumsum(-1)[..., -1]
 
 
 AGGREGATES = {"max_then_sum": max_then_sum, "mean_then_sum": mean_then_sum}
@@ -89,9 +91,9 @@ def pruning_rule(config: SearchConfig) -> PruningRule:
 
 def aggregate_of(config: SearchConfig) -> Callable[[Tensor], Tensor]:
     """From scores of steps and agents to one per branch; what lies past a scene's end has no say in it."""
-    found = load_object(config.aggregate) if ":" in config.aggregate else AGGREGATES[config.aggregate]
-    # The largest score is none past the end anyway.
-    return found if found is max_then_sum else partial(_until_the_end, found)
+    if ":" in config.aggregate:
+        return partial(_until_the_end, load_object(config.aggregate))
+    return AGGREGATES[config.aggregate]
 
 
 def _until_the_end(
@@ -219,8 +221,6 @@ def search(
         tilt: importance of rare manoeuvres.
     """
     steps = env.decisions
-    # The last period of all says nothing of which leaves of a shorter scene are the best.
-    mixed = bool((env.scenes.last_step < steps).any())
     found = beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
@@ -231,7 +231,6 @@ def search(
         rule=rule,
         aggregate=aggregate,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
-        leaves=None if mixed else leaves,
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         group_key=keys.GOAL if takes_groups(rule) else None,
@@ -242,11 +241,13 @@ def search(
         reseed=_reseed,
         tilt=tilt,
     )
-    return found if leaves is None or not mixed else _best(env, found, start, leaves)
+    return found if leaves is None else _best(env, found, start, leaves)
 
 
 def _best(env: DrivingEnv, found: BeamSearchResult, start: TensorDictBase, leaves: int) -> BeamSearchResult:
-    """Only so many leaves, the best of the last period of their scene."""
+    """Only so many leaves, the best of the last period of their scene: in the last one of all, branches of a shorter
+    scene are equal.
+    """
     decisions = env.scenes.last_step[start.get(keys.SCENE)[..., 0, 0]]
     last = (-(-decisions // found.prune_every) - 1).clamp_min(0)[..., None, None]
 
