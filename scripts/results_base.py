@@ -40,17 +40,15 @@ def records(pattern: str) -> list[Record]:
 def means(rows: Sequence[tuple[str, str]], columns: Sequence[str] = tuple(COLUMNS)) -> Grid:
     """A line per row: means over seeds, with standard errors if there are several; the lowest simulated in bold."""
     values = [[[row[name] for row in records(pattern)] for name in columns] for _, pattern in rows]
-    average = np.array([[np.mean(cell) for cell in line] for line in values])
     digits = [COLUMNS[name][1] for name in columns]
-    simulated = average[[label != PLAYBACK for label, _ in rows]]
-    lowest = [np.round(simulated[:, k], digits[k]).min() for k in range(len(columns))]
+    # Rounded as text is: what looks equal is.
+    shown = [[round(float(np.mean(v)), d) for v, d in zip(line, digits, strict=True)] for line in values]
+    simulated = [line for line, (label, _) in zip(shown, rows, strict=True) if label != PLAYBACK]
+    lowest = [min(column) for column in zip(*simulated, strict=True)]
     grid = [["", *(COLUMNS[name][0] for name in columns)]]
-    for (label, _), line in zip(rows, values, strict=True):
+    for (label, _), line, rounded in zip(rows, values, shown, strict=True):
         cells = [mean_of(cell, number) for cell, number in zip(line, digits, strict=True)]
-        bold = [
-            label != PLAYBACK and round(float(np.mean(cell)), digits[k]) == lowest[k]
-            for k, cell in enumerate(line)
-        ]
+        bold = [label != PLAYBACK and mean == least for mean, least in zip(rounded, lowest, strict=True)]
         grid.append([label, *(f"**{text}**" if b else text for text, b in zip(cells, bold, strict=True))])
     return grid
 
