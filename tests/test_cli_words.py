@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,12 +48,20 @@ def test_help_is_not_broken_where_its_source_is(
     assert "must come in the log to be driven; 0: no limit." in told
 
 
-def test_only_kinds_of_collision_that_happened_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_are_told_where_there_are_some(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     row: dict[str, Any] = dict.fromkeys(("offroad_time", "ade", "min_sade", "curvature_jsd"), 0.0)
     row |= dict.fromkeys((f"collision_{kind}" for kind, _ in KINDS), 0.0)
-    row |= {"agent": "runs/bc", "collision_rate": 12.5, "collision_crossing": 12.5, "search": "log"}
+    row |= {"agent": "runs/bc", "collision_rate": 12.5, "collision_crossing": 12.5}
+    row |= {"curvature_jsd_corrected": math.nan, "curvature_jsd_se": math.nan, "curvature_jsd_floor": 0.25}
+    row |= {"my:jerk": 1.5, "my:jerk_se": 0.5, "standing": math.nan}
     print_metrics([row | {"interactive": 2, "rollouts": 4, "segments": 2, "groups": 2, "seed": 0}])
-    assert "bc: collisions, % of rollouts: 12.5 crossing\n" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "bc: collisions, % of rollouts: 12.5 crossing\n" in told
+    assert "bc: my:jerk 1.5000 ± 0.5000\n" in told
+    assert "bc: JSD 0.0000, corrected for sampling –; the log's finite size alone gives 0.2500\n" in told
 
 
 def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

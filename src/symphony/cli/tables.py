@@ -112,13 +112,15 @@ def write_numbers(path: Path, numbers: Any) -> None:
 
 def _more(row: dict[str, Any]) -> list[str]:
     """What else there is to say of an agent, in lines."""
-    lines: list[str] = []
+    own = (name for name in row if ":" in name and not name.endswith("_se"))
+    lines = [f"{name} {number_cell(row[name], row.get(f'{name}_se'), 4)}" for name in own]
     if row.get("search") == "log":
         return lines
     if not math.isnan(row.get("curvature_jsd_floor", math.nan)):
+        corrected = number_cell(row["curvature_jsd_corrected"], row["curvature_jsd_se"], 4)
         lines.append(
-            f"JSD {row['curvature_jsd']:.4f}, corrected for sampling {row['curvature_jsd_corrected']:.4f} ± "
-            f"{row['curvature_jsd_se']:.4f}; the log's finite size alone gives {row['curvature_jsd_floor']:.4f}"
+            f"JSD {row['curvature_jsd']:.4f}, corrected for sampling {corrected}; "
+            f"the log's finite size alone gives {row['curvature_jsd_floor']:.4f}"
         )
     if not math.isnan(row.get("standing", math.nan)):
         lines.append(f"{row['standing']:.1f} % stand at the end, {row['standing_log']:.1f} % in the log")
