@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from helpers_segments import crossing, straight_road
+from symphony.cli import recipe as recipes
 from symphony.data.store_writer import StoreWriter
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
@@ -91,3 +92,25 @@ def test_recipe(
     assert found["ade"] > 0
     assert len(found["per_segment"]) == 2
     assert f"{found['ade']:.2f}" in capsys.readouterr().out
+
+
+def test_mistakes_are_told_in_a_line_before_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with StoreWriter(tmp_path / "train") as writer:
+        writer.append(straight_road(4, steps=16))
+    words = [
+        "--data",
+        str(tmp_path / "train"),
+        "--test",
+        str(tmp_path / "none"),
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    monkeypatch.setattr(sys, "argv", ["bc.py", *words, *COMMON])
+    monkeypatch.setattr(recipes, "settle", lambda: None)
+    with pytest.raises(SystemExit) as ended:
+        recipes.run("bc", None)
+    assert ended.value.code == 1
+    assert "none: no such directory" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

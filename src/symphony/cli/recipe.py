@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from symphony.cli import settle
+from symphony.cli import _guarded, settle
 from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
 from symphony.cli.helps import PARAGRAPHS
 from symphony.cli.profiles import WORDS, expanded
@@ -31,19 +31,20 @@ class Arguments:
 
 
 def run(method: Method, description: str | None, args: Sequence[str] | None = None) -> None:
-    """Run the recipe of a method with command-line arguments, by default those of the process."""
+    """Run the recipe of a method with command-line arguments; by default with those of the process, which it ends."""
     if args is None:
         settle()
+        sys.exit(_guarded(lambda: run(method, description, sys.argv[1:])))
     from symphony.agents import load_agent
     from symphony.data.store import SegmentStore
     from symphony.evaluation.records import evaluation_record, keep_evaluation
     from symphony.recipes import train
 
-    given = list(sys.argv[1:] if args is None else args)
     settings = tyro.cli(
-        Arguments, description=description, args=expanded([method, *given]), registry=PARAGRAPHS
+        Arguments, description=description, args=expanded([method, *args]), registry=PARAGRAPHS
     )
-    folder, store = train(settings.training), SegmentStore(settings.test)
+    store = SegmentStore(settings.test)  # or complain now, not after the training
+    folder = train(settings.training)
     config = EvaluateConfig(
         rollouts=settings.rollouts, seed=settings.training.seed, device=settings.training.device
     )
