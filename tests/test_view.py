@@ -212,7 +212,10 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
       const maps = scene.map.drawn;
       for (let i = 0; i < 20; i++) { seek(i / 2); frame(0); }
       out.redrawn = scene.map.drawn - maps;
-      await open(1); out.periods = search.periods;
+      await open(1); out.periods = search.periods; out.place = location.hash;
+      const two = scene.replay, driven = Array.from(two.agents);
+      two.drivers = driven.map((_, n) => n ? "background:idm" : "");
+      out.roles = driven.map(row => role(two, row)); out.names = driven.map(row => followName(two, row));
       out.fates = Array.from({length: search.branches}, (_, s) => search.fate(0, 0, s)[0]);
       out.history = search.history(0, search.periods - 1, search.slot(0, search.periods - 1, 0));
       const box = $("tree").getBoundingClientRect(), l = search.layout();
@@ -245,6 +248,9 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
     fates = np.where(kept, "kept", np.where(went_on, "died out", "pruned"))
     assert out["fates"] == fates.tolist()
     assert out["history"] == trees.slots[0, np.arange(tree.steps) // trees.prune_every, 0].tolist()
+    assert "t=0.00" in out["place"]  # not the time at which the segment before was left
+    assert out["roles"] == ["ego", "background, driven by idm"]
+    assert [name.split()[0] for name in out["names"]] == ["ego", "background"]
     assert out["branch"].startswith("Branch 0, 0.0–")
     highest = trees.score[0, 0, : trees.prune_every].max()
     assert f"Highest score: {highest:.2f}, agent " in out["branch"]

@@ -45,6 +45,12 @@ class Replay {
     this.color = row => row === this.ego ? PALETTE[0] : PALETTE[(1 + others.indexOf(row)) % PALETTE.length];
   }
 
+  // What a driven agent is: one that is evaluated, or background that drives by a rule.
+  kind(row) {
+    if (row === this.ego) return "ego";
+    return (this.drivers[this.rank.get(row)] || "").startsWith("background:") ? "background" : "interactive";
+  }
+
   // State at time t (in steps) from arrays of so many states; null where the agent isn't there.
   at(prefix, index, t) {
     const i = Math.min(Math.floor(t), this.states - 1), f = t - i, a = index * this.states + i;

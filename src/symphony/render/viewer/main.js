@@ -28,12 +28,12 @@ async function open(segment, wanted = {}) {
   legend(r);
   resize();
   fit();
-  choose(Math.min(wanted.rollout || 0, r.rollouts - 1));
   seek(wanted.step || 0);
+  choose(Math.min(wanted.rollout || 0, r.rollouts - 1));
   if (wanted.agent !== undefined) select(wanted.agent);
 }
 
-const followName = (r, row) => `${row === r.ego ? "ego" : r.rank.has(row) ? "interactive" : "agent"} ${escapeText(r.ids[row])}`;
+const followName = (r, row) => `${r.rank.has(row) || row === r.ego ? r.kind(row) : "agent"} ${escapeText(r.ids[row])}`;
 function rolloutNote(r, k) {
   const found = r.events.filter(e => e.rollout === k);
   const hits = found.filter(e => e.kind === "collision");
@@ -96,7 +96,7 @@ function resize() {
 }
 function legend(r) {
   const rows = Array.from(new Set([r.ego, ...r.agents])).filter(row => r.rank.has(row));
-  const entries = rows.slice(0, 8).map(row => `<div><b style="background:${r.color(row)}"></b>${row === r.ego ? "ego" : "interactive"} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
+  const entries = rows.slice(0, 8).map(row => `<div><b style="background:${r.color(row)}"></b>${r.kind(row)} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
   if (rows.length > 8) entries.push(`<div>and ${rows.length - 8} more driven</div>`);
   $("legend").innerHTML = entries.join("") + `<div><b style="background:${PLAYBACK}"></b>playback</div><div><b class="dash"></b>log</div>`;
 }

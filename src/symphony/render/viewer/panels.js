@@ -4,8 +4,8 @@ const escapeText = text => String(text).replace(/[&<>"]/g, c => ({ "&": "&amp;",
 
 function role(r, row) {
   if (!r.rank.has(row)) return row === r.ego ? "ego, log playback" : "log playback";
-  const driver = r.drivers[r.rank.get(row)];
-  return (row === r.ego ? "ego" : "interactive") + (driver ? `, driven by ${driver}` : "");
+  const driver = (r.drivers[r.rank.get(row)] || "").replace(/^background:/, "");
+  return r.kind(row) + (driver ? `, driven by ${driver}` : "");
 }
 
 function describeAgent(r, view) {
