@@ -71,7 +71,7 @@ PAGES = (
             "appendix",
             "wosac",
             "planners",
-            "rollouts",
+            "crowds",
         )
     ),
 )
