@@ -103,6 +103,14 @@ def test_a_resumed_run_ends_with_the_same_weights(run: Path, store: Path, tmp_pa
     assert [r["step"] for r in read_metrics(out)] == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_run_that_failed_at_its_first_update_is_no_run(run: Path, store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again"
+    with pytest.raises(DataError, match="60 are asked for"):
+        train(config(store, out, duration=60))
+    train(config(store, out))
+    assert same_weights(weights(run), weights(out))
+
+
 def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path) -> None:
     with pytest.raises(ConfigError, match="holds a run already"):
         train(config(store, run))

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from symphony.files import naming, write_file
 
+RECORDS = "metrics.jsonl"
+
 
 class Tracker:
     """Writes the metrics of a run.
@@ -43,7 +45,7 @@ class Tracker:
         tags: Sequence[str] = (),
         after: int = 0,
     ) -> None:
-        self.path = folder / "metrics.jsonl"
+        self.path = folder / RECORDS
         self.kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
         # Put in place as a whole, lest a kill meanwhile lose what is kept.
         write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
@@ -105,7 +107,7 @@ class Tracker:
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """The records of a run so far; a line that is none, such as a last one cut short by a kill, is left out."""
-    path = folder / "metrics.jsonl"
+    path = folder / RECORDS
     if not path.is_file():
         return []
     records = []

@@ -10,6 +10,7 @@ from symphony.agents.checkpoint import latest, load_checkpoint, parts_of
 from symphony.agents.choice import choose, split_name
 from symphony.config import AgentSpec, RunConfig, read_json
 from symphony.errors import ConfigError
+from symphony.training.logging import RECORDS
 
 FREE = (
     "out",
@@ -34,8 +35,12 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
     Raises:
         ConfigError: if the folder holds a run that is not to be gone on with, or another one.
     """
-    path = config.out / "config.json"
+    path, records = config.out / "config.json", config.out / RECORDS
+    found = latest(config.out / "checkpoints")
     if path.exists():
+        # One that failed at its first update, say for a wrong setting, has nothing to lose.
+        if not config.resume and found is None and not (records.exists() and records.stat().st_size):
+            return None
         if not config.resume:
             raise ConfigError(f"{config.out} holds a run already; choose another folder or --resume")
         before = read_json(type(config), path)
@@ -53,7 +58,6 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
         ]
         if changed:
             raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
-    found = latest(config.out / "checkpoints")
     if found is not None and not path.exists():
         raise ConfigError(
             f"{config.out} holds checkpoints of a run whose config.json is gone; choose another folder"
