@@ -178,6 +178,12 @@ ADVERSARIAL = (
     ("and 300 with the gradient through reactions, too", "adversarial/{}-react"),
 )
 """MGAIL before and after adversarial updates, and their records on the validation parts."""
+LONGER = (
+    ("6 000 updates of regression at 0.003", "adversarial/{}-longer-start"),
+    ("and 150 adversarial ones", "adversarial/{}-longer-150"),
+    ("and 600", "adversarial/{}-longer-600"),
+)
+"""MGAIL of another seed that goes on for longer, on more validation segments."""
 SETTINGS = {"many": "8 agents", "long": "20 s"}
 
 
