@@ -8,16 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers_runs import tiny
+from helpers_segments import straight_road
 from symphony import keys
 from symphony.config import SamplingConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.recipes import train
@@ -130,3 +133,15 @@ def test_interactive_agents_come_more_often() -> None:
         return float(((own[:, None] - size).abs().amax(-1) < 1e-4).any(1).float().mean())
 
     assert share(often) > share(data)
+
+
+def test_a_batch_in_which_nothing_counts_is_named(tmp_path: Path) -> None:
+    standing = straight_road(2, steps=11)
+    standing = standing.replace(
+        position=standing.position[:, :1].repeat(11, 1), velocity=np.zeros_like(standing.velocity)
+    )
+    with StoreWriter(tmp_path / "store") as writer:
+        writer.append(standing)
+    data = SceneDataset(SegmentStore(tmp_path / "store"), 1, Bicycle(), sampling=SamplingConfig(standing=0.0))
+    with pytest.raises(DataError, match=r"store.*sampling.*none of the states"):
+        data.sample_states([0], 8, ObservationConfig(), rng(0))

@@ -13,15 +13,18 @@ class SubmissionMeta:
     """What a submission says about itself; there are no defaults for what only its authors can answer.
 
     Attributes:
-        account_name: e-mail address registered with the challenge.
-        unique_method_name: short name on the leaderboard.
-        uses_lidar_data: whether the model uses lidar data.
-        uses_camera_data: whether it uses camera data.
-        uses_public_model_pretraining: whether public models were used for pre-training.
-        num_model_parameters: a number with a suffix, such as ``200K``.
-        acknowledge_complies_with_closed_loop_requirement: that every step was simulated from the steps before it.
-        authors, affiliation, description, method_link: further information.
-        public_model_names: which public models.
+        account_name: E-mail address registered with the challenge.
+        unique_method_name: Short name on the leaderboard.
+        uses_lidar_data: Whether the model uses lidar data.
+        uses_camera_data: Whether it uses camera data.
+        uses_public_model_pretraining: Whether public models were used for pre-training.
+        num_model_parameters: A number with a suffix, such as ``200K``.
+        acknowledge_complies_with_closed_loop_requirement: That every step was simulated from the steps before it.
+        authors: Their names.
+        affiliation: Of the authors.
+        description: Of the method.
+        method_link: A page on the method.
+        public_model_names: Which public models.
     """
 
     account_name: str

@@ -286,6 +286,12 @@ class SceneDataset:
         ]
         speed = [expert.states[place][:, 3] for expert, place in zip(experts, places, strict=True)]
         weights = state_weights(torch.cat(acts), torch.cat(speed), self.sampling)
+        if not (weights > 0).any():
+            raise DataError(
+                "none of the states drawn for an update counts; give a larger batch or weights above 0",
+                file=self.store.path,
+                field="sampling",
+            )
         return torch.multinomial(weights, count, replacement=True, generator=rng)
 
     def sample_goals(

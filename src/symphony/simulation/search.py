@@ -22,6 +22,8 @@ from symphony.collectors import (
     ReplaceBad,
     Systematic,
     beam_search,
+    max_then_sum,
+    mean_then_sum,
 )
 from symphony.collectors.result import ranking
 from symphony.collectors.rules import takes_groups
@@ -58,20 +60,6 @@ KEPT: Sequence[keys.Key] = [
 def kept_keys(env: DrivingEnv, also: Sequence[keys.Key] = ()) -> list[keys.Key]:
     """:data:`KEPT`, with the personas of agents that have them."""
     return [*KEPT, *([keys.PERSONA] if env.observation.persona else []), *also]
-
-
-def max_then_sum(scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
-    """The paper's total: the worst moment of each agent, added up. One by one: how many padded agents follow would
-    change the last bit of a sum.
-    """
-    return scores.amax(-2).cumsum(-1)[..., -1]
-
-
-def mean_then_sum(scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
-    """The average of each agent over the period, up to its scene's end, added up likewise."""
-    going = scores != ENDED
-    mean = scores.where(going, 0.0).cumsum(-2)[..., -1, :] / going.sum(-2).clamp_min(1)
-    return mean.cumsum(-1)[..., -1]
 
 
 AGGREGATES = {"max_then_sum": max_then_sum, "mean_then_sum": mean_then_sum}
