@@ -145,7 +145,7 @@ def test_an_agent_drives_in_the_style_that_it_is_told(agent: Agent, store: Path)
 
 
 def test_what_is_no_persona_is_refused(store: Path) -> None:
-    for wrong in ("fast", "speed=2", "headway=x", "headway=.5,colour=.1"):
+    for wrong in ("headway=.8,headway=.3", "fast", "speed=2", "headway=x", "headway=.5,colour=.1"):
         with pytest.raises(ConfigError, match=r"headway=\.8,speed=\.3"):
             EvaluateConfig(persona=wrong)
     plain = load_agent("pretrained:bc_ts_h")

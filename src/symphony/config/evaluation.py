@@ -39,16 +39,17 @@ def persona_quantiles(text: str) -> dict[str, float]:
     """From ``headway=.8,speed=.3`` to numbers by name; either may be missing.
 
     Raises:
-        ConfigError: it can't be read, or a number is not between 0 and 1.
+        ConfigError: it can't be read, names something twice, or a number is not between 0 and 1.
     """
     found: dict[str, float] = {}
     for part in text.split(",") if text else []:
         name, _, number = part.partition("=")
+        twice = name in found
         try:
             found[name] = float(number)
         except ValueError:
             found[name] = -1.0
-        if name not in PERSONA_PARTS or not 0 <= found[name] <= 1:
+        if twice or name not in PERSONA_PARTS or not 0 <= found[name] <= 1:
             raise ConfigError(
                 f"a persona is such as headway=.8,speed=.3 (quantiles from 0 to 1), not '{text}'"
             )
