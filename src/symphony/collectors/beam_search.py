@@ -54,6 +54,7 @@ def beam_search(
     keep: Sequence[NestedKey] | None = None,
     keep_tree: bool = False,
     leaves: int | None = None,
+    last_period: Int[Tensor, "*b"] | None = None,
     retries: int = 0,
     retry_above: float | None = None,
     reseed: Callable[[TensorDictBase, int], TensorDictBase] | None = None,
@@ -89,6 +90,7 @@ def beam_search(
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
         leaves: return only so many, the best of the last period first; default all, in the order of their slots.
+        last_period: [*b] number of the period that is the last for `leaves`, where rows end sooner than others.
         retries: how often a period may be simulated again, from its start, for branches that ended it with a
             total above `retry_above`; the lowest total of a branch counts. All branches are run again and only
             those concerned take the result, so that shapes do not depend on the data.
@@ -157,7 +159,13 @@ def beam_search(
     )
     slots = lineage(all_parents)
     if leaves is not None:
-        best = ranking(all_totals[..., -1, :].detach(), slots[..., -1, :])[..., :leaves]
+        ended = (
+            torch.full(start.shape[:-1], len(periods) - 1, device=slots.device)
+            if last_period is None
+            else last_period
+        )
+        last_totals, last_slots = (_period(part, ended) for part in (all_totals.detach(), slots))
+        best = ranking(last_totals, last_slots)[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
     log_weights = None
     if weights:
@@ -178,6 +186,12 @@ def beam_search(
         simulated_steps=simulated * start.numel(),
         log_weights=log_weights,
     )
+
+
+def _period(values: Shaped[Tensor, "*b P S"], number: Int[Tensor, "*b"]) -> Shaped[Tensor, "*b S"]:
+    """Of each row the values of a period of its own."""
+    place = number[..., None, None].expand(*number.shape, 1, values.shape[-1])
+    return values.gather(-2, place).squeeze(-2)
 
 
 def _tiltable(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +24,6 @@ from symphony.collectors import (
     max_then_sum,
     mean_then_sum,
 )
-from symphony.collectors.result import ranking
 from symphony.collectors.rules import takes_groups
 from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
@@ -208,8 +206,8 @@ def search(
         also: what is kept of every step beside :data:`KEPT`.
         tilt: importance of rare manoeuvres.
     """
-    steps = env.decisions
-    found = beam_search(
+    steps, scene = env.decisions, start.get(keys.SCENE)[..., 0, 0]
+    return beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
         realism_score(env, discriminator, ego=ego),
@@ -219,6 +217,9 @@ def search(
         rule=rule,
         aggregate=aggregate,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
+        leaves=leaves,
+        # In the last period of all, branches of a shorter scene are equal.
+        last_period=(-(-env.scenes.last_step[scene] // prune_every) - 1).clamp_min(0),
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         group_key=keys.GOAL if takes_groups(rule) else None,
@@ -228,29 +229,6 @@ def search(
         retry_above=retry_above if retries else None,
         reseed=_reseed,
         tilt=tilt,
-    )
-    return found if leaves is None else _best(env, found, start, leaves)
-
-
-def _best(env: DrivingEnv, found: BeamSearchResult, start: TensorDictBase, leaves: int) -> BeamSearchResult:
-    """Only so many leaves, the best of the last period of their scene: in the last one of all, branches of a shorter
-    scene are equal.
-    """
-    decisions = env.scenes.last_step[start.get(keys.SCENE)[..., 0, 0]]
-    last = (-(-decisions // found.prune_every) - 1).clamp_min(0)[..., None, None]
-
-    def at_the_end(values: Tensor) -> Tensor:
-        return values.gather(-2, last.expand(*last.shape[:-1], values.shape[-1]))[..., 0, :]
-
-    best = ranking(at_the_end(found.totals).detach(), at_the_end(found.slots))[..., :leaves]
-    rows = torch.meshgrid(*(torch.arange(k, device=best.device) for k in best.shape), indexing="ij")[:-1]
-    weights = found.log_weights
-    return replace(
-        found,
-        trajectories=found.trajectories[(*rows, best)],
-        scores=found.scores[(*rows, best)],
-        slots=found.slots.gather(-1, best[..., None, :].expand(*found.slots.shape[:-1], leaves)),
-        log_weights=None if weights is None else weights.gather(-1, best),
     )
 
 
