@@ -278,6 +278,20 @@ def test_lineage_by_hand():
     assert lineage(parents).tolist() == [[[2, 0, 0], [0, 1, 1], [2, 1, 0]]]
 
 
+def test_leaves_are_chosen_at_the_end_of_each_row():
+    start = starts(Walk(), 3, branches=4)
+    found, every = (search(start, **how) for how in ({"leaves": 2}, {}))
+    for last in range(every.totals.shape[-2]):
+        chosen = search(start, leaves=2, last_period=torch.full((3,), last))
+        totals = every.totals[:, last].gather(-1, every.slots[:, last]).sort(-1).values[:, :2]
+        assert_close(
+            chosen.totals[:, last].gather(-1, chosen.slots[:, last]).sort(-1).values[:, 0], totals[:, 0]
+        )
+    assert torch.equal(chosen.slots, found.slots)
+    with pytest.raises(ConfigError, match="last_period is"):
+        search(start, leaves=2, last_period=torch.zeros(2, dtype=torch.int64))
+
+
 def test_marks_of_the_tree():
     found = search(starts(Walk(), 3, branches=4), keep_tree=True)
     assert (found.survived.sum(-1) == 2).all()

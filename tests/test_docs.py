@@ -77,7 +77,7 @@ def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_commands_are_understood(
     page: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(symphony.cli, "_guarded", lambda run: 0)  # parsed as ever, but nothing runs
+    monkeypatch.setattr(symphony.cli, "guarded", lambda run: 0)  # parsed as ever, but nothing runs
     for words in commands(page):
         if words[0] == "symphony":
             assert symphony.cli.main(words[1:]) == 0, (
@@ -86,7 +86,7 @@ def test_commands_are_understood(
 
 
 def test_a_wrong_flag_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(symphony.cli, "_guarded", lambda run: 0)
+    monkeypatch.setattr(symphony.cli, "guarded", lambda run: 0)
     assert symphony.cli.main(["data", "info", "DIR"]) == 0
     assert symphony.cli.main(["data", "info", "DIR", "--no-such-flag"]) == 2
 

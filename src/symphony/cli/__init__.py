@@ -84,7 +84,7 @@ def main(args: Sequence[str] | None = None) -> int:
         args = sys.argv[1:]
     args = list(args)
     if args == ["--version"]:
-        return _guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
+        return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
         if args[:1] == ["train"]:
             args = profiles.expanded(args)
@@ -99,9 +99,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return _complain(error, USAGE)
     except SystemExit as stop:
         # Help or a complaint was printed; whoever read it may have gone, say `head`.
-        return _guarded(lambda: None) or int(stop.code or 0)
+        return guarded(lambda: None) or int(stop.code or 0)
     except BrokenPipeError:
-        return _guarded(_gone)
+        return guarded(_gone)
 
     def run() -> None:
         for name in RESULTS:
@@ -110,7 +110,7 @@ def main(args: Sequence[str] | None = None) -> int:
                 check_writable(path)
         command.run()
 
-    return _guarded(run)
+    return guarded(run)
 
 
 def settle() -> None:
@@ -146,7 +146,7 @@ def _ended_politely() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _guarded(action: Callable[[], object]) -> int:
+def guarded(action: Callable[[], object]) -> int:
     """Run something; errors that a user can meet become one line and an exit status."""
     try:
         with _ended_politely(), warnings.catch_warnings():

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from symphony.cli import _guarded, settle
+from symphony.cli import guarded, settle
 from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
 from symphony.cli.helps import PARAGRAPHS
 from symphony.cli.profiles import WORDS, expanded
@@ -34,7 +34,7 @@ def run(method: Method, description: str | None, args: Sequence[str] | None = No
     """Run the recipe of a method with command-line arguments; by default with those of the process, which it ends."""
     if args is None:
         settle()
-        sys.exit(_guarded(lambda: run(method, description, sys.argv[1:])))
+        sys.exit(guarded(lambda: run(method, description, sys.argv[1:])))
     from symphony.agents import load_agent
     from symphony.data.store import SegmentStore
     from symphony.evaluation.records import evaluation_record, keep_evaluation

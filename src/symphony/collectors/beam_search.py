@@ -107,6 +107,8 @@ def beam_search(
             do not fit.
     """
     _check(start, steps, prune_every, leaves, retries, retry_above)
+    if last_period is not None and last_period.shape != start.shape[:-1]:
+        raise ConfigError(f"last_period is {list(last_period.shape)}, rows are {list(start.shape[:-1])}")
     if tilt is not None and not _tiltable(rule, start, leaves, retries, group_key):
         raise ConfigError(
             "a tilt goes with rule Systematic and all leaves, without groups and without retries"
