@@ -50,6 +50,7 @@ def random_trees(saved: SavedRollouts, branches: int = 4, every: int = 2, seed: 
     periods = -(-saved.steps // every)
     return SavedTrees(
         state=rng.normal(size=(*shape, 4)).astype(np.float32),
+        there=rng.random(shape) < 0.8,
         collision=rng.random(shape) < 0.5,
         offroad=rng.random(shape) < 0.5,
         score=rng.normal(size=shape).astype(np.float32),

@@ -28,6 +28,8 @@ from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import SceneBatch, collate
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
+from symphony.evaluation.pictures import search_tree
+from symphony.render import plot_search
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.control import given_goals
 from symphony.simulation.crowd import Crowd, CrowdDataset, crowd_dataset
@@ -363,6 +365,22 @@ def test_a_saved_world_shows_who_is_there(store: SegmentStore, tmp_path: Path) -
     # At constant speed all is as logged, entering and leaving included.
     assert (world.valid == segment.valid).all()
     assert not segment.valid.all()
+
+
+def test_a_saved_tree_shows_who_is_there(store: SegmentStore, tmp_path: Path) -> None:
+    config = EvaluateConfig(rollouts=2, branches=4, interactive="all")
+    dataset = crowd_dataset(store, tiny(), config, [2])
+    (saved,) = save_simulation(tmp_path, tiny(), dataset, config)
+    trees, steps = saved.trees, np.arange(saved.steps)
+    assert trees is not None
+    assert not trees.there.all()
+    for k in range(saved.rollouts):
+        history = trees.slots[0, steps // trees.prune_every, k]
+        np.testing.assert_array_equal(trees.there[0, history, steps], saved.counted[k])
+    drawn = search_tree(tiny(), dataset, 0, config)
+    np.testing.assert_array_equal(np.isfinite(drawn.position).all(-1)[..., drawn.real], trees.there[0])
+    plot_search(dataset.segment(0), drawn, tmp_path / "tree.png")
+    assert (tmp_path / "tree.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,9 @@ def test_a_packed_segment_holds_its_numbers(number: int) -> None:
     np.testing.assert_allclose(np.cos(turn), 1, atol=1e-7)
     np.testing.assert_allclose(arrays["size"], segment.size[:, :2], atol=0.006)
     if saved.trees is not None:
-        np.testing.assert_allclose(arrays["tree.x"].swapaxes(2, 3), saved.trees.state[..., 0], atol=6e-4)
+        x = np.where(saved.trees.there, saved.trees.state[..., 0], 0)
+        np.testing.assert_allclose(arrays["tree.x"].swapaxes(2, 3), x, atol=6e-4)
+        np.testing.assert_array_equal(arrays["tree.valid"].swapaxes(2, 3), saved.trees.there)
         np.testing.assert_array_equal(arrays["tree.totals"], saved.trees.totals)
         np.testing.assert_array_equal(arrays["tree.parents"], saved.trees.parents)
 
@@ -222,6 +224,12 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
       const where = { clientX: box.left + l.left + 2, clientY: box.top + l.top + 2, bubbles: true };
       $("tree").dispatchEvent(new MouseEvent("click", where));
       out.branch = $("branch").textContent;
+      let points = 0;
+      const pen = new Proxy({}, { get: () => () => { points++; }, set: () => true });
+      const drawn = () => { points = 0; scene.branch(pen, view); return points; };
+      seek(view.branch.steps.length);
+      out.drawn = drawn();
+      two["tree.valid"].fill(0); out.absent = drawn(); out.peak = search.peak(0, 0, 0);
     """
     out = json.loads(driven_page(tmp_path, script, [saved, tree]))
     assert "error" not in out
@@ -252,6 +260,11 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
     assert out["roles"] == ["ego", "background, driven by idm"]
     assert [name.split()[0] for name in out["names"]] == ["ego", "background"]
     assert out["branch"].startswith("Branch 0, 0.0–")
+    # Of agents that are not there, nothing is drawn.
+    agents = len(tree.agents)
+    assert out["drawn"] > 5 * agents
+    assert out["absent"] == 3 * agents  # an empty path each, stroked twice
+    assert out["peak"] is None
     highest = trees.score[0, 0, : trees.prune_every].max()
     assert f"Highest score: {highest:.2f}, agent " in out["branch"]
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -186,13 +187,14 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
     result = found.search
     if result is None or result.tree is None or found.drawn is None:
         raise RuntimeError("the search kept no tree")
-    state, collision, offroad = (
+    state, there, collision, offroad = (
         result.tree.get(("next", *key))[0, 0].cpu().numpy()
-        for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)
+        for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
     )
     agents = torch.where(scene.interactive_valid, scene.interactive, -1)[0]
     return SearchTree(
-        position=state[..., :2],
+        # In open traffic agents come and go.
+        position=np.where(there[..., None], state[..., :2], np.nan),
         score=result.simulated_scores[0, 0].cpu().numpy(),
         parents=result.parents[0, 0].cpu().numpy(),
         reaches_leaf=result.reaches_leaf[0, 0].cpu().numpy(),

@@ -81,7 +81,7 @@ class SearchTree:
     S branches (slots), T steps in P periods, N agents; the last period may be shorter.
 
     Attributes:
-        position: [S, T, N, 2] box centres after each step, metres.
+        position: [S, T, N, 2] box centres after each step, metres; NaN where an agent is not there.
         score: [S, T, N] of those states; high is bad. NaN where there is none.
         parents: [P, S] after period p slot s was continued from slot ``parents[p, s]``.
         reaches_leaf: [P, S] bool, whether what a slot simulated in a period is part of a leaf's history.

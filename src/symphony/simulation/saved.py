@@ -34,6 +34,7 @@ class SavedTrees:
 
     Attributes:
         state: [R, S, T, N, 4] x, y, heading, speed after each step, by the slot that simulated it.
+        there: [R, S, T, N] whether the agent is there then (in open traffic agents come and go).
         collision: [R, S, T, N].
         offroad: [R, S, T, N].
         score: [R, S, T, N] of those states, high is bad; NaN where there is none.
@@ -44,6 +45,7 @@ class SavedTrees:
     """
 
     state: NDArray[np.float32]
+    there: NDArray[np.bool_]
     collision: NDArray[np.bool_]
     offroad: NDArray[np.bool_]
     score: NDArray[np.float32]
@@ -221,14 +223,15 @@ def _trees(
     if slots.shape[0] * slots.shape[-1] != rollouts:
         message = f"{slots.shape[0]} trees of {slots.shape[-1]} leaves are not {rollouts} rollouts"
         raise DataError(message, segment=segment_id, field="tree.slots")
-    state, collision, offroad = (
+    state, there, collision, offroad = (
         _array(search.tree.get(("next", *key))[row])[:, :, :steps, real]
-        for key in (keys.STATE, keys.COLLISION, keys.OFFROAD)
+        for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
     )
     periods = math.ceil(steps / search.prune_every)
     totals, parents = (_array(part[row])[:, :periods] for part in (search.totals, search.parents))
     return SavedTrees(
         state=state,
+        there=there,
         collision=collision[..., 0],
         offroad=offroad[..., 0],
         score=_array(search.simulated_scores[row])[:, :, :steps, real],

@@ -47,6 +47,7 @@ _WEIGHT = "log_weight"
 """Of an array that only some files have."""
 _TREE_SHAPES: dict[str, tuple[Any, str]] = {
     "state": (np.float32, "RSTN4"),
+    "there": (np.bool_, "RSTN"),
     "collision": (np.bool_, "RSTN"),
     "offroad": (np.bool_, "RSTN"),
     "score": (np.float32, "RSTN"),
@@ -156,6 +157,8 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     )
     trees = None
     if "prune_every" in facts:
+        # Files of before November 23, 2026 don't say who is there.
+        arrays.setdefault("tree.there", np.ones(reader.array("tree.offroad").shape, np.bool_))
         parts = {name: reader.array(f"tree.{name}") for name in _TREE}
         trees = SavedTrees(**parts, prune_every=reader.fact("prune_every", int))
     failed = reader.fact("failed", dict)
@@ -218,7 +221,7 @@ def _check_trees(trees: SavedTrees, sizes: dict[str, int]) -> None:
     if sizes["R"] * sizes["L"] != sizes["K"]:
         message = f"{sizes['R']} trees of {sizes['L']} leaves are not {sizes['K']} rollouts"
         raise DataError(message, field="tree.slots")
-    _check_state("tree.state", trees.state)
+    _check_state("tree.state", trees.state[trees.there])
     if np.isinf(trees.score).any():
         raise DataError("holds an infinite number", field="tree.score")
 

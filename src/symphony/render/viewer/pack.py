@@ -172,7 +172,8 @@ def _pack_road(packer: _Packer, segment: RunSegment) -> None:
 
 def _pack_trees(packer: _Packer, trees: SavedTrees) -> dict[str, Any]:
     # Time last, as everywhere in the page.
-    packer.states("tree", trees.state.swapaxes(2, 3))
+    packer.states("tree", np.where(trees.there[..., None], trees.state, 0).swapaxes(2, 3))
+    packer.add("tree.valid", "u8", trees.there.swapaxes(2, 3))
     packer.add("tree.score", "f32", trees.score.swapaxes(2, 3))
     for name in ("totals", "parents", "slots"):
         packer.add(f"tree.{name}", "f32" if name == "totals" else "i16", getattr(trees, name))

@@ -169,16 +169,18 @@ class Scene {
     const r = this.replay, n = r.agents.length, { steps, tree } = view.branch;
     for (let i = 0; i < n; i++) {
       context.beginPath();
-      let last = 0;
+      let pen = false;
       steps.forEach((slot, t) => {
-        last = ((tree * r.branches + slot) * n + i) * r.steps + t;
-        context.lineTo(r["tree.x"][last], r["tree.y"][last]);
+        const a = ((tree * r.branches + slot) * n + i) * r.steps + t;
+        if (r["tree.valid"][a]) pen ? context.lineTo(r["tree.x"][a], r["tree.y"][a]) : context.moveTo(r["tree.x"][a], r["tree.y"][a]);
+        pen = r["tree.valid"][a];
       });
       context.strokeStyle = "white"; context.lineWidth = 5 * this.px; context.stroke();
       context.strokeStyle = view.branch.color; context.lineWidth = 2.6 * this.px; context.stroke();
       const now = Math.min(Math.floor(view.t) - 1, steps.length - 1);
       if (now >= 0) {
         const a = ((tree * r.branches + steps[now]) * n + i) * r.steps + now;
+        if (!r["tree.valid"][a]) continue;
         this.outline(context, r.agents[i], { x: r["tree.x"][a], y: r["tree.y"][a], h: r["tree.h"][a] });
         context.lineWidth = 2 * this.px; context.stroke();
       }

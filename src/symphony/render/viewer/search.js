@@ -101,8 +101,8 @@ class SearchPanel {
     const r = this.replay, n = r.agents.length;
     let best = null;
     for (let i = 0; i < n; i++) for (let t = p * r.prune_every; t < Math.min((p + 1) * r.prune_every, r.steps); t++) {
-      const score = r["tree.score"][((tree * r.branches + s) * n + i) * r.steps + t];
-      if (Number.isFinite(score) && (!best || score > best.score)) best = { score, agent: r.agents[i], step: t + 1 };
+      const a = ((tree * r.branches + s) * n + i) * r.steps + t, score = r["tree.score"][a];
+      if (r["tree.valid"][a] && Number.isFinite(score) && (!best || score > best.score)) best = { score, agent: r.agents[i], step: t + 1 };
     }
     return best;
   }
