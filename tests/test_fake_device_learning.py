@@ -32,11 +32,14 @@ ROWS = 4
 
 
 def spec(space: Any) -> AgentSpec:
+    cells = 3 if space == "histogram" else 0
     return AgentSpec(
-        action_space=space,
+        action_space="displacement" if cells else space,
         dt=0.2,
         goals=True,
-        agent=AgentConfig(num_objects=3, num_points=20, num_lights=2, features="gaps", hidden=8, head=8),
+        agent=AgentConfig(
+            num_objects=3, num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8, head=8
+        ),
         discriminator=DiscriminatorConfig(features="foresight", hidden=8, head=8),
         searches=True,
     )
@@ -53,7 +56,7 @@ def world(space: Any = "bicycle") -> Iterator[tuple[PretendDevice, Any, DrivingE
         yield device, agent, on(device, env)
 
 
-@pytest.mark.parametrize("space", ["bicycle", "displacement"])
+@pytest.mark.parametrize("space", ["bicycle", "displacement", "histogram"])
 def test_simulations_stay_on_the_device(space: Any) -> None:
     with world(space) as (device, agent, env):
         policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
@@ -111,9 +114,12 @@ def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
     return batch
 
 
-@pytest.mark.parametrize("name", ["bc", "distillation", "goal", "discriminator", "mgail"])
-def test_losses_and_their_gradients_stay_on_the_device(name: str) -> None:
-    space = "displacement" if name == "mgail" else "bicycle"
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [(name, "bicycle") for name in ("bc", "distillation", "goal", "discriminator")]
+    + [("mgail", "displacement"), ("mgail", "histogram")],
+)
+def test_losses_and_their_gradients_stay_on_the_device(name: str, space: str) -> None:
     with world(space) as (device, agent, env):
         loss = losses(agent, env)[name]
         row = torch.arange(ROWS, device=device.device) % 2

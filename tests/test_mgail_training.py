@@ -124,10 +124,11 @@ def test_goals_and_discriminator_learn_nothing_from_the_loss_of_the_policy(
         assert all(with_gradient) if name == "policy" else not any(with_gradient)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, method: str) -> None:
+@pytest.mark.parametrize(("method", "cells"), [*((method, 0) for method in METHODS), ("mgail_ts", 5)])
+def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, method: str, cells: int) -> None:
     """Rollouts that are simulated again lead through the very states that the search found."""
-    trainer = build(config(method, store, tmp_path))
+    settings = config(method, store, tmp_path)
+    trainer = build(replace(settings, agent=replace(settings.agent, cells=cells)))
     replay, policy = pieces(trainer)["replay"], trainer.agent.modules["policy"]
     trainer.rng.manual_seed(0)
     replay.refresh(4)
@@ -222,6 +223,20 @@ def test_a_killed_run_ends_like_an_unbroken_one(
     train(settings)
     assert same_weights(weights(settings.out), weights(whole))
     assert [r["step"] for r in read_metrics(settings.out)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_policy_of_a_histogram_learns_and_is_evaluated(store: Path, tmp_path: Path) -> None:
+    settings = config("mgail", store, tmp_path / "run")
+    trainer = build(replace(settings, agent=replace(settings.agent, cells=5)))
+    for step, phase in ((0, {"policy"}), (2, {"discriminator"}), (4, {"policy", "discriminator"})):
+        before = copies(trainer)
+        record = trainer._update(step)
+        assert moved(before, copies(trainer)) == phase
+        assert all(math.isfinite(v) for k, v in record.items() if k.startswith(("loss", "gradient")))
+    agent = load_agent(str(train(replace(settings, agent=replace(settings.agent, cells=5)))))
+    assert agent.spec.agent.cells == 5
+    numbers = evaluate(agent, store, SETTINGS).numbers()
+    assert all(math.isfinite(float(numbers[name])) for name in ("ade", "collision_rate", "offroad_time"))
 
 
 @pytest.mark.parametrize("method", METHODS)

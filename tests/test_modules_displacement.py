@@ -20,7 +20,7 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.geometry.frames import rotate, wrap
 from symphony.keys import ACTION, NOISE, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, VALID
 from symphony.modules import BoundedDisplacement, ElementGroup, SeededNoise, displacement_policy
-from symphony.modules.displacement import INSIDE, SMOOTH
+from symphony.modules.bounded import INSIDE, SMOOTH
 from symphony.objectives import BCLoss
 from symphony.streams import uniform
 from test_env import moved

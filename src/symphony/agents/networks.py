@@ -79,7 +79,7 @@ def _groups(spec: AgentSpec, *, route: bool) -> tuple[ElementGroup, ...]:
 
 def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
-    bicycle, or a Gaussian over displacements. Seed torch beforehand.
+    bicycle, or a Gaussian or a histogram over displacements. Seed torch beforehand.
     """
     policy = build_object(spec.agent.policy, spec) if spec.agent.policy != "paper" else _policy(spec)
     if spec.agent.persona:
@@ -103,7 +103,7 @@ def _policy(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     if isinstance(dynamics, Bicycle):
         return discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
     scale = observation_of(spec).size_scale
-    return displacement_policy(own, groups, dt=spec.dt, size_scale=scale, **sizes)
+    return displacement_policy(own, groups, dt=spec.dt, size_scale=scale, cells=spec.agent.cells, **sizes)
 
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:

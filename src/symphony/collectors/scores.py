@@ -27,7 +27,8 @@ class Aggregate:
 
     Args:
         time: how the T_p steps are joined.
-        agents: how the N agents are joined.
+        agents: how the N agents are joined. Scores of padded agents are 0: a sum does not change with how many there
+            are, a maximum or a mean does.
     """
 
     time: Literal["max", "mean", "sum", "last"] = "max"

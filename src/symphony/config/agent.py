@@ -36,6 +36,9 @@ class AgentConfig:
     far its box is from the edge of the road, and its centre within the next 2 s."""
     accelerations: int = 7
     """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
+    cells: int = 0
+    """Cells along and across of a histogram that displacements are drawn from, an odd number (methods mgail*; 0: one
+    Gaussian instead, as in the paper)."""
     persona: bool = False
     """Drive in a style of one's own: the policy is told how closely the vehicle follows and how fast it drives among
     those of the log; in simulations that is drawn for each rollout, or given."""
@@ -51,10 +54,12 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
-        not_negative(self, "num_lights")
+        not_negative(self, "num_lights", "cells")
         one_of(self, "features", ["paper", "gaps", "road"])
         if self.accelerations < 3 or self.accelerations % 2 == 0:
             raise ConfigError(f"accelerations must be odd and at least 3, is {self.accelerations}")
+        if self.cells and (self.cells < 3 or self.cells % 2 == 0):
+            raise ConfigError(f"cells must be odd and at least 3, or 0, is {self.cells}")
         one_of(self, "encoder", ["paper"], path=True)
         one_of(self, "policy", ["paper"], path=True)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram
 from symphony.modules.discriminator import FORESIGHT, Discriminator, discriminator
-from symphony.modules.displacement import BoundedDisplacement, displacement_policy
+from symphony.modules.displacement import displacement_policy
 from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
 from symphony.modules.noise import SeededNoise
@@ -16,6 +17,7 @@ __all__ = [
     "FORESIGHT",
     "BoundedDisplacement",
     "Discriminator",
+    "DisplacementHistogram",
     "ElementGroup",
     "NoiseSampler",
     "RouteScores",

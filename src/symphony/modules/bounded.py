@@ -1,0 +1,296 @@
+"""Distributions over the displacements that a vehicle can drive within a step: one Gaussian, or a histogram."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.distributions import Distribution, Normal, constraints
+
+from symphony.geometry.constants import constant
+from symphony.modules.sampling import inverse_cdf
+
+SMOOTH = 0.02
+"""Metres within which a displacement bends smoothly towards zero instead of turning negative."""
+INSIDE = 0.95
+"""Share of the bounds beyond which an action counts as lying there, so that its likelihood stays finite."""
+LEAST = 1e-3
+"""Metres below which a histogram takes all displacements for standing still."""
+EDGE = 1e-6
+"""How near to an end of its cell a draw may come, as a share of the cell."""
+
+
+def squash(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """`x / sqrt(1 + x^2)`, in (-1, 1). Made of exactly rounded operations, unlike tanh, whose last bit on the CPU
+    depends on an element's place in the batch.
+    """
+    return x * (1.0 + x.square()).rsqrt() if x.device.type != "cpu" else x / (1.0 + x.square()).sqrt()
+
+
+def unsquash(y: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Inverse of :func:`squash`."""
+    return y / (1.0 - y.square()).sqrt()
+
+
+def positive(x: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
+    """A smooth `max(x, 0)`: `(x + sqrt(x^2 + smooth^2)) / 2`, above it by at most `smooth / 2`."""
+    return 0.5 * (x + (x.square() + smooth**2).sqrt())
+
+
+def positive_inverse(y: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
+    """Inverse of :func:`positive`, for `y > 0`."""
+    return y - smooth**2 / (4.0 * y)
+
+
+def displaced(
+    share: Float[Tensor, "*b 2"], pace: Float[Tensor, "*b"], slope: Float[Tensor, "*b"], reach: float
+) -> Float[Tensor, "*b 2"]:
+    """Displacements [..., 2] (metres; forward, left) by shares [..., 2] in (-1, 1) of what can be reached.
+
+    forward = positive(pace + reach share1), so the speed changes by at most reach / dt and never becomes negative;
+    left = forward * slope * share2, so nothing slides sideways or turns at standstill.
+    """
+    forward = positive(pace + reach * share[..., 0])
+    return torch.stack([forward, forward * slope * share[..., 1]], -1)
+
+
+def shares(
+    displacement: Float[Tensor, "*b 2"],
+    pace: Float[Tensor, "*b"],
+    slope: Float[Tensor, "*b"],
+    reach: float,
+    least: float = 1e-4,
+) -> Float[Tensor, "*b 2"]:
+    """Inverse of :func:`displaced`; what can't be reached has shares beyond 1. Less than `least` metres forward count
+    as so many.
+    """
+    forward = displacement[..., 0].clamp_min(least)
+    first = (positive_inverse(forward) - pace) / reach
+    return torch.stack([first, displacement[..., 1] / (forward * slope)], -1)
+
+
+def log_area(
+    share: Float[Tensor, "*b 2"], pace: Float[Tensor, "*b"], slope: Float[Tensor, "*b"], reach: float
+) -> Float[Tensor, "*b"]:
+    """Logarithm [...] of the square metres of displacements per area of shares."""
+    x = pace + reach * share[..., 0]
+    bend = 0.5 * (1.0 + x / (x.square() + SMOOTH**2).sqrt())
+    return (reach * bend * positive(x) * slope).log()
+
+
+class BoundedDisplacement(Distribution):
+    """Displacements [..., 2] (metres; forward, left) reachable within a step, see :func:`displaced`.
+
+    Their shares of what can be reached are those of Gaussian numbers u, squashed; differentiable in u, in the
+    parameters and in the bounds.
+
+    Args:
+        loc: [..., 2] mean of u.
+        scale: [..., 2] standard deviation of u.
+        pace: [...] metres covered at unchanged speed.
+        slope: [...] largest ratio of left to forward.
+        reach: metres that the largest acceleration adds.
+    """
+
+    arg_constraints = {}  # noqa: RUF012 - the type torch declares
+    support = constraints.real_vector
+    has_rsample = True
+
+    def __init__(
+        self,
+        loc: Float[Tensor, "*b 2"],
+        scale: Float[Tensor, "*b 2"],
+        pace: Float[Tensor, "*b"],
+        slope: Float[Tensor, "*b"],
+        reach: float,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.loc, self.scale, self.pace, self.slope, self.reach = loc, scale, pace, slope, reach
+        super().__init__(loc.shape[:-1], loc.shape[-1:], validate_args=validate_args)
+
+    def expand(
+        self, batch_shape: torch.Size | Sequence[int], _instance: Distribution | None = None
+    ) -> BoundedDisplacement:
+        """The same distribution for a larger batch."""
+        shape = torch.Size(batch_shape)
+        return BoundedDisplacement(
+            self.loc.expand(*shape, 2),
+            self.scale.expand(*shape, 2),
+            self.pace.expand(shape),
+            self.slope.expand(shape),
+            self.reach,
+            validate_args=False,
+        )
+
+    def displacement(self, u: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """The displacement that Gaussian numbers [..., 2] stand for."""
+        return displaced(squash(u), self.pace, self.slope, self.reach)
+
+    def latent(self, displacement: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Inverse of :meth:`displacement`; what lies outside the bounds or next to them is moved to INSIDE them."""
+        share = shares(displacement, self.pace, self.slope, self.reach)
+        return unsquash(share.clamp(-INSIDE, INSIDE))
+
+    def rsample(
+        self,
+        sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
+    ) -> Float[Tensor, "*b 2"]:
+        """Draw, with gradient to the parameters."""
+        shape = self._extended_shape(torch.Size(sample_shape))
+        noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
+        return self.displacement(self.loc + self.scale * noise)
+
+    def icdf(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """The draw that independent uniform numbers [..., 2] in (0, 1) stand for, with gradient to the parameters."""
+        return self.displacement(self.loc + self.scale * torch.special.ndtri(value))
+
+    @property
+    def mode(self) -> Float[Tensor, "*b 2"]:
+        """The displacement of the mean of u (the median of either component)."""
+        return self.displacement(self.loc)
+
+    @property
+    def deterministic_sample(self) -> Float[Tensor, "*b 2"]:
+        """What TorchRL takes when it does not explore."""
+        return self.mode
+
+    def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+        """Log-density [...]; that of the nearest displacement INSIDE the bounds where `value` is not."""
+        u = self.latent(value)
+        # Both squashings have the derivative (1 + u^2)^(-3/2).
+        volume = log_area(squash(u), self.pace, self.slope, self.reach)
+        volume = volume - 1.5 * (1.0 + u.square()).log().sum(-1)
+        return Normal(self.loc, self.scale, validate_args=False).log_prob(u).sum(-1) - volume
+
+
+@cache
+def _edges(cells: int) -> tuple[float, ...]:
+    """Shares at which one of so many cells ends and the next begins, from -1 to 1, dense in the middle."""
+    unit = [2.0 * i / cells - 1.0 for i in range(cells + 1)]
+    return tuple(x * (0.2 + 0.8 * abs(x)) for x in unit)
+
+
+class DisplacementHistogram(Distribution):
+    """Displacements [..., 2] (metres; forward, left) reachable within a step, see :func:`displaced`: anywhere in one
+    of F x L cells.
+
+    Unlike one Gaussian it can brake or go on, turn left or right, and not do what lies between. A draw has the
+    gradient of the mean over all cells (straight through).
+
+    Args:
+        logits: [..., F * L] of the cells, those of the hardest braking first.
+        pace: [...] metres covered at unchanged speed.
+        slope: [...] largest ratio of left to forward.
+        reach: metres that the largest acceleration adds.
+        forward: F, cells between the hardest braking and the largest acceleration.
+    """
+
+    arg_constraints = {}  # noqa: RUF012 - the type torch declares
+    support = constraints.real_vector
+    has_rsample = True
+
+    def __init__(
+        self,
+        logits: Float[Tensor, "*b C"],
+        pace: Float[Tensor, "*b"],
+        slope: Float[Tensor, "*b"],
+        reach: float,
+        forward: int,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.logits, self.pace, self.slope, self.reach = logits, pace, slope, reach
+        self.cells = forward, logits.shape[-1] // forward
+        super().__init__(logits.shape[:-1], torch.Size([2]), validate_args=validate_args)
+
+    def expand(
+        self, batch_shape: torch.Size | Sequence[int], _instance: Distribution | None = None
+    ) -> DisplacementHistogram:
+        """The same distribution for a larger batch."""
+        shape = torch.Size(batch_shape)
+        return DisplacementHistogram(
+            self.logits.expand(*shape, self.logits.shape[-1]),
+            self.pace.expand(shape),
+            self.slope.expand(shape),
+            self.reach,
+            self.cells[0],
+            validate_args=False,
+        )
+
+    @property
+    def edges(self) -> tuple[Float[Tensor, " F1"], Float[Tensor, " L1"]]:
+        """Shares [F + 1] and [L + 1] between which the cells lie."""
+        forward, left = (
+            constant(_edges(cells), self.logits.dtype, self.logits.device) for cells in self.cells
+        )
+        return forward, left
+
+    @property
+    def mean_share(self) -> Float[Tensor, "*b 2"]:
+        """Mean [..., 2] of the shares drawn, with gradient to the logits."""
+        probability = self.logits.softmax(-1).unflatten(-1, self.cells)
+        middle = [(edges[1:] + edges[:-1]) / 2 for edges in self.edges]
+        return torch.stack([(probability.sum(-1 - k) * middle[k]).sum(-1) for k in range(2)], -1)
+
+    def within(self, cell: Int[Tensor, "*b"], place: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Shares [..., 2] at places [..., 2] in (0, 1) of cells by number."""
+        # Cells of one acceleration lie side by side.
+        number = torch.stack([cell // self.cells[1], cell % self.cells[1]], -1)
+        low, high = (
+            torch.stack([edges[number[..., k] + more] for k, edges in enumerate(self.edges)], -1)
+            for more in (0, 1)
+        )
+        return low + (high - low) * place
+
+    def icdf(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """The draw that independent uniform numbers [..., 2] in (0, 1) stand for.
+
+        The first decides the cell and, by where it lies in that cell's share of (0, 1), the place along it; the
+        second the place across it.
+        """
+        dist = self.expand(torch.broadcast_shapes(value.shape[:-1], self.batch_shape))
+        first, second = (part.expand(dist.batch_shape) for part in value.unbind(-1))
+        weights = dist.logits.detach().softmax(-1)
+        cell = inverse_cdf(dist.logits, first)
+        above = weights.cumsum(-1).gather(-1, cell[..., None]).squeeze(-1)
+        weight = weights.gather(-1, cell[..., None]).squeeze(-1)
+        along = ((first - (above - weight)) / weight).clamp(EDGE, 1.0 - EDGE)
+        share = dist.within(cell, torch.stack([along, second], -1))
+        if torch.is_grad_enabled() and dist.logits.requires_grad:
+            mean = dist.mean_share
+            share = share + (mean - mean.detach())
+        return displaced(share, dist.pace, dist.slope, dist.reach)
+
+    def rsample(
+        self,
+        sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
+    ) -> Float[Tensor, "*b 2"]:
+        """Draw, with gradient to the logits and the bounds."""
+        shape = self._extended_shape(torch.Size(sample_shape))
+        return self.icdf(torch.rand(shape, dtype=self.logits.dtype, device=self.logits.device))
+
+    @property
+    def mode(self) -> Float[Tensor, "*b 2"]:
+        """The middle of the likeliest cell."""
+        share = self.within(self.logits.argmax(-1), self.logits.new_full((*self.batch_shape, 2), 0.5))
+        return displaced(share, self.pace, self.slope, self.reach)
+
+    @property
+    def deterministic_sample(self) -> Float[Tensor, "*b 2"]:
+        """What TorchRL takes when it does not explore."""
+        return self.mode
+
+    def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+        """Log-density [...]; that of the nearest displacement that can be reached where `value` is not one."""
+        share = shares(value, self.pace, self.slope, self.reach, LEAST).clamp(-0.999, 0.999)
+        cell, area = (
+            torch.zeros_like(share[..., 0], dtype=torch.int64),
+            log_area(share, self.pace, self.slope, self.reach),
+        )
+        for k, edges in enumerate(self.edges):
+            number = torch.bucketize(share[..., k].contiguous(), edges[1:-1].contiguous(), right=True)
+            cell, area = cell * self.cells[k] + number, area + edges.diff()[number].log()
+        logits = self.logits.log_softmax(-1).expand(*cell.shape, self.logits.shape[-1])
+        return logits.gather(-1, cell[..., None]).squeeze(-1) - area
