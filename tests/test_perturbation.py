@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -57,6 +59,25 @@ def test_it_leads_back(speed: float, along: float, across: float, turn: float, f
         state = way_back(state, log[t : t + 1], log[t + 1 : t + 2], LENGTH, DT)
     assert (state[0, :2] - log[-1, :2]).norm() < 0.2
     assert abs(float(state[0, 3] - log[-1, 3])) < 0.1
+
+
+@given(
+    speed=st.floats(0, 30),
+    acceleration=st.floats(-4, 4),
+    steering=st.floats(-0.4, 0.4),
+    dynamics=st.sampled_from([Displacement(), Bicycle(num_acceleration=401, num_steering=201)]),
+)
+def test_a_label_brakes_and_turns_as_the_way_back_does(
+    speed: float, acceleration: float, steering: float, dynamics: Any
+) -> None:
+    """In either action space: a displacement to the same place would change the speed half as much."""
+    log = drive(speed, acceleration, steering, 1)
+    size = torch.cat([LENGTH, LENGTH / 2])[None]
+    found = dynamics.step(log[:1], dynamics.towards(log[:1], log[1:], size, DT), size, DT)
+    torch.testing.assert_close(found[:, 3], log[1:, 3], atol=0.03, rtol=0)
+    # A step too short for its turn: one that comes to rest while the wheel is held over.
+    if log[1, 3] > 2.0:
+        assert wrap(found[:, 2] - log[1:, 2]).abs() < 0.01
 
 
 @given(seed=st.integers(0, 1000), angle=st.floats(-3, 3))

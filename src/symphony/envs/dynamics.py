@@ -23,6 +23,8 @@ from symphony.geometry.nearest import first_smallest
 
 WHEELBASE = 0.6
 """Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""
+STEEPEST = 0.3
+"""Largest ratio of sideways to distance that a displacement is made up with."""
 
 
 def bicycle_step(
@@ -106,6 +108,25 @@ def displacement_inverse(
 ) -> Float[Tensor, "*b 2"]:
     """The displacement in the frame of ``state`` that leads to the position of ``after`` (exact)."""
     return rotate(after[..., :2] - state[..., :2], -state[..., 2])
+
+
+def displacement_to(
+    state: Float[Tensor, "*b 4"], after: Float[Tensor, "*b 4"], length: Float[Tensor, "*b"], dt: float
+) -> Float[Tensor, "*b 2"]:
+    """The displacement that leads to the heading and the speed of ``after``, whatever its position.
+
+    Exact unless the turn is too sharp for the distance: then the steepest step to that side, :data:`STEEPEST`.
+    """
+    distance, arm = after[..., 3].clamp_min(0.0) * dt, 0.5 * WHEELBASE * length
+    # :func:`displacement_step` backwards: left = s (arm + forward / 2), both together as long as the distance.
+    most = STEEPEST * distance / (arm + 0.5 * distance)
+    s = torch.maximum(torch.minimum(torch.tan(wrap(after[..., 2] - state[..., 2])), most), -most)
+    square = s.square()
+    half, a = 0.5 * square * arm, 1.0 + 0.25 * square
+    forward = (
+        (half.square() - a * (square * arm.square() - distance.square())).clamp_min(0.0).sqrt() - half
+    ) / a
+    return torch.stack([forward, s * (arm + 0.5 * forward)], -1)
 
 
 def _quadratic(largest: float, count: int) -> NDArray[np.float32]:
@@ -223,6 +244,18 @@ class Bicycle:
 
         return _follow(position, heading, speed.clamp_min(0.0), valid, nearest)
 
+    def towards(
+        self,
+        state: Float[Tensor, "*b 4"],
+        after: Float[Tensor, "*b 4"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> Int[Tensor, "*b"]:
+        """The action whose next state is nearest to ``after``, a step of :func:`bicycle_step` away."""
+        pair = torch.stack([state, after], -2)
+        known = torch.ones(pair.shape[:-1], dtype=torch.bool, device=pair.device)
+        return self.fit(pair[..., :2], pair[..., 2], pair[..., 3], known, size, dt)[0].squeeze(-1)
+
 
 @dataclass(frozen=True)
 class Displacement:
@@ -261,6 +294,19 @@ class Displacement:
             return action, displacement_step(state, action, size[..., 0], dt)
 
         return _follow(position, heading, speed, valid, exact)
+
+    def towards(
+        self,
+        state: Float[Tensor, "*b 4"],
+        after: Float[Tensor, "*b 4"],
+        size: Float[Tensor, "*b 2"],
+        dt: float,
+    ) -> Float[Tensor, "*b 2"]:
+        """The action that leads to the heading and the speed of ``after``, a step of :func:`bicycle_step` away.
+
+        Not to its position, which is that of the mean speed: here the whole step has the speed after it.
+        """
+        return displacement_to(state, after, size[..., 0], dt)
 
 
 def _follow(

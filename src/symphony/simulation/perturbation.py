@@ -107,7 +107,5 @@ def perturbed(
     chosen = (torch.rand(len(state), generator=rng) < config.share).nonzero()[:, 0]
     moved, before, size = displaced(logged, config, rng)[chosen], logged[chosen], size[chosen]
     target = way_back(moved, before, following[chosen], size[:, 0], dt)
-    pair = torch.stack([moved, target], 1)
-    known = torch.ones(pair.shape[:2], dtype=torch.bool)
-    label, _ = dynamics.fit(pair[..., :2], pair[..., 2], pair[..., 3], known, size, dt)
-    return state.index_copy(0, chosen, moved), action.index_copy(0, chosen, label[:, 0].to(action.dtype))
+    label = dynamics.towards(moved, target, size, dt).to(action.dtype)
+    return state.index_copy(0, chosen, moved), action.index_copy(0, chosen, label)
