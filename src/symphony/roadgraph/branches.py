@@ -41,6 +41,9 @@ def visited_regions(
 
     Returns:
         [..., R], in the order of ``graph.regions``.
+
+    Raises:
+        ValueError: for a valid state that is not finite.
     """
     lead, steps = valid.shape[:-1], valid.shape[-1]
     count = math.prod(lead)
@@ -48,6 +51,8 @@ def visited_regions(
     row, _ = np.nonzero(valid)
     points = np.asarray(position, dtype=np.float64).reshape(count, steps, 2)[valid]
     headings = np.asarray(heading, dtype=np.float64).reshape(count, steps)[valid]
+    if not (np.isfinite(points).all() and np.isfinite(headings).all()):
+        raise ValueError("positions and headings of valid states must be finite")
     shape = count, len(graph.regions)
     if shape[1] == 0 or len(row) == 0:
         return np.zeros((*lead, shape[1]), dtype=bool)
