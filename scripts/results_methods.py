@@ -184,6 +184,23 @@ LONGER = (
     ("and 600", "adversarial/{}-longer-600"),
 )
 """MGAIL of another seed that goes on for longer, on more validation segments."""
+MENDED = (
+    ("one Gaussian, 6 000 updates, half of the way back", "adversarial/{}-longer-start"),
+    ("one Gaussian, 6 000 updates, all of it", "mended/{}-gaussian"),
+    ("histogram, 3 000 updates, half of the way back", "mended/{}-histogram-half"),
+    ("histogram, 3 000 updates, all of it", "mended/{}-histogram"),
+)
+"""Regression by labels that lead half of the way back to the log and all of it, on the validation parts."""
+AHEAD = (
+    (PLAYBACK, "eight/{}-bc-40", "playback"),
+    ("constant velocity", "eight/{}-bc-40", "constant_velocity"),
+    ("BC, three seeds", "eight/{}-bc-*"),
+    ("MGAIL as above, three seeds", "eight/{}-mgail-*"),
+    ("MGAIL, three seeds", "ahead/{}-mgail-*"),
+    ("MGAIL+TS as above, three seeds", "eight/{}-mgail_ts-[0-9]*"),
+    ("MGAIL+TS, one seed", "ahead/{}-mgail_ts-*"),
+)
+"""MGAIL of a histogram by mended labels, beside the methods' rows."""
 SETTINGS = {"many": "8 agents", "long": "20 s"}
 
 

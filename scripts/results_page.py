@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from results_base import ROOT, Grid, beside, means, records
 from results_methods import (
     ADVERSARIAL,
+    AHEAD,
     DRIVEN,
     FEATURES,
     FOREST,
@@ -28,6 +29,7 @@ from results_methods import (
     INPUTS,
     LABELS,
     LONGER,
+    MENDED,
     NGSIM,
     PARTS,
     POINTS,
@@ -79,11 +81,14 @@ PAGES = (
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
     "relations": lambda: held(["eight/town-*"]),
+    "ahead-relations": lambda: held(["eight/town-bc-[0-9]*", "ahead/town-*"]),
     "roadside": roadside,
     "parts": lambda: driven(PARTS),
     "towns": lambda: driven(TOWNS),
     "rates": lambda: driven(RATES),
     "longer": lambda: driven(LONGER),
+    "mended": lambda: driven(MENDED),
+    "ahead": lambda: driven(AHEAD),
     "adversarial": lambda: driven(ADVERSARIAL),
     "inputs": lambda: driven(INPUTS),
     "points": lambda: driven(POINTS),
