@@ -64,13 +64,15 @@ def test_it_leads_back(speed: float, along: float, across: float, turn: float, f
 @given(
     speed=st.floats(0, 30),
     acceleration=st.floats(-4, 4),
-    steering=st.floats(-0.4, 0.4),
+    lateral=st.floats(-6, 6),
     dynamics=st.sampled_from([Displacement(), Bicycle(num_acceleration=401, num_steering=201)]),
 )
 def test_a_label_brakes_and_turns_as_the_way_back_does(
-    speed: float, acceleration: float, steering: float, dynamics: Any
+    speed: float, acceleration: float, lateral: float, dynamics: Any
 ) -> None:
     """In either action space: a displacement to the same place would change the speed half as much."""
+    # A turn with at most so many m/s^2 to the side, and the wheel not beyond 0.4 radians.
+    steering = max(-0.4, min(0.4, lateral * 2.7 / max(speed, 1.0) ** 2))
     log = drive(speed, acceleration, steering, 1)
     size = torch.cat([LENGTH, LENGTH / 2])[None]
     found = dynamics.step(log[:1], dynamics.towards(log[:1], log[1:], size, DT), size, DT)
