@@ -284,13 +284,12 @@ class DisplacementHistogram(Distribution):
 
     def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
         """Log-density [...]; that of the nearest displacement that can be reached where `value` is not one."""
-        share = shares(value, self.pace, self.slope, self.reach, LEAST).clamp(-0.999, 0.999)
-        cell, area = (
-            torch.zeros_like(share[..., 0], dtype=torch.int64),
-            log_area(share, self.pace, self.slope, self.reach),
-        )
+        share = shares(value, self.pace, self.slope, self.reach, LEAST).clamp(-1.0, 1.0)
+        area = log_area(share, self.pace, self.slope, self.reach)
+        cell = torch.zeros_like(share[..., 0], dtype=torch.int64)
         for k, edges in enumerate(self.edges):
             number = torch.bucketize(share[..., k].contiguous(), edges[1:-1].contiguous(), right=True)
+            # Those of one acceleration lie side by side.
             cell, area = cell * self.cells[k] + number, area + edges.diff()[number].log()
         logits = self.logits.log_softmax(-1).expand(*cell.shape, self.logits.shape[-1])
         return logits.gather(-1, cell[..., None]).squeeze(-1) - area
