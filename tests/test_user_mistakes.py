@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from functools import partial
@@ -106,6 +107,29 @@ def test_a_planner_with_other_parameters_is_another_simulation(store: Path, tmp_
     assert source_of(partial(Steady, object())) == source_of(partial(Steady, object()))
 
 
+def steadily(gain: float) -> Any:
+    def plan(seen: Any) -> tuple[float, float]:
+        return gain, 0.0
+
+    return plan
+
+
+class Shop:
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    def plan(self, seen: Any) -> tuple[float, float]:
+        return self.gain, 0.0
+
+    def __call__(self, seen: Any) -> tuple[float, float]:
+        return self.plan(seen)
+
+
+@pytest.mark.parametrize("make", [steadily, Shop, lambda gain: Shop(gain).plan])
+def test_what_a_function_or_an_object_holds_is_part_of_the_planner(make: Any) -> None:
+    assert source_of(make(1.0)) == source_of(make(1.0)) != source_of(make(2.0))
+
+
 def test_a_command_is_what_it_starts_and_what_that_reads(tmp_path: Path) -> None:
     script = tmp_path / "mine.py"
     found = []
@@ -127,11 +151,23 @@ def test_other_weights_under_the_same_name_are_another_simulation(store: Path, r
         save_simulation("a", agent, crowd_dataset(data, agent, config, [0]), config)
 
 
+def test_an_agent_that_searches_otherwise_is_another_simulation(store: Path, run: Path, told: Any) -> None:
+    shutil.copytree(run, "own")
+    command = ["simulate", "own", "--data", store, "--segments", 0, "--rollouts", 2, "--out", "a"]
+    assert told(*command)[0] == 0
+    file = Path("own/agent.json")
+    spec = json.loads(file.read_text())
+    spec["search"]["keep"] = 0.25
+    file.write_text(json.dumps(spec))
+    code, words = told(*command)
+    assert (code, "differs in settings.specification" in words) == (1, True)
+
+
 def test_folders_from_before_weights_were_kept_are_gone_on_with(store: Path, run: Path, told: Any) -> None:
     command = ["simulate", run, "--data", store, "--rollouts", 2, "--out", "a"]
     assert told(*command, "--segments", 0)[0] == 0
     manifest = json.loads(Path("a/manifest.json").read_text())
-    del manifest["settings"]["weights"]
+    del manifest["settings"]["weights"], manifest["settings"]["specification"]
     Path("a/manifest.json").write_text(json.dumps(manifest))
     assert told(*command, "--segments", 1)[0] == 0
     assert len(load_rollouts("a")) == 2

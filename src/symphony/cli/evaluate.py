@@ -93,7 +93,7 @@ class Evaluate:
         from symphony.evaluation.records import evaluation_record, keep_evaluation
         from symphony.simulation.demonstrations import evenly_spaced
         from symphony.simulation.saved_files import About, RolloutWriter
-        from symphony.simulation.saving import plain_settings, weights_of
+        from symphony.simulation.saving import identity_of, plain_settings
 
         if self.figure is not None:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
@@ -119,7 +119,7 @@ class Evaluate:
         if self.save_rollouts is not None:
             from symphony.evaluation.pictures import RolloutKeeper
 
-            plain = plain_settings(config, agent.interactive, agent.duration) | weights_of(agent)
+            plain = plain_settings(config, agent.interactive, agent.duration) | identity_of(agent)
             about = About.of(agent.name, store, plain, seed=config.seed)
             keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
 

@@ -43,6 +43,8 @@ _KEPT = (
 
 FREE = ("planner", "planner_seconds", "rollouts")
 """Settings that are the planner's own, and how often it is tried."""
+LATER = ("weights", "specification")
+"""Settings that records have since November 2026."""
 BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
 """Those that mean something where all others play back their log."""
 
@@ -215,8 +217,9 @@ def check_crowds(records: Sequence[Record]) -> None:
         names = [name for name in dict.fromkeys([*other["settings"], *one["settings"]]) if name not in FREE]
         if one["crowd"] == other["crowd"] == PLAYBACK:
             names = [name for name in names if name in BESIDE_LOG]
-        if None in weights:  # records from before they were kept
-            names = [name for name in names if name != "weights"]
+        # Records from before these were kept lack them.
+        lacking = {name for name in LATER if None in (one["settings"].get(name), other["settings"].get(name))}
+        names = [name for name in names if name not in lacking]
         pairs = [(name, one["settings"].get(name), other["settings"].get(name)) for name in names]
         # The same agent may go by several names.
         if None in weights or weights[0] != weights[1]:

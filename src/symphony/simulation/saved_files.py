@@ -26,7 +26,7 @@ from symphony.simulation.saved_tensors import KEY, MAX_LENGTH, read_tensors, ten
 
 FORMAT = 1
 MANIFEST, INDEX, SEGMENTS = "manifest.json", "index.jsonl", "segments"
-LATER = ("weights", "planner", "planner_seconds")
+LATER = ("weights", "specification", "planner", "planner_seconds")
 """Settings that a manifest has since November 2026."""
 _LONGEST = 120
 _KINDS: dict[str, tuple[type, ...]] = {

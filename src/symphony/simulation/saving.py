@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import inspect
+import json
 import re
 import shlex
 from collections.abc import Callable, Sequence
@@ -72,7 +73,7 @@ def save_simulation(
     """
     if planner:
         planner_maker(planner)  # or complain before anything is simulated
-    settings = plain_settings(config, dataset.interactive, dataset.duration) | weights_of(agent)
+    settings = plain_settings(config, dataset.interactive, dataset.duration) | identity_of(agent)
     if goals:
         settings["goal"] = list(goals)
     if planner:
@@ -166,8 +167,10 @@ def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int]
     return found
 
 
-def weights_of(agent: Agent) -> dict[str, str]:
-    """A digest of an agent's weights, as a setting: another agent of the same name is another simulation."""
+def identity_of(agent: Agent) -> dict[str, str]:
+    """Digests of an agent's weights and of what it is built and searched by, as settings: another agent of the same
+    name is another simulation.
+    """
     if not agent.modules:
         return {}
     digest = hashlib.sha256()
@@ -175,12 +178,13 @@ def weights_of(agent: Agent) -> dict[str, str]:
         for name, value in sorted(module.state_dict().items()):
             digest.update(f"{part}.{name} {value.dtype} {tuple(value.shape)}".encode())
             digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return {"weights": digest.hexdigest()[:12]}
+    specification = "" if agent.spec is None else json.dumps(dataclasses.asdict(agent.spec), sort_keys=True)
+    return {"weights": digest.hexdigest()[:12], "specification": _short(specification.encode())}
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it by
-    ``functools.partial``: one that was changed is another one.
+    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it (by
+    ``functools.partial``, as an object's attributes, by the function around it): one that was changed is another one.
 
     Of a command what it starts, where that is a file, and the first other word that is one. Empty for what comes with
     the package, and where no source is known.
@@ -196,8 +200,20 @@ def source_of(planner: str | Callable[..., Any]) -> str:
         # Where an object lies in memory is nothing of it.
         bound += _PLACE.sub("", repr((given.args, given.keywords)))
         given = given.func
+    held = _held_by(given)
+    bound += _PLACE.sub("", repr(held)) if held else ""
     code = _code_of(given)
     return _short((code + bound).encode()) if bound else code
+
+
+def _held_by(given: Any) -> list[Any]:
+    """What an object or a function has beside its code."""
+    if inspect.ismethod(given):
+        return [vars(given.__self__)] if hasattr(given.__self__, "__dict__") else []
+    if inspect.isfunction(given):
+        values = inspect.getclosurevars(given).nonlocals
+        return [values] if values else []
+    return [] if inspect.isclass(given) or not hasattr(given, "__dict__") else [vars(given)]
 
 
 def _code_of(given: Any) -> str:
