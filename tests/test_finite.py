@@ -49,13 +49,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
     return SegmentStore(path)
 
 
-def agent(space: Any = "bicycle") -> Agent:
+def agent(space: Any = "bicycle", cells: int = 0) -> Agent:
     torch.manual_seed(0)
     spec = AgentSpec(
         action_space=space,
         dt=0.2,
         goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8, cells=cells),
         discriminator=DiscriminatorConfig(hidden=8, head=8),
         searches=True,
         search=SearchConfig(test_branches=2, prune_every=3),
@@ -82,12 +82,12 @@ class Spoiled(TensorDictModuleBase):
 
 
 @pytest.mark.parametrize(("search", "rule"), SEARCHES)
-@pytest.mark.parametrize("space", ["bicycle", "displacement"])
+@pytest.mark.parametrize(("space", "cells"), [("bicycle", 0), ("displacement", 0), ("displacement", 5)])
 @pytest.mark.parametrize("network", ["policy", "goals", "discriminator"])
 def test_weights_that_are_not_finite_are_found_at_once(
-    store: SegmentStore, network: str, space: str, search: Any, rule: str
+    store: SegmentStore, network: str, space: str, cells: int, search: Any, rule: str
 ) -> None:
-    broken = agent(space)
+    broken = agent(space, cells)
     config = EvaluateConfig(rollouts=2, search=search, rule=rule)
     evaluate(broken, store, config)
     with torch.no_grad():

@@ -7,6 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from symphony.config import AgentConfig, AgentSpec
+from symphony.errors import ConfigError
 from symphony.keys import ACTION, NOISE, STATE, VALID
 from symphony.modules import DisplacementHistogram
 from symphony.modules.bounded import LEAST, displaced, shares
@@ -213,3 +215,8 @@ def test_padded_agents_change_nothing():
 def test_an_even_number_of_cells_is_refused(cells):
     with pytest.raises(ValueError, match="cells must be odd"):
         policy(cells=cells)
+
+
+def test_cells_are_of_displacements():
+    with pytest.raises(ConfigError, match="cells are of displacements"):
+        AgentSpec(action_space="bicycle", dt=DT, agent=AgentConfig(cells=5))

@@ -186,3 +186,7 @@ class AgentSpec:
         not_negative(self, "duration")
         if self.searches and self.discriminator is None:
             raise ConfigError("an agent that searches needs a discriminator")
+        if self.agent.cells and self.action_space != "displacement":
+            raise ConfigError(
+                f"cells are of displacements, and the actions are those of a {self.action_space}"
+            )
