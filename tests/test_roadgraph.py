@@ -144,6 +144,8 @@ def test_what_is_not_finite_is_on_no_lane_and_not_silently(number):
         states = np.array([[0.0, 0.0, 0.0], vehicle])
         with pytest.raises(ValueError, match="vehicle \\[1\\]"):
             lane_of(graph, states[:, :2], states[:, 2])
+        with pytest.raises(ValueError, match="not finite"):
+            starting_lanes(graph, np.array(vehicle[:2]), vehicle[2])
 
 
 def test_heading_decides_between_overlapping_lanes():

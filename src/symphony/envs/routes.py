@@ -19,9 +19,9 @@ from symphony.geometry.frames import rotate
 from symphony.geometry.nearest import first_smallest
 from symphony.roadgraph import (
     LaneGraph,
-    feasible_routes,
     ground_truth_routes,
     route_polyline,
+    routes,
     starting_lanes,
 )
 from symphony.streams import stream_of
@@ -71,14 +71,14 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     steps = begin + np.flatnonzero(segment.valid[agent, begin:])
     for first in steps if begin else steps[:1]:
         position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
-        choices = feasible_routes(graph, position, heading)
-        if choices:
+        starts = starting_lanes(graph, position, heading)
+        if starts:
             break
     else:
         return RouteTable(
             np.zeros((0, POINTS, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1
         )
-    along = dict(starting_lanes(graph, position, heading))
+    choices, along = routes(graph, starts), dict(starts)
     # A route that begins with a lane change starts on the neighbour, beside the lane the vehicle is on.
     default = next(iter(along.values()), 0.0)
     points = np.empty((len(choices), POINTS, 2), np.float32)

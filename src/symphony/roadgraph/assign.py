@@ -50,15 +50,8 @@ def lane_of(
     wrong = np.argwhere(~(np.isfinite(position).all(-1) & np.isfinite(heading)))
     if len(wrong):
         raise ValueError(f"vehicle {wrong[0].tolist()}: a position or heading that is not finite")
-    result = np.full(position.shape[:-1], -1, dtype=np.int64)
     near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance, max_turn)
-    smallest = np.full(result.size, np.inf)
-    np.minimum.at(smallest, near.point, near.distance)
-    close = near.distance <= smallest[near.point] + _TIE
-    order = np.lexsort((near.line, np.round(turn / _TURN_TIE), ~close, near.point))
-    point, first = np.unique(near.point[order], return_index=True)
-    result.reshape(-1)[point] = graph.usable_lanes[near.line[order][first]]
-    return result
+    return _nearest(graph, near, turn, position[..., 0].size).reshape(position.shape[:-1])
 
 
 def starting_lanes(
@@ -77,12 +70,17 @@ def starting_lanes(
 
     Returns:
         Pairs (lane, metres from the lane's start); empty if the vehicle is on no lane.
+
+    Raises:
+        ValueError: a position or heading that is not finite.
     """
     position = np.asarray(position, dtype=np.float64).reshape(1, 2)
-    near, _ = _compatible(graph, position, np.array([heading]), tolerance, max_turn)
+    if not (np.isfinite(position).all() and np.isfinite(heading)):
+        raise ValueError("a position or heading that is not finite")
+    near, turn = _compatible(graph, position, np.array([heading]), tolerance, max_turn)
     if len(near.line) == 0:
         return []
-    best = int(lane_of(graph, position[0], np.array(heading), tolerance=tolerance, max_turn=max_turn))
+    best = int(_nearest(graph, near, turn, 1)[0])
     found = {
         int(graph.usable_lanes[k]): (float(distance), float(along))
         for k, distance, along in zip(near.line, near.distance, near.along, strict=True)
@@ -95,6 +93,18 @@ def starting_lanes(
     }
     kept = sorted(found.keys() - gone, key=lambda k: (k != best, round(found[k][0], 3), k))
     return [(k, found[k][1]) for k in kept]
+
+
+def _nearest(graph: LaneGraph, near: Near, turn: NDArray[np.float64], count: int) -> Indices:
+    """[count] lane of each point, see :func:`lane_of`, from lanes near to them and the angles to these."""
+    result = np.full(count, -1, dtype=np.int64)
+    smallest = np.full(count, np.inf)
+    np.minimum.at(smallest, near.point, near.distance)
+    close = near.distance <= smallest[near.point] + _TIE
+    order = np.lexsort((near.line, np.round(turn / _TURN_TIE), ~close, near.point))
+    point, first = np.unique(near.point[order], return_index=True)
+    result[point] = graph.usable_lanes[near.line[order][first]]
+    return result
 
 
 def _compatible(

@@ -171,25 +171,32 @@ def route_errors(
     away = [distance[[row[lane] for lane in route]] for route in choices]
     errors = np.array([each.min(0).mean() for each in away])
     again = np.array([len(set(route)) < len(route) for route in choices])
-    best = errors[~again].min(initial=np.inf)
     # With all passes counted the error is at most what it is with one.
-    for k in sorted(np.flatnonzero(again), key=errors.__getitem__):
-        if errors[k] > best + within:
-            errors[k] = np.inf
-            continue
-        errors[k] = np.where(_passed(graph, choices[int(k)], path), away[k], np.inf).min(0).mean()
-        best = min(best, errors[k])
+    close = errors <= errors[~again].min(initial=np.inf) + within
+    errors[again & ~close] = np.inf
+    twice = np.flatnonzero(again & close).tolist()
+    for k, on in zip(twice, _passed(graph, [choices[k] for k in twice], path), strict=True):
+        errors[k] = np.where(on, away[k], np.inf).min(0).mean()
     return errors
 
 
-def _passed(graph: LaneGraph, route: Route, path: Reals) -> NDArray[np.bool_]:
-    """[lanes, T] which of a route's lanes are near the place along it to which a path [T, 2] has come."""
-    line = np.concatenate([graph.lines[lane] for lane in route])
-    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
-    ends = np.cumsum([len(graph.lines[lane]) for lane in route])
-    begin, end = arc[np.concatenate([[0], ends[:-1]])], arc[ends - 1]
-    station = stations_along(line[None], path[None], np.ones((1, len(path)), bool))[0]
-    return (begin[:, None] <= station + _AROUND) & (end[:, None] >= station - _AROUND)
+def _passed(graph: LaneGraph, choices: Sequence[Route], path: Reals) -> list[NDArray[np.bool_]]:
+    """[lanes, T] for each route which of its lanes are near the place along it to which a path [T, 2] has come."""
+    if not choices:
+        return []
+    lines = [np.concatenate([graph.lines[lane] for lane in route]) for route in choices]
+    # Shorter ones end with their last point again.
+    most = max(len(line) for line in lines)
+    padded = np.stack([np.concatenate([line, line[-1:].repeat(most - len(line), 0)]) for line in lines])
+    shape = len(lines), *path.shape
+    stations = stations_along(padded, np.broadcast_to(path, shape), np.ones(shape[:2], bool))
+    found = []
+    for route, line, station in zip(choices, lines, stations, strict=True):
+        arc = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
+        ends = np.cumsum([len(graph.lines[lane]) for lane in route])
+        begin, end = arc[np.concatenate([[0], ends[:-1]])], arc[ends - 1]
+        found.append((begin[:, None] <= station + _AROUND) & (end[:, None] >= station - _AROUND))
+    return found
 
 
 def ground_truth_routes(
