@@ -211,8 +211,8 @@ def test_padded_agents_change_nothing():
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("cells", [-1, 4])
-def test_an_even_number_of_cells_is_refused(cells):
+@pytest.mark.parametrize("cells", [-1, 1, 4])
+def test_a_number_of_cells_without_a_middle_and_sides_is_refused(cells):
     with pytest.raises(ValueError, match="cells must be odd"):
         policy(cells=cells)
 

@@ -110,8 +110,8 @@ def displacement_policy(
         pool: see :func:`symphony.modules.pool_elements`.
         encoder: a class with the arguments of :class:`SceneEncoder`.
     """
-    if cells < 0 or (cells and cells % 2 == 0):
-        raise ValueError(f"cells must be odd, or 0 for none, is {cells}")
+    if cells and (cells < 3 or cells % 2 == 0):
+        raise ValueError(f"cells must be odd and at least 3, or 0 for none, is {cells}")
     for name, value in (
         ("dt", dt),
         ("max_acceleration", max_acceleration),
