@@ -191,16 +191,10 @@ MENDED = (
     ("histogram, 3 000 updates, all of it", "mended/{}-histogram"),
 )
 """Regression by labels that lead half of the way back to the log and all of it, on the validation parts."""
-AHEAD = (
-    (PLAYBACK, "eight/{}-bc-40", "playback"),
-    ("constant velocity", "eight/{}-bc-40", "constant_velocity"),
-    ("BC, three seeds", "eight/{}-bc-*"),
-    ("MGAIL as above, three seeds", "eight/{}-mgail-*"),
-    ("MGAIL, three seeds", "ahead/{}-mgail-*"),
-    ("MGAIL+TS as above, three seeds", "eight/{}-mgail_ts-[0-9]*"),
-    ("MGAIL+TS, one seed", "ahead/{}-mgail_ts-*"),
+HALF = tuple(
+    (f"{EIGHT[method]}, three seeds", f"half/{{}}-{method}-[0-9]*") for method in EIGHT if "mgail" in method
 )
-"""MGAIL of a histogram by mended labels, beside the methods' rows."""
+"""The methods' rows of MGAIL as they were by labels that lead half of the way back, without a histogram or a cut."""
 SETTINGS = {"many": "8 agents", "long": "20 s"}
 
 

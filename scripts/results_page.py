@@ -21,10 +21,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from results_base import ROOT, Grid, beside, means, records
 from results_methods import (
     ADVERSARIAL,
-    AHEAD,
     DRIVEN,
     FEATURES,
     FOREST,
+    HALF,
     HALVING,
     INPUTS,
     LABELS,
@@ -81,14 +81,13 @@ PAGES = (
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
     "relations": lambda: held(["eight/town-*"]),
-    "ahead-relations": lambda: held(["eight/town-bc-[0-9]*", "ahead/town-*"]),
     "roadside": roadside,
     "parts": lambda: driven(PARTS),
     "towns": lambda: driven(TOWNS),
     "rates": lambda: driven(RATES),
     "longer": lambda: driven(LONGER),
     "mended": lambda: driven(MENDED),
-    "ahead": lambda: driven(AHEAD),
+    "half": lambda: driven(HALF),
     "adversarial": lambda: driven(ADVERSARIAL),
     "inputs": lambda: driven(INPUTS),
     "points": lambda: driven(POINTS),

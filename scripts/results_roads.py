@@ -32,10 +32,8 @@ ELSEWHERE = {
     "2-included-none": "driving/ngsim-none",
     "2-included-bc_ts_h": "driving/ngsim-replace-branch",
     "2-rate-paper": "driving/ngsim-bc",
-    **{
-        f"2-rate-{method}": f"eight/ngsim-{method}-40"
-        for method in ("bc", "bc_h", "bc_ts", "bc_ts_h", "mgail_ts_h")
-    },
+    "2-rate-mgail_ts_h": "half/ngsim-mgail_ts_h-40",
+    **{f"2-rate-{method}": f"eight/ngsim-{method}-40" for method in ("bc", "bc_h", "bc_ts", "bc_ts_h")},
 }
 """Records of the table on real roads that other tables have, too."""
 UNSEEN = {"womd": "WOMD", "argoverse2": "Argoverse 2", "interaction": "INTERACTION", "nuscenes": "nuScenes"}
