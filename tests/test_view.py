@@ -275,7 +275,7 @@ def test_what_is_drawn_is_seen(tmp_path: Path) -> None:
     assert main(["view", str(tmp_path / "sim")]) == 0
     shot = tmp_path / "shot.png"
     page = tmp_path / "sim" / "view.html"
-    browse(page, f"--screenshot={shot}", "--timeout=6000", place="#rollout=1&t=2.4")
+    browse(page, f"--screenshot={shot}", "--virtual-time-budget=8000", place="#rollout=1&t=2.4")
     with Image.open(shot) as image:
         pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
     for color in ((0x00, 0x72, 0xB2), (0xA9, 0xAE, 0xB5), (0xB3, 0x12, 0x2B), (0xF3, 0xF1, 0xEC)):
