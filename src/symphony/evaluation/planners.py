@@ -14,7 +14,7 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import grouped_mean, report, total_numbers
 from symphony.files import locating
 from symphony.simulation.saved import PLAYBACK, SavedRollouts
-from symphony.simulation.saved_files import RolloutFolder
+from symphony.simulation.saved_files import LATER, RolloutFolder
 
 FORMAT = 1
 """Version of a record."""
@@ -43,8 +43,6 @@ _KEPT = (
 
 FREE = ("planner", "planner_seconds", "rollouts")
 """Settings that are the planner's own, and how often it is tried."""
-LATER = ("weights", "specification")
-"""Settings that records have since November 2026."""
 BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
 """Those that mean something where all others play back their log."""
 

@@ -8,7 +8,7 @@ import inspect
 import json
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -206,14 +206,12 @@ def source_of(planner: str | Callable[..., Any]) -> str:
     return _short((code + bound).encode()) if bound else code
 
 
-def _held_by(given: Any) -> list[Any]:
-    """What an object or a function has beside its code."""
-    if inspect.ismethod(given):
-        return [vars(given.__self__)] if hasattr(given.__self__, "__dict__") else []
+def _held_by(given: Any) -> Mapping[str, Any]:
+    """What an object or a function has beside its code, by name."""
     if inspect.isfunction(given):
-        values = inspect.getclosurevars(given).nonlocals
-        return [values] if values else []
-    return [] if inspect.isclass(given) or not hasattr(given, "__dict__") else [vars(given)]
+        return inspect.getclosurevars(given).nonlocals
+    owner = given.__self__ if inspect.ismethod(given) else given
+    return {} if inspect.isclass(owner) else getattr(owner, "__dict__", {})
 
 
 def _code_of(given: Any) -> str:
