@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
@@ -133,6 +134,19 @@ def test_workers_share_what_was_imported_for_them(monkeypatch: pytest.MonkeyPatc
     servers, workers = {importer for importer, _ in found}, {worker for _, worker in found}
     assert len(servers) == 1
     assert not servers & {*workers, os.getpid()}
+
+
+def is_imported(name: str) -> bool:
+    return name in sys.modules
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
+def test_later_work_finds_what_was_imported_before_the_first() -> None:
+    # What evaluates needs seconds to import; a conversion, which needs none of it, may have been the first.
+    importlib.import_module("symphony.simulation.workers")
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # one of earlier tests
+    names = ["symphony.simulation.workers", "torchrl", "symphony.no_such_module"]
+    assert list(ordered_map(is_imported, names, workers=2)) == [True, True, False]
 
 
 def mark_unless_stopped(path: Path) -> Path:

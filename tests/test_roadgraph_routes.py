@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from helpers_roadgraph import (
     crossing,
@@ -258,21 +261,30 @@ def test_going_around_the_block_first_is_not_the_way_of_the_log():
     assert np.isinf(route_errors(graph, found, direct, valid, within=0.5)).any()
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_the_error_of_a_route_does_not_depend_on_those_beside_it(seed):
-    """Routes that come by a lane twice, of different lengths: around either of two blocks, or both."""
+@functools.cache
+def two_blocks():
+    """A graph with a street between two blocks; routes that come by it twice, of different lengths; longer ones."""
     street = np.stack([np.linspace(0.0, 30.0, 16), np.zeros(16)], -1)
     small = np.array([[30.0, 0], [35, 5], [30, 12], [0, 12], [-5, 5], [0, 0]])
     large = np.array([[30.0, 0], [40, -10], [30, -30], [0, -30], [-20, -12], [0, 0]])
     lanes = [street, small, large, street + np.array([30.0, 0.0])]
     graph = LaneGraph(make_road(lanes, successors=[(0, 1), (1, 0), (0, 2), (2, 0), (0, 3)]))
-    found = routes(graph, [(0, 2.0)], horizon=250.0, lane_change=False)
+    found, longer = (routes(graph, [(0, 2.0)], horizon=metres, lane_change=False) for metres in (250.0, 400.0))
+    return graph, found, [way for way in longer if len(way) > 2]
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=30)
+def test_the_error_of_a_route_does_not_depend_on_those_beside_it(seed, drives):
+    graph, found, ways = two_blocks()
     rng = np.random.default_rng(seed)
-    # Drivers may go on beyond the end of a route, leave it, or go back to where they were.
-    ways = [way for way in routes(graph, [(0, 2.0)], horizon=400.0, lane_change=False) if len(way) > 2]
-    path = route_polyline(graph, ways[rng.integers(len(ways))], spacing=1.5)
-    path = path + rng.normal(0.0, 1.0, path.shape)
-    path = np.concatenate([path, path[:: -1 if seed % 2 else 2]])
+    if drives:
+        # Beyond the end of a route, and back to where it was.
+        path = route_polyline(graph, ways[rng.integers(len(ways))], spacing=1.5)
+        path = np.concatenate([path, path[:: rng.choice([-1, 2])]]) + rng.normal(0.0, 1.0, 2)
+    else:
+        # Also where no lane leads.
+        path = rng.uniform([-25.0, -35.0], [65.0, 15.0], (rng.integers(2, 40), 2))
     there = np.ones(len(path), bool)
     alone = [route_errors(graph, [route], path, there)[0] for route in found]
     np.testing.assert_array_equal(route_errors(graph, found, path, there), alone)

@@ -94,11 +94,13 @@ def get_ready(imports: Sequence[str]) -> None:
     """Begin to import what local workers need, in a process of its own from which all of them are forked (Linux).
 
     Modules are imported once instead of once a worker; a program that calls this before its own imports has both done
-    at the same time. Workers that come after find the modules of the first call imported, whatever they ask for.
+    at the same time. Workers that come after find imported what the first call asked for and what of this package its
+    process had imported until then, whatever they need themselves.
     """
     if _START == "forkserver":
         context = multiprocessing.get_context(_START)
-        context.set_forkserver_preload([name for name in imports if name != "__main__"])
+        ours = [name for name in sys.modules if name.startswith("symphony.")]
+        context.set_forkserver_preload([name for name in (*ours, *imports) if name != "__main__"])
         with _environment(WORKER_ENVIRONMENT), _no_interrupts():
             forkserver.ensure_running()
 
