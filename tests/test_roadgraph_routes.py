@@ -269,7 +269,9 @@ def two_blocks():
     large = np.array([[30.0, 0], [40, -10], [30, -30], [0, -30], [-20, -12], [0, 0]])
     lanes = [street, small, large, street + np.array([30.0, 0.0])]
     graph = LaneGraph(make_road(lanes, successors=[(0, 1), (1, 0), (0, 2), (2, 0), (0, 3)]))
-    found, longer = (routes(graph, [(0, 2.0)], horizon=metres, lane_change=False) for metres in (250.0, 400.0))
+    found, longer = (
+        routes(graph, [(0, 2.0)], horizon=metres, lane_change=False) for metres in (250.0, 400.0)
+    )
     return graph, found, [way for way in longer if len(way) > 2]
 
 
