@@ -9,9 +9,9 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_table import make_record
 from symphony.config import EvaluateConfig
 from symphony.evaluation.records import evaluation_name
-from test_table import make_record
 
 CHANGES: dict[str, Any] = {
     "persona": "speed=.8",

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_table import make_entry, make_record, row_of
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import compare
 from symphony.evaluation.entries import Entry
 from symphony.evaluation.formats import as_latex, as_markdown
 from symphony.evaluation.paired import PAIRED, clustered_mean, differences
-from test_table import make_entry, make_record, row_of
 
 
 def test_paired_differences_are_over_what_both_have_and_over_recordings() -> None:

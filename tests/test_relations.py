@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers_table import make_entry, make_record, make_run, row_of
 from symphony.cli import main
 from symphony.config import Method, TableColumns
 from symphony.errors import ConfigError, DataError
@@ -19,7 +20,6 @@ from symphony.evaluation.entries import Entry, collect
 from symphony.evaluation.formats import FORMATS, as_json
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.relations import RELATION_FORMATS, STATEMENTS, Relation, grid, relations
-from test_table import make_entry, make_record, make_run, row_of
 
 METHODS = get_args(Method)
 RATES = ("collision_rate", "offroad_time", "ade", "min_sade")

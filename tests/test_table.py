@@ -8,7 +8,7 @@ import math
 import re
 import shutil
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,79 +17,23 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from helpers_segments import crossing, straight_road
+from helpers_table import METHODS, full_table, make_entry, row_of
 from symphony.cli import main
-from symphony.config import AgentConfig, EvaluateConfig, Method, TrainConfig
+from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.comparison import COLUMNS, Comparison, compare
-from symphony.evaluation.entries import ROWS, SETTINGS, Entry, collect, family, method_name
+from symphony.evaluation.entries import ROWS, SETTINGS, Entry, family, method_name
 from symphony.evaluation.formats import ABSENT, FORMATS, as_json, as_latex, as_markdown, as_text, print_text
 from symphony.evaluation.paper import METRICS, paper_figures
-from symphony.evaluation.records import evaluation_name, find_runs, keep_evaluation, kept_evaluations
+from symphony.evaluation.records import evaluation_name, kept_evaluations
 from symphony.metrics import jensen_shannon
 from symphony.recipes import train
 from symphony.render import plot_curvature
 
-METHODS = get_args(Method)
 NUMBERS = st.floats(0, 100)
-
-
-def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[str, Any]:
-    numbers = dict.fromkeys(METRICS, 1.0) | (values or {})
-    config = {
-        "search": "none",
-        "trees": 0,
-        "branches": 0,
-        "rule": "",
-        "interactive": 2,
-        "rollouts": 16,
-        "duration": 0,
-        "seed": 0,
-        "logged_goals": False,
-    }
-    counts = [0] * 100 + [3] + [0] * 100
-    return {
-        "format": 2,
-        **numbers,
-        "segments": 4,
-        "run": {"updates": 0, "named": False, "checkpoint": 0},
-        "data": {"name": "test", "checksum": "ab" * 32},
-        "config": config | changes,
-        "playback": {"collision_rate": 0.5, "offroad_time": 0.25},
-        "constant_velocity": dict.fromkeys(METRICS, 2.0),
-        "cost": {"simulation": 6.0},
-        "curvature": {"policy": counts, "log": counts},
-    }
-
-
-def make_entry(method: str, seed: int = 0, **values: float) -> Entry:
-    record = make_record(values, seed=seed)
-    return Entry(Path(f"{method}-{seed}"), {"method": method, "seed": seed}, evaluation_name(record), record)
-
-
-def make_run(folder: Path, method: str, seed: int = 0, *records: dict[str, Any], **config: Any) -> Path:
-    folder.mkdir(parents=True)
-    settings = {"format": 2, "method": method, "seed": seed, "agent": {"interactive": 2}} | config
-    (folder / "config.json").write_text(json.dumps(settings))
-    for record in records:
-        keep_evaluation(str(folder), record)
-    return folder
-
-
-def full_table(seeds: int = 3, methods: Any = METHODS) -> list[Entry]:
-    rng, top = np.random.default_rng(0), [30, 5, 20, 10, 0.01]
-    return [
-        make_entry(method, seed, **dict(zip(METRICS, rng.uniform(0, top).tolist(), strict=True)))
-        for method in methods
-        for seed in range(seeds)
-    ]
-
-
-def row_of(comparison: Comparison, method: str) -> Any:
-    (row,) = (row for row in comparison.rows if row.method == method)
-    return row
 
 
 # --- what is in a table ---
@@ -314,141 +258,6 @@ def test_many_columns_leave_names_whole() -> None:
         assert "…" not in text
 
 
-# --- which runs and evaluations count ---
-
-
-def test_settings_tell_runs_apart(tmp_path: Path) -> None:
-    kinds: dict[str, list[dict[str, Any]]] = {
-        "main": [{}, {"duration": 0}, {"duration": 10}, {"agent": {}}],
-        "long": [{"duration": 20}],
-        "many": [{"agent": {"interactive": 8}}],
-    }
-    strange = [{"duration": 15}, {"duration": 20, "agent": {"interactive": 8}}]
-    for setting, configs in kinds.items():
-        for k, config in enumerate(configs):
-            agents = config.get("agent", {}).get("interactive", 2)
-            record = make_record(interactive=agents, duration=config.get("duration", 0))
-            make_run(tmp_path / "runs" / f"{setting}-{k}", "bc", k, record, **config)
-    for k, config in enumerate(strange):
-        make_run(tmp_path / "runs" / f"strange-{k}", "bc", k, make_record(), **config)
-    make_run(tmp_path / "runs" / "new", "bc", 9)
-    for setting, configs in kinds.items():
-        entries, left_out = collect([tmp_path / "runs"], setting)  # type: ignore[arg-type]
-        assert [entry.folder.name for entry in entries] == [f"{setting}-{k}" for k in range(len(configs))]
-        assert len(entries) + sum(map(len, left_out.values())) == 9
-    assert any("not evaluated" in reason for reason in collect([tmp_path / "runs"], "main")[1])
-
-
-def test_runs_evaluated_in_another_setting_than_their_own_do_not_count(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "bc", "bc", 0, make_record(interactive=8), make_record(duration=20))
-    assert collect([run], "main")[0] == []
-    keep_evaluation(str(run), make_record(duration=10))
-    assert len(collect([run], "main")[0]) == 1
-
-
-def test_runs_are_found_below_folders_each_once(tmp_path: Path) -> None:
-    one = make_run(tmp_path / "a" / "one", "bc")
-    two = make_run(tmp_path / "a" / "deeper" / "two", "bc", 1)
-    (one / "checkpoints" / "inner").mkdir(parents=True)
-    (one / "checkpoints" / "inner" / "config.json").write_text("{}")
-    assert sorted(find_runs([tmp_path, one, tmp_path / "a", two])) == sorted([one, two])
-    (tmp_path / "empty").mkdir()
-    for folder in (tmp_path / "empty", tmp_path / "absent"):
-        with pytest.raises(ConfigError, match="holds no run"):
-            find_runs([one, folder])
-
-
-def test_several_evaluations_need_a_choice(tmp_path: Path) -> None:
-    without, tree = make_record(), make_record(search="tree", trees=1, branches=16, rule="best")
-    run = make_run(tmp_path / "ts", "bc_ts", 0, without, tree)
-    make_run(tmp_path / "bc", "bc", 0, without)
-    with pytest.raises(ConfigError) as error:
-        collect([tmp_path], "main")
-    for word in (str(run), evaluation_name(without), evaluation_name(tree), "--evaluation"):
-        assert word in str(error.value)
-    for patterns, wanted in (
-        (["*-tree-*", "*-none-*"], {"bc_ts": tree, "bc": without}),
-        (["*-none-*", "*-tree-*"], {"bc_ts": without, "bc": without}),
-        (["*-tree-1x16-*"], {"bc_ts": tree}),
-        ([evaluation_name(tree)], {"bc_ts": tree}),
-    ):
-        found = {entry.method: entry.record for entry in collect([tmp_path], "main", patterns)[0]}
-        assert found == wanted
-    with pytest.raises(ConfigError, match="several ways"):
-        collect([tmp_path], "main", ["test-*"])
-    entries, left_out = collect([tmp_path], "main", ["*-oracle-*"])
-    assert not entries
-    assert list(map(len, left_out.values())) == [2]
-
-
-def test_two_runs_of_one_method_and_seed_are_refused(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        make_run(tmp_path / name, "bc_h", 3, make_record())
-    with pytest.raises(ConfigError, match=r"two runs of BC\+H with seed 3.*one.*two"):
-        collect([tmp_path], "main")
-
-
-def test_rows_must_be_comparable() -> None:
-    entries = full_table(2)
-    entries[-1].record["data"]["checksum"] = "cd" * 32
-    with pytest.raises(ConfigError, match="different run segments"):
-        compare(entries, "main")
-    entries = full_table(2)
-    entries[-1].record["config"]["rollouts"] = 4
-    with pytest.raises(ConfigError, match=r"seeds of MGAIL\+TS\+H evaluated in different ways"):
-        compare(entries, "main")
-    entries[-2].record["config"]["rollouts"] = 4
-    assert any("4 rollouts: MGAIL+TS+H" in note for note in compare(entries, "main").notes)
-    with pytest.raises(ConfigError, match="no evaluated runs"):
-        compare([], "main")
-    with pytest.raises(DataError, match="ade"):
-        compare([make_entry("bc", ade="much")], "main")  # type: ignore[arg-type]
-
-
-def test_notes_say_what_differs_and_what_is_outdated(tmp_path: Path) -> None:
-    for seed, steps in ((0, 5), (1, 6)):
-        record = make_record(seed=seed)
-        record["run"]["updates"] = 5
-        search = {"rule": "best" if seed else "systematic"}
-        run = make_run(tmp_path / f"bc-{seed}", "bc", seed, record, steps=steps, out=str(seed), search=search)
-        (run / "checkpoints" / f"step-{steps:012d}").mkdir(parents=True)
-    notes = "\n".join(compare(collect([tmp_path], "main")[0], "main").notes)
-    assert "runs of BC differ in steps, search.rule\n" in notes
-    assert notes.count("was evaluated after") == 1
-    assert "bc-1 was evaluated after 5 updates and has 6 now" in notes
-    assert "checkpoint" not in notes
-    entries = [make_entry("bc", seed) for seed in (0, 1)]
-    entries[1].record["run"] |= {"named": True, "checkpoint": 50}
-    notes = "\n".join(compare(entries, "main").notes)
-    assert "bc-1 was evaluated at its checkpoint 50, which it would not choose itself" in notes
-    assert notes.count("checkpoint") == 1
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "not valid JSON"),
-        ("[]", "not a JSON object"),
-        ("{}", "format"),
-        (json.dumps(make_record() | {"format": 99}), "format 99"),
-        (json.dumps(make_record() | {"config": {"search": "none"}}), r"field config\.trees"),
-        (json.dumps(make_record() | {"run": None}), "field run"),
-        (json.dumps(make_record() | {"segments": None}), "field segments"),
-        (json.dumps(make_record() | {"per_segment": [{}]}), "one row for each of 4 segments"),
-        (json.dumps(make_record() | {"cost": {}}), r"field cost\.simulation"),
-        (json.dumps(make_record() | {"cost": {"simulation": None}}), r"field cost\.simulation"),
-        (json.dumps(make_record() | {"data": {"name": "a", "checksum": None}}), r"field data\.checksum"),
-        (json.dumps(make_record() | {"per_segment": [{}, {}, {}, {}]}), "row without a segment"),
-    ],
-)
-def test_damaged_evaluations_are_named(tmp_path: Path, text: str, message: str) -> None:
-    run = make_run(tmp_path / "bc", "bc", 0, make_record())
-    (run / "evaluations" / "bad.json").write_text(text)
-    with pytest.raises(DataError, match=message) as error:
-        collect([run], "main")
-    assert "bad.json" in str(error.value)
-
-
 # --- the commands ---
 
 
@@ -492,6 +301,8 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
     assert record["ade"] == found.numbers()["ade"]
     assert record["playback"]["ade"] == 0
     assert len(record["per_segment"]) == 2
+    segments = SegmentStore(store)
+    assert record["horizon"] == max((s.num_steps - 1) * s.dt for s in (segments[0], segments[1]))
     assert record["data"]["checksum"] == SegmentStore(store).checksum()
     assert (record["run"]["method"], record["run"]["updates"]) == ("bc", 2)
     visited = [np.array(record["curvature"][part]) for part in ("policy", "log")]

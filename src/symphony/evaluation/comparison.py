@@ -10,7 +10,16 @@ from typing import Any
 
 from symphony.config import EvaluateConfig, PaperData, Setting, TableColumns
 from symphony.errors import ConfigError
-from symphony.evaluation.entries import BASELINES, ROWS, SETTINGS, Entry, family, method_name, number
+from symphony.evaluation.entries import (
+    BASELINES,
+    ROWS,
+    SETTINGS,
+    Entry,
+    family,
+    method_name,
+    number,
+    setting_seconds,
+)
 from symphony.evaluation.paper import METRICS, paper_figures
 from symphony.evaluation.records import (
     simulation_way,
@@ -342,6 +351,9 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
         f"({record['data']['checksum'][:12]}); ± standard error over seeds; bold: best of the BC methods and "
         f"of the MGAIL methods"
     ]
+    horizons = sorted({round(entry.record["horizon"], 1) for entry in entries if "horizon" in entry.record})
+    if any(each != setting_seconds(record) for each in horizons):
+        notes.append(f"rollouts last {' or '.join(f'{each:g}' for each in horizons)} s")
     ways: dict[str, list[str]] = {}
     for entry in entries:
         config = entry.record["config"]

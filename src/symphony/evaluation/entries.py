@@ -25,7 +25,7 @@ ROWS: tuple[str, ...] = (*BASELINES, *get_args(Method))
 SETTINGS: dict[Setting, tuple[int, int]] = {"main": (2, 10), "long": (2, 20), "many": (8, 10)}
 """Interactive agents and seconds."""
 WHOLE_LOG = 10
-"""Seconds that a run counts as where it was trained on the whole of the segments."""
+"""Seconds that the whole of the segments counts as, where nothing says how many they are."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ def collect(
             name: record
             for name, record in kept_evaluations(folder).items()
             if record["config"]["interactive"] == interactive
-            and (record["config"]["duration"] or WHOLE_LOG) == seconds
+            and setting_seconds(record) == seconds
+            and record["config"]["duration"] in (0, config.get("duration") or WHOLE_LOG)
         }
         if not fitting(kept, patterns):
             reason = (
@@ -108,12 +109,24 @@ def collect(
     return entries, left_out
 
 
+def setting_seconds(record: Mapping[str, Any]) -> float:
+    """Seconds of the setting that an evaluation belongs to.
+
+    Those asked for; of one over the whole of the segments those of the setting that is nearest to its horizon: logs
+    of 9.1 s belong to the one of 10.
+    """
+    asked: float = record["config"]["duration"]
+    horizon: float = record.get("horizon", WHOLE_LOG)
+    return asked or min((seconds for _, seconds in SETTINGS.values()), key=lambda each: abs(each - horizon))
+
+
 def _unfit(config: Mapping[str, Any], setting: Setting) -> str:
     if config["method"] not in ROWS[1:]:
         return f"unknown method {config['method']}"
-    found = run_interactive(dict(config)), config.get("duration") or WHOLE_LOG
-    if found != SETTINGS[setting]:
-        return f"trained with {found[0]} interactive agents for {found[1]:g} s"
+    interactive, seconds = SETTINGS[setting]
+    acting, lasting = run_interactive(dict(config)), config.get("duration", 0)
+    if acting != interactive or lasting not in (0, seconds):
+        return f"trained with {acting} interactive agents for {lasting or WHOLE_LOG:g} s"
     return ""
 
 

@@ -79,6 +79,7 @@ class Evaluation:
         search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
         own: mean of each metric of the user's own by run segment, by import path.
         seconds: CPU time of the simulation, what it costs.
+        horizon: seconds that the longest rollout lasts.
         baselines: the same of :data:`BASELINES`, where they were asked for.
     """
 
@@ -89,6 +90,7 @@ class Evaluation:
     search: str
     own: dict[str, dict[str, float]] = field(default_factory=dict)
     seconds: float = 0.0
+    horizon: float = 0.0
     baselines: tuple[Evaluation, ...] = ()
 
     def numbers(self) -> dict[str, float | int | str]:
@@ -183,8 +185,9 @@ def evaluate_dataset(
     once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0, persona="")
     acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     hows = [config] + [once] * (len(everyone) - 1)
+    horizon = dataset.decisions * dataset.dt
     found = [
-        Evaluation(one.name, RolloutMetrics(), how, acting, search_kind(one, how))
+        Evaluation(one.name, RolloutMetrics(), how, acting, search_kind(one, how), horizon=horizon)
         for one, how in zip(everyone, hows, strict=True)
     ]
     for path in config.metric:

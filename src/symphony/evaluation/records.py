@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -70,11 +71,12 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         seconds of CPU time for ``simulation``, all rollouts of all segments together; ``run``: ``method``, ``seed``,
         ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether
         that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
-        store; ``config``: the settings of the evaluation, with what was left to the agent filled
-        in; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and ``parts``,
-        pseudo-values of the divergence by recording (see :func:`symphony.metrics.sampled_divergence`);
-        ``per_segment``: a row for each run segment. `symphony evaluate --metrics wosac` adds ``wosac`` and numbers
-        whose names begin so (see :func:`symphony.evaluation.wosac.wosac_parts`).
+        store; ``config``: the settings of the evaluation, with what was left to the agent filled in; ``horizon``:
+        seconds of the longest rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy``
+        and ``log``, and ``parts``, pseudo-values of the divergence by recording (see
+        :func:`symphony.metrics.sampled_divergence`); ``per_segment``: a row for each run segment. `symphony evaluate
+        --metrics wosac` adds ``wosac`` and numbers whose names begin so (see
+        :func:`symphony.evaluation.wosac.wosac_parts`).
     """
     visited, visited_log = result.metrics.curvature_histograms()
     divergence, names = result.metrics.curvature_divergence()
@@ -85,6 +87,7 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         "run": _run_facts(agent.name),
         "data": {"name": store.path.resolve().name, "checksum": store.checksum()},
         "config": _filled_in(agent, result),
+        "horizon": result.horizon,
         **{baseline.agent: baseline.numbers() for baseline in result.baselines},
         "cost": {"simulation": result.seconds},
         "curvature": {"policy": visited.tolist(), "log": visited_log.tolist(), "parts": parts},
@@ -233,6 +236,10 @@ def read_evaluation(file: Path) -> dict[str, Any]:
     for part, name, kinds in (("data", "checksum", (str,)), ("cost", "simulation", (int, float))):
         if type(record[part][name]) not in kinds:
             raise DataError(f"is {record[part][name]!r}", file=file, field=f"{part}.{name}")
+    # Those of before have none.
+    horizon = record.get("horizon", 1.0)
+    if type(horizon) not in (int, float) or not 0 < horizon < math.inf:
+        raise DataError(f"is {horizon!r}", file=file, field="horizon")
     segments, rows = record.get("segments"), record.get("per_segment")
     if type(segments) is not int or segments < 1:
         raise DataError("is missing", file=file, field="segments")

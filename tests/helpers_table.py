@@ -1,0 +1,73 @@
+"""Evaluations, runs and tables of made-up numbers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from symphony.config import Method
+from symphony.evaluation.comparison import Comparison
+from symphony.evaluation.entries import Entry
+from symphony.evaluation.paper import METRICS
+from symphony.evaluation.records import evaluation_name, keep_evaluation
+
+METHODS = get_args(Method)
+
+
+def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[str, Any]:
+    numbers = dict.fromkeys(METRICS, 1.0) | (values or {})
+    config = {
+        "search": "none",
+        "trees": 0,
+        "branches": 0,
+        "rule": "",
+        "interactive": 2,
+        "rollouts": 16,
+        "duration": 0,
+        "seed": 0,
+        "logged_goals": False,
+    }
+    counts = [0] * 100 + [3] + [0] * 100
+    return {
+        "format": 2,
+        **numbers,
+        "segments": 4,
+        "run": {"updates": 0, "named": False, "checkpoint": 0},
+        "data": {"name": "test", "checksum": "ab" * 32},
+        "config": config | changes,
+        "playback": {"collision_rate": 0.5, "offroad_time": 0.25},
+        "constant_velocity": dict.fromkeys(METRICS, 2.0),
+        "cost": {"simulation": 6.0},
+        "curvature": {"policy": counts, "log": counts},
+    }
+
+
+def make_entry(method: str, seed: int = 0, **values: float) -> Entry:
+    record = make_record(values, seed=seed)
+    return Entry(Path(f"{method}-{seed}"), {"method": method, "seed": seed}, evaluation_name(record), record)
+
+
+def make_run(folder: Path, method: str, seed: int = 0, *records: dict[str, Any], **config: Any) -> Path:
+    folder.mkdir(parents=True)
+    settings = {"format": 2, "method": method, "seed": seed, "agent": {"interactive": 2}} | config
+    (folder / "config.json").write_text(json.dumps(settings))
+    for record in records:
+        keep_evaluation(str(folder), record)
+    return folder
+
+
+def full_table(seeds: int = 3, methods: Any = METHODS) -> list[Entry]:
+    rng, top = np.random.default_rng(0), [30, 5, 20, 10, 0.01]
+    return [
+        make_entry(method, seed, **dict(zip(METRICS, rng.uniform(0, top).tolist(), strict=True)))
+        for method in methods
+        for seed in range(seeds)
+    ]
+
+
+def row_of(comparison: Comparison, method: str) -> Any:
+    (row,) = (row for row in comparison.rows if row.method == method)
+    return row
