@@ -26,9 +26,10 @@ from symphony.evaluation.pictures import search_tree
 from symphony.evaluation.planners import check_crowds, winners
 from symphony.recipes import train
 from symphony.simulation.crowd import crowd_dataset
+from symphony.simulation.identity import source_of
 from symphony.simulation.planner_calls import answer, plans_of
 from symphony.simulation.saved_files import load_rollouts
-from symphony.simulation.saving import save_simulation, source_of
+from symphony.simulation.saving import save_simulation
 
 PLAN = "def plan(seen):\n    return {}\n"
 
@@ -123,6 +124,50 @@ class Shop:
 
     def __call__(self, seen: Any) -> tuple[float, float]:
         return self.plan(seen)
+
+
+class Part:
+    """Prints as its place in memory."""
+
+    def __init__(self, value: Any) -> None:
+        self.value, self.whole = value, self
+
+
+def middle(gain: float) -> Any:
+    """Numbers of which Python prints only the first and the last."""
+    values = np.zeros(5000)
+    values[2500] = gain
+    return values
+
+
+def network(gain: float) -> Any:
+    layer = torch.nn.Linear(1, 2000)
+    torch.nn.init.constant_(layer.weight, 0.0)
+    torch.nn.init.constant_(layer.bias, gain)
+    return layer
+
+
+HELD: dict[str, Any] = {
+    "array": middle,
+    "tensor": lambda gain: torch.from_numpy(middle(gain)).requires_grad_(),
+    "network": network,
+    "object": lambda gain: Part({"deep": [Part(gain)]}),
+    "set": lambda gain: {"a", gain},
+    "objects": lambda gain: np.array([Part(gain), None]),
+}
+
+
+@pytest.mark.parametrize("kind", HELD)
+@pytest.mark.parametrize("bind", [Shop, lambda held: partial(steady, held)], ids=["object", "partial"])
+def test_whatever_a_planner_holds_is_looked_at_whole(kind: str, bind: Any) -> None:
+    one, same, other = (source_of(bind(HELD[kind](gain))) for gain in (1.0, 1.0, 2.0))
+    assert one == same != other
+
+
+def test_the_order_of_a_set_is_nothing_of_a_planner() -> None:
+    one, other = {0, 8}, {8, 0}
+    assert list(one) != list(other)  # as of words from one process to the next
+    assert source_of(partial(steady, one)) == source_of(partial(steady, other))
 
 
 @pytest.mark.parametrize("make", [steadily, Shop, lambda gain: Shop(gain).plan])

@@ -92,8 +92,9 @@ class Evaluate:
         from symphony.data.store import SegmentStore
         from symphony.evaluation.records import evaluation_record, keep_evaluation
         from symphony.simulation.demonstrations import evenly_spaced
+        from symphony.simulation.identity import identity_of
         from symphony.simulation.saved_files import About, RolloutWriter
-        from symphony.simulation.saving import identity_of, plain_settings
+        from symphony.simulation.saving import plain_settings
 
         if self.figure is not None:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while

@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import inspect
-import json
-import re
-import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +18,16 @@ from symphony.simulation.control import given_goals
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import driven_by
 from symphony.simulation.finite import NotFiniteError
+from symphony.simulation.identity import identity_of, source_of
 from symphony.simulation.planned import EgoPlanners
-from symphony.simulation.planner import PIPE, planner_maker, planner_name
+from symphony.simulation.planner import planner_maker, planner_name
 from symphony.simulation.planner_calls import SECONDS
-from symphony.simulation.planner_view import FunctionPlanner
 from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
 from symphony.simulation.workers import batches, naming, shared
 
 _MEMORY = ("batch", "device", "metric", "workers", "engine")
 """Settings that change no rollout."""
-_PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 
 
 def save_simulation(
@@ -165,78 +158,6 @@ def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int]
         else:
             writer.fail(segment.segment_id, rollouts, why, segment.group)
     return found
-
-
-def identity_of(agent: Agent) -> dict[str, str]:
-    """Digests of an agent's weights and of what it is built and searched by, as settings: another agent of the same
-    name is another simulation.
-    """
-    if not agent.modules:
-        return {}
-    digest = hashlib.sha256()
-    for part, module in sorted(agent.modules.items()):
-        for name, value in sorted(module.state_dict().items()):
-            digest.update(f"{part}.{name} {value.dtype} {tuple(value.shape)}".encode())
-            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    specification = "" if agent.spec is None else json.dumps(dataclasses.asdict(agent.spec), sort_keys=True)
-    return {"weights": digest.hexdigest()[:12], "specification": _short(specification.encode())}
-
-
-def source_of(planner: str | Callable[..., Any]) -> str:
-    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it (by
-    ``functools.partial``, as an object's attributes, by the function around it): one that was changed is another one.
-
-    Of a command what it starts, where that is a file, and the first other word that is one. Empty for what comes with
-    the package, and where no source is known.
-    """
-    if isinstance(planner, str) and planner.startswith(PIPE):
-        words = shlex.split(planner.removeprefix(PIPE))
-        found = [_digest(words[0]), next(filter(None, map(_digest, words[1:])), "")]
-        return _short("".join(found).encode()) if all(found) else "".join(found)
-    given, bound = planner_maker(planner), ""
-    if isinstance(given, partial) and given.func is FunctionPlanner:
-        given = given.args[0]
-    while isinstance(given, partial):
-        # Where an object lies in memory is nothing of it.
-        bound += _PLACE.sub("", repr((given.args, given.keywords)))
-        given = given.func
-    held = _held_by(given)
-    bound += _PLACE.sub("", repr(held)) if held else ""
-    code = _code_of(given)
-    return _short((code + bound).encode()) if bound else code
-
-
-def _held_by(given: Any) -> Mapping[str, Any]:
-    """What an object or a function has beside its code, by name."""
-    if inspect.isfunction(given):
-        return inspect.getclosurevars(given).nonlocals
-    owner = given.__self__ if inspect.ismethod(given) else given
-    return {} if inspect.isclass(owner) else getattr(owner, "__dict__", {})
-
-
-def _code_of(given: Any) -> str:
-    module = inspect.getmodule(given)
-    if module is None or module.__name__.partition(".")[0] == "symphony":
-        return ""
-    file = getattr(module, "__file__", None)
-    if file is not None:
-        return _digest(file)
-    try:  # of a notebook, say
-        return _short(inspect.getsource(given).encode())
-    except (OSError, TypeError):
-        return ""
-
-
-def _short(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:12]
-
-
-def _digest(file: str) -> str:
-    """Of what a file holds; empty where there is none that can be read."""
-    try:
-        return _short(Path(file).read_bytes()) if Path(file).is_file() else ""
-    except OSError:
-        return ""
 
 
 def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:
