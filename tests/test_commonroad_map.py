@@ -10,7 +10,7 @@ import shapely
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from helpers_sources import ROAD, bound, driver, lanelet, signed_area
+from helpers_sources import ROAD, bound, driver, lanelet, off_road, signed_area
 from helpers_sources import convert_xml as convert
 from symphony.data.segment import LaneType, MarkType, SignalState
 from symphony.data.sources.lines import SLIT, drivable_rings
@@ -67,7 +67,7 @@ def test_speed_limits_of_either_version(path: Path) -> None:
         ("<laneletType>highway</laneletType>", "", LaneType.FREEWAY),
         ("<laneletType>urban</laneletType>", "highway", LaneType.SURFACE_STREET),
         ("<laneletType>urban</laneletType><laneletType>bicycleLane</laneletType>", "", LaneType.BIKE_LANE),
-        ("<laneletType>shoulder</laneletType>", "", LaneType.UNDEFINED),
+        ("<laneletType>unknown</laneletType>", "", LaneType.UNDEFINED),
         ("", "multi_lane highway comfort", LaneType.FREEWAY),
         ("", "urban", LaneType.SURFACE_STREET),
         ("", "", LaneType.UNDEFINED),
@@ -85,6 +85,25 @@ def test_walkways_are_no_lanes(path: Path) -> None:
     assert segment.road.lane_id.tolist() == [10, 11]
     assert segment.road.mark_type.tolist() == [MarkType.CROSSWALK]
     assert segment.road.boundary.points[:, 1].max() == 2
+
+
+@pytest.mark.parametrize("kind", ["shoulder", "border", "parking", "restricted"])
+def test_what_lies_beside_the_lanes_is_road_and_no_lane(path: Path, kind: str) -> None:
+    """Nobody's route leads along it, nobody who stands there is off the road, and it is cut where the lanes are."""
+    types = f"<laneletType>urban</laneletType><laneletType>{kind}</laneletType>"
+    more = '<adjacentLeft ref="10" drivingDir="same"/>'
+    strips = [
+        lanelet(20, [(0, -2), (50, -2)], [(0, -4), (50, -4)], f'{types}<successor ref="21"/>{more}'),
+        lanelet(21, [(50, -2), (100, -2)], [(50, -4), (100, -4)], types),
+    ]
+    segment, plain = (convert(path, ROAD, *beside, driver(7)) for beside in (strips, []))
+    road = segment.road
+    for name in ("lane_id", "successors", "left_neighbors", "right_neighbors", "lane_type"):
+        np.testing.assert_array_equal(getattr(road, name), getattr(plain.road, name))
+    spots = np.array([(50, 0), (50, -3), (99, -3.9), (150, -3), (50, -4.5), (50, 2.5)]) - segment.origin[:2]
+    assert (off_road(road, spots) > 0).tolist() == [False] * 4 + [True] * 2
+    with pytest.raises(AssertionError, match="field lanelet: has no lanes"):
+        convert(path, *strips, driver(7))
 
 
 def test_painted_lines_are_marks_and_shared_ones_count_once(path: Path) -> None:

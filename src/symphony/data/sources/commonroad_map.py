@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,8 @@ _LANE_TYPES = (
     (LaneType.SURFACE_STREET, {"urban", "country", "intersection", "driveWay", "busLane"}),
 )
 _WALKWAYS = frozenset({"sidewalk", "crosswalk"})
+_BESIDE = frozenset({"shoulder", "border", "parking", "restricted"})
+"""Places of the road that are no way to anywhere."""
 _SPEED_SIGNS = frozenset({"274", "R2-1", "r301", "R301"})
 _COLORS = {
     "red": SignalState.STOP,
@@ -74,7 +77,7 @@ class Network:
     """All lanelets of a file in logged coordinates (float64).
 
     Attributes:
-        lanes: those that carry vehicles or cyclists; a road's lane k is ``lanes[k]``.
+        lanes: those by which vehicles or cyclists get on; a road's lane k is ``lanes[k]``.
         crosswalks: those for crossing on foot.
         boundary: edge of the drivable area, drivable side on the left, open where the network was cut.
         kind: lane type where a lanelet does not say.
@@ -93,7 +96,8 @@ class Network:
 def read_network(root: ET.Element) -> Network:
     """Read the lanelets of either version of the format.
 
-    Sidewalks are left out; so are lanelets with a bound of fewer than two points.
+    Sidewalks are left out; so are lanelets with a bound of fewer than two points. Shoulders, parking places and what
+    is restricted belong to the drivable area, but are no lanes.
 
     Raises:
         DataError: there are no lanelets, or one can't be read.
@@ -101,23 +105,33 @@ def read_network(root: ET.Element) -> Network:
     limits = _speed_signs(root)
     found = [_lanelet(node, limits) for node in root.findall("lanelet")]
     lanelets = [lanelet for lanelet in found if len(lanelet.left)]
-    lanes = tuple(lanelet for lanelet in lanelets if not lanelet.kinds & _WALKWAYS)
+    surface = tuple(lanelet for lanelet in lanelets if not lanelet.kinds & _WALKWAYS)
+    lanes = tuple(lanelet for lanelet in surface if not lanelet.kinds & _BESIDE)
     if not lanes:
         raise DataError("has no lanes", field="lanelet")
     tags = set((root.get("tags") or "").split()) | {child.tag for child in root.findall("scenarioTags/*")}
-    index = {lanelet.lanelet_id: k for k, lanelet in enumerate(lanes)}
-    flow = [(k, index[ref]) for k, lane in enumerate(lanes) for ref in lane.successors if ref in index]
-    flow += [(index[ref], k) for k, lane in enumerate(lanes) for ref in lane.predecessors if ref in index]
-    links = pairs(flow)
-    rings = drivable_rings([lanelet.ring for lanelet in lanes])
+    rings = drivable_rings([lanelet.ring for lanelet in surface])
+    ends = cut_ends([(lanelet.left, lanelet.right) for lanelet in surface], _links(surface))
     return Network(
         lanes=lanes,
         crosswalks=tuple(lanelet for lanelet in lanelets if "crosswalk" in lanelet.kinds),
-        boundary=opened(rings, cut_ends([(lane.left, lane.right) for lane in lanes], links)),
+        boundary=opened(rings, ends),
         kind=_lane_type(tags, LaneType.UNDEFINED),
-        index=index,
-        links=links,
+        index=_places(lanes),
+        links=_links(lanes),
     )
+
+
+def _places(lanelets: Sequence[Lanelet]) -> dict[int, int]:
+    return {lanelet.lanelet_id: k for k, lanelet in enumerate(lanelets)}
+
+
+def _links(lanelets: Sequence[Lanelet]) -> NDArray[np.int32]:
+    """[E, 2] which of some lanelets lead to which of them, told by either."""
+    index = _places(lanelets)
+    flow = [(k, index[ref]) for k, lane in enumerate(lanelets) for ref in lane.successors if ref in index]
+    flow += [(index[ref], k) for k, lane in enumerate(lanelets) for ref in lane.predecessors if ref in index]
+    return pairs(flow)
 
 
 def _speed_signs(root: ET.Element) -> dict[int, float]:
