@@ -139,6 +139,15 @@ def test_planners_are_forked_with_their_branches(settings: dict[str, Any]) -> No
         assert (parents != torch.arange(6)).any(), "nobody was forked"
 
 
+@pytest.mark.parametrize("make", [Wanderer, odd([0.0] * 3)], ids=["copied", "failed"])
+def test_planners_of_branches_that_come_again_are_not_all_there_are(make: Any) -> None:
+    settings: dict[str, Any] = {"search": "tree", "branches": 6, "rule": "replace", "prune_every": 4}
+    once = simulated(make, **settings).search
+    found = simulated(make, retries=2, retry_above=float(once.totals.median()), **settings)
+    assert 1 < found.search.simulated_steps / once.simulated_steps < 3
+    assert [set(each) for each in found.failed] == [set() if make is Wanderer else set(range(4))] * 2
+
+
 def test_planners_that_share_their_memory_are_taken_for_another() -> None:
     found = simulated(Shared, search="tree", branches=6, rule="best", prune_every=5)
     assert any("taken for another" in why for each in found.failed for why in each.values())

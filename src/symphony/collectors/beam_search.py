@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -92,8 +92,8 @@ def beam_search(
         leaves: return only so many, the best of the last period first; default all, in the order of their slots.
         last_period: [*b] number of the period that is the last for `leaves`, where rows end sooner than others.
         retries: how often a period may be simulated again, from its start, for branches that ended it with a
-            total above `retry_above`; the lowest total of a branch counts. All branches are run again and only
-            those concerned take the result, so that shapes do not depend on the data.
+            total above `retry_above`; the lowest total of a branch counts. Only these are run again, R of them as
+            a batch [R, 1], which policy, environment and `score` must take like any other.
         retry_above: threshold of `retries`.
         reseed: ``reseed(state, attempt) -> state`` for attempt 1, 2, ...: gives the start of a repeated period
             fresh random numbers. Not needed if policy and environment draw from a global generator.
@@ -127,15 +127,16 @@ def beam_search(
     with set_exploration_type(exploration_type):
         for period, length in enumerate(periods):
             run = _simulate(env, policy, score, now, length, aggregate, keep)
-            simulated += length
+            simulated += length * start.numel()
             for attempt in range(1, retries + 1):
-                redo = ~(run.totals <= threshold)
-                if not bool(redo.any()):
+                # Places in the flattened [*b, S].
+                redo = (~(run.totals <= threshold)).flatten().nonzero()
+                if len(redo) == 0:
                     break
                 again = now if reseed is None else reseed(now.copy(), attempt)
-                other = _simulate(env, policy, score, again, length, aggregate, keep)
-                simulated += length
-                run = _better(run, other, redo, slot_keys)
+                other = _simulate(env, policy, score, _take(again, redo), length, aggregate, keep)
+                simulated += length * len(redo)
+                run = _better(run, other, redo.squeeze(-1), slot_keys)
             records += run.records
             scores.append(run.scores)
             totals.append(run.totals)
@@ -185,7 +186,7 @@ def beam_search(
         simulated_scores=simulated_scores,
         tree=tree if keep_tree else None,
         prune_every=prune_every,
-        simulated_steps=simulated * start.numel(),
+        simulated_steps=simulated,
         log_weights=log_weights,
     )
 
@@ -271,20 +272,37 @@ def _simulate(
     return _Run(records, joined, totals, now)
 
 
-def _better(first: _Run, second: _Run, redo: Bool[Tensor, "*b S"], slot_keys: Sequence[NestedKey]) -> _Run:
-    """Branch by branch the run with the lower total, among those to be redone; NaN is worse than any."""
-    lower = (second.totals < first.totals) | (first.totals.isnan() & ~second.totals.isnan())
-    take = redo & lower
+def _better(first: _Run, second: _Run, rows: Int[Tensor, " R"], slot_keys: Sequence[NestedKey]) -> _Run:
+    """The first run, but of some branches the second, [R, 1], where that has a lower total; NaN is worse than any.
 
-    def choose(new: Shaped[Tensor, "*e"], old: Shaped[Tensor, "*e"]) -> Shaped[Tensor, "*e"]:
-        return torch.where(take.reshape(take.shape + (1,) * (new.ndim - take.ndim)), new, old)
+    Args:
+        first: of all branches.
+        second: of some.
+        rows: places of these in the flattened [*b, S].
+        slot_keys: entries that stay as in the first.
+    """
+    before, total = first.totals.flatten().index_select(0, rows), second.totals.flatten()
+    lower = ((total < before) | (before.isnan() & ~total.isnan())).nonzero().squeeze(-1)
+    dims, where = first.totals.ndim, rows.index_select(0, lower)
 
-    after = second.after.apply(choose, first.after)
+    def put(old: Shaped[Tensor, "*e"], new: Shaped[Tensor, "*e"]) -> Shaped[Tensor, "*e"]:
+        taken = new.flatten(0, 1).index_select(0, lower)
+        return old.flatten(0, dims - 1).index_copy(0, where, taken).reshape(old.shape)
+
+    def put_all(old: TensorDictBase, new: TensorDictBase) -> TensorDictBase:
+        both = {
+            key: put_all(value, new.get(key))
+            if isinstance(value, TensorDictBase)
+            else put(value, new.get(key))
+            for key, value in old.items()
+        }
+        return TensorDict(both, old.batch_size, device=old.device)
+
     return _Run(
-        [new.apply(choose, old) for new, old in zip(second.records, first.records, strict=True)],
-        choose(second.scores, first.scores),
-        choose(second.totals, first.totals),
-        _set_slots(after, first.after, slot_keys),
+        [put_all(old, new) for old, new in zip(first.records, second.records, strict=True)],
+        put(first.scores, second.scores),
+        put(first.totals, second.totals),
+        _set_slots(put_all(first.after, second.after), first.after, slot_keys),
     )
 
 

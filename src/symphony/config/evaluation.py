@@ -76,7 +76,8 @@ class EvaluateConfig:
     """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `oracle`: by the true collision
     and off-road flags; `best`: independent rollouts, of which the one with the best score counts."""
     trees: int = 1
-    """Search trees per run segment, each with goals of its own; each gives its share of the rollouts."""
+    """Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
+    less than all of its leaves, take `goals` of the tree: among those of branches the discriminator would choose."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: str = "agent"
@@ -92,7 +93,7 @@ class EvaluateConfig:
     meant."""
     retries: int = 0
     """How often the steps between two prunings are simulated again for branches that end them with a score above
-    `retry-above` (each time costs as much as the whole search)."""
+    `retry-above`. Only these cost anything."""
     retry_above: float = 0.0
     """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     action_temperature: float = 1.0

@@ -202,7 +202,8 @@ class EgoPolicy(TensorDictModuleBase):
     def _own(self, numbers: list[int], going: list[bool], step: int) -> list[int]:
         """Numbers of planners that may be changed, one for each rollout that goes on."""
         keeps = self.keep_every > 0 and step % self.keep_every == 0
-        if step > self._kept_from and (keeps or self.keep_every == 0) and len(set(numbers)) < len(self._held):
+        if step > self._kept_from and (keeps or self.keep_every == 0):
+            # Only the first time: whoever comes again are some of the branches, and the others go on, too.
             self._held = {n: self._held[n] for n in set(numbers)}
             self._kept_from = step
         taken: set[int] = set()
