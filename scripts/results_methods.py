@@ -48,12 +48,23 @@ SEARCH = (
     ("only the bad replaced, goals of each branch", "replace-branch", ""),
 )
 """Ways to simulate one agent: label, end of the record's name, and the part of it that the row is of."""
-FOREST = (
-    ("no search", "none", ""),
-    ("the leaves of one tree of 16", "one", ""),
-    ("a leaf each of 16 trees of 16 (the paper's reading)", "forest", ""),
+FOREST = {
+    "bc_ts": "BC+TS",
+    "bc_ts_h": "BC+TS+H",
+    "mgail_ts": "MGAIL+TS",
+    "mgail_ts_h": "MGAIL+TS+H",
+    "included": "included BC+TS+H",
+}
+"""Agents on 100 of the 500 test segments of towns: those of BC of 10 000 towns, those of MGAIL of seed 70."""
+AGAIN = (
+    ("16 branches", "16", ""),
+    ("32 branches", "32", ""),
+    ("64 branches", "64", ""),
+    ("16, totals above 1 once again", "retry-1", ""),
+    ("16, totals above 0 once again", "retry-0", ""),
+    ("16, totals above 0 twice again", "retries-0", ""),
 )
-"""On every fifth test segment of towns: of the included agent, and of BC+TS+H among the methods."""
+"""The included agent on validation segments: label and end of the record's name."""
 DRIVEN = {"town": "towns", "ngsim": "real roads"}
 INCLUDED = (
     ("log playback", "driving/{}-none", "playback"),
@@ -151,6 +162,11 @@ TOWNS = (
     ("BC, 10 000 towns", "towns/{}-bc"),
     ("BC+TS, 3 290 towns, three seeds", "eight/{}-bc_ts-*"),
     ("BC+TS, 10 000 towns", "towns/{}-bc_ts"),
+    ("BC+H, 3 290 towns, three seeds", "eight/{}-bc_h-*"),
+    ("BC+H, 10 000 towns", "towns/{}-bc_h"),
+    ("BC+TS+H, 3 290 towns, three seeds", "eight/{}-bc_ts_h-*"),
+    ("BC+TS+H, 10 000 towns", "towns/{}-bc_ts_h"),
+    ("BC+TS+H, 10 000 towns, 2 000 instead of 500 updates", "towns/{}-bc_ts_h-2000"),
 )
 """What three times as many simulated towns do in as many updates."""
 INPUTS = (
@@ -309,6 +325,23 @@ def searched(folder: str, data: str, rows: Sequence[tuple[str, str, str]] = SEAR
         cost = "" if part else f"{record['cost']['simulation'] / record['segments']:.2f}"
         grid.append([label, *cells([record], COLUMNS, part), cost])
     return grid
+
+
+def forests() -> Grid:
+    """Independent trees of which each gives a leaf, beside one tree and beside no search."""
+    ways = {
+        "none": "no search",
+        "one": "the leaves of one tree of 16",
+        "forest": "a leaf each of 16 trees of 16",
+        "branch": "the same, goals of each branch",
+    }
+    rows = [
+        (f"{name}: {words}" if way == "none" else words, f"{agent}-{way}", "")
+        for agent, name in FOREST.items()
+        for way, words in ways.items()
+        if way != "branch" or agent == "mgail_ts_h"
+    ]
+    return searched("forest", "town", rows)
 
 
 def included() -> Grid:
