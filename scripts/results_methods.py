@@ -162,6 +162,7 @@ TOWNS = (
     ("BC, 10 000 towns", "towns/{}-bc"),
     ("BC+TS, 3 290 towns, three seeds", "eight/{}-bc_ts-*"),
     ("BC+TS, 10 000 towns", "towns/{}-bc_ts"),
+    ("BC+TS, 10 000 towns, 2 000 instead of 500 updates", "towns/{}-bc_ts-2000"),
     ("BC+H, 3 290 towns, three seeds", "eight/{}-bc_h-*"),
     ("BC+H, 10 000 towns", "towns/{}-bc_h"),
     ("BC+TS+H, 3 290 towns, three seeds", "eight/{}-bc_ts_h-*"),
