@@ -26,6 +26,7 @@ from symphony.envs.routes import (
     ROUTE_FEATURES,
     SPACING,
     STRIDE,
+    TURN_FEATURES,
     pick_routes,
     route_ahead,
     route_choices,
@@ -136,8 +137,12 @@ def test_moving_the_world_changes_no_feature(
     state = [torch.tensor([[[*place, 0.2, 5.0]]]), torch.tensor([[[*there(place), 0.2 + angle, 5.0]]])]
     choices = [padded(p)[None, None, None] for p in (line, there(line))]
     count = torch.tensor([[[len(line)]]])
-    one, two = (route_choices(s.double(), c, count, SCALE)[0] for s, c in zip(state, choices, strict=True))
-    torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
+    for turns in (False, True):
+        one, two = (
+            route_choices(s.double(), c, count, SCALE, turns=turns)[0]
+            for s, c in zip(state, choices, strict=True)
+        )
+        torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
 
 
 def test_without_a_route_all_features_are_zero() -> None:
@@ -170,13 +175,16 @@ def test_padding_of_points_and_routes_changes_nothing(count: int, seed: int) -> 
     points, exist = pick_routes(table, counts, torch.tensor([1]), torch.tensor([[2, -1]]))
     assert torch.equal(points[0, 0], padded(line))
     assert exist.tolist() == [[count, 0]]
-    features, mask = route_choices(state.expand(1, 2, 4), table[1:], counts[1:], SCALE)
-    alone, one = route_choices(state, padded(line)[None, None, None], number[..., None], SCALE)
-    assert features.shape == (1, 2, 3, CHOICE_FEATURES)
-    assert torch.equal(mask, counts[1:] > 1)
-    assert torch.equal(features[0, 0, 2], alone[0, 0, 0])
-    assert one.all()
-    assert (features[counts[1:] == 0] == 0).all()
+    for turns in (False, True):
+        features, mask = route_choices(state.expand(1, 2, 4), table[1:], counts[1:], SCALE, turns=turns)
+        alone, one = route_choices(
+            state, padded(line)[None, None, None], number[..., None], SCALE, turns=turns
+        )
+        assert features.shape == (1, 2, 3, CHOICE_FEATURES + TURN_FEATURES * turns)
+        assert torch.equal(mask, counts[1:] > 1)
+        assert torch.equal(features[0, 0, 2], alone[0, 0, 0])
+        assert one.all()
+        assert (features[counts[1:] == 0] == 0).all()
 
 
 def test_choices_are_points_of_the_route_with_their_directions() -> None:
@@ -192,6 +200,37 @@ def test_choices_are_points_of_the_route_with_their_directions() -> None:
     steps = np.diff(np.concatenate([line, line[-1:]]), axis=0)[kept]
     np.testing.assert_allclose(np.stack([course.real, course.imag], -1), steps / SPACING, atol=1e-9)
     assert (rows[: len(kept), 4] == 1).all()
+
+
+@given(lines, st.integers(2, POINTS - 2), st.floats(-3.5, 3.5), headings)
+def test_turns_say_where_a_route_jumps(
+    line: NDArray[np.float64], where: int, aside: float, heading: float
+) -> None:
+    """As it does where it changes lanes; else they are the sines of the angles between its steps."""
+    where = min(where, len(line) - 1)
+    jumped = line + np.where(np.arange(len(line)) >= where, aside, 0.0)[:, None] * [0.0, 1.0]
+    state = torch.tensor([[[*line[0], heading, 5.0]]], dtype=torch.float64)
+    count = torch.tensor([[[len(line), len(line)]]])
+    both = torch.stack([padded(line), padded(jumped)])[None, None]
+    features, _ = route_choices(state, both, count, SCALE, turns=True)
+    found = features[0, 0, :, CHOICE_FEATURES + 2 :].numpy()
+    for turns, points in zip(found, (line, jumped), strict=True):
+        step = (points[1:] - points[:-1]) @ [1.0, 1j]
+        expected = np.sin(np.angle(step[1:] / step[:-1]))
+        np.testing.assert_allclose(turns[: len(expected)], expected, atol=1e-6)
+        assert (turns[len(expected) :] == 0).all()
+    other = np.flatnonzero(np.abs(found[0] - found[1]) > 1e-6)
+    assert set(other) <= {where - 2, where - 1}
+    if abs(aside) > 1.0:
+        assert len(other) > 0
+
+
+def test_where_a_route_begins_is_told_to_the_decimetre() -> None:
+    line, state = bend(), torch.tensor([[[0.0, 0.0, 0.0, 5.0]]], dtype=torch.float64)
+    beside = torch.stack([padded(line + np.array([0.0, y])) for y in (0.0, 0.1, 3.2)])[None, None]
+    features, _ = route_choices(state, beside, torch.full((1, 1, 3), len(line)), SCALE, turns=True)
+    _, left = features[0, 0, :, CHOICE_FEATURES : CHOICE_FEATURES + 2].unbind(-1)
+    torch.testing.assert_close(3.0 * left.atanh(), torch.tensor([0.0, 0.1, 3.2], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(4))

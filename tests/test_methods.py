@@ -18,10 +18,12 @@ from torch import Tensor
 from helpers_runs import build, pieces, same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from symphony import keys
+from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError, checkpoints
+from symphony.agents.included import pretrained_names
 from symphony.cli import main
 from symphony.collectors import BeamSearchCollector
-from symphony.config import DiscriminatorConfig, SearchConfig, TrainConfig, read_json, to_json
+from symphony.config import AgentSpec, DiscriminatorConfig, SearchConfig, TrainConfig, read_json, to_json
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
@@ -246,6 +248,22 @@ def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None
             read_json(TrainConfig, file)
     file.write_text(json.dumps(saved))
     assert read_json(TrainConfig, file).method == "bc_ts"
+
+
+def test_a_file_that_is_older_than_a_setting_means_what_held_then(tmp_path: Path) -> None:
+    """Of the included agents, too: they learned from routes of points alone."""
+    file = tmp_path / "agent.json"
+    spec = AgentSpec(action_space="bicycle", dt=0.2, goals=True)
+    for kept in ("turns", "points", None):
+        values = json.loads(to_json(spec))
+        assert values["agent"]["goal_features"] == "turns"
+        values["agent"] |= {"goal_features": kept}
+        if kept is None:
+            del values["agent"]["goal_features"]
+        file.write_text(json.dumps(values))
+        assert read_json(AgentSpec, file).agent.goal_features == (kept or "points")
+    for name in pretrained_names():
+        assert not load_agent(f"pretrained:{name}").observation.turns
 
 
 def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from symphony import keys
 from symphony.config import AgentConfig, AgentSpec
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
-from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES
+from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES, TURN_FEATURES
 from symphony.imports import build_object, load_object
 from symphony.modules import (
     FORESIGHT,
@@ -51,6 +51,7 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         num_points=spec.agent.num_points,
         num_lights=spec.agent.num_lights,
         route=spec.goals,
+        turns=spec.goals and spec.agent.goal_features == "turns",
         along=gaps and spec.goals,
         gaps=gaps,
         persona=spec.agent.persona,
@@ -111,7 +112,7 @@ def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     return goal_policy(
         SELF_FEATURES,
         _groups(spec, route=False),
-        CHOICE_FEATURES,
+        CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features == "turns"),
         hidden=spec.agent.hidden,
         encoder=_encoder(spec),
     )

@@ -34,6 +34,9 @@ class AgentConfig:
     """`paper`: objects and points around; `gaps`: also how far it is from the boxes of objects, now and within the
     next 2 s, were everyone to keep speed and course, and with goals where they are along its route; `road`: also how
     far its box is from the edge of the road, and its centre within the next 2 s."""
+    goal_features: Literal["points", "turns"] = field(default="turns", metadata={"before": "points"})
+    """What the goal policy observes of each route. `points`: where it is every 12 m; `turns`: also where it begins
+    and how much it turns every 3 m, which tells where it changes lanes (methods *_h)."""
     accelerations: int = 7
     """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
     cells: int = 0
@@ -56,6 +59,7 @@ class AgentConfig:
         positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
         not_negative(self, "num_lights", "cells")
         one_of(self, "features", ["paper", "gaps", "road"])
+        one_of(self, "goal_features", ["points", "turns"])
         if self.accelerations < 3 or self.accelerations % 2 == 0:
             raise ConfigError(f"accelerations must be odd and at least 3, is {self.accelerations}")
         if self.cells and (self.cells < 3 or self.cells % 2 == 0):

@@ -47,7 +47,18 @@ def read_json(kind: type[Any], file: Path) -> Any:
         raise ConfigError(f"{file}: not a JSON object")
     if values.pop("format", None) != FORMAT:
         raise ConfigError(f"{file}: configuration of another version, expected format {FORMAT}")
+    _fill(kind, values)
     return from_dict(kind, values, where=f"{file}: ")
+
+
+def _fill(kind: Any, values: dict[str, Any]) -> None:
+    """Add settings that a file is too old to have and that meant something else then than by default now."""
+    for field in dataclasses.fields(kind):
+        nested, value = _hints(kind)[field.name], values.get(field.name)
+        if "before" in field.metadata:
+            values.setdefault(field.name, field.metadata["before"])
+        elif isinstance(nested, type) and dataclasses.is_dataclass(nested) and isinstance(value, dict):
+            _fill(nested, value)
 
 
 def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> Any:

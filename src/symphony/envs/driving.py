@@ -195,6 +195,7 @@ class DrivingEnv(EnvBase):
             self.scenes.route[row.flatten()],
             self.scenes.route_count[row.flatten()],
             self.observation.distance_scale,
+            turns=self.observation.turns,
         )
         out = state.copy()
         out.set(keys.ROUTES, features.unflatten(0, row.shape))

@@ -54,6 +54,7 @@ class ObservationConfig:
         size_scale: metres of a box side that become 1.
         num_lights: nearest lights seen beside the points, as a group of their own; 0 for none.
         route: whether it observes the route that is its goal.
+        turns: whether whoever chooses a route observes where routes turn and change lanes.
         along: whether it observes where the objects are along that route.
         gaps: whether it observes how far its box is from others.
         persona: whether it knows the style in which it drives, a part of its state.
@@ -71,6 +72,7 @@ class ObservationConfig:
     speed_scale: float = 10.0
     size_scale: float = 5.0
     route: bool = False
+    turns: bool = False
     along: bool = False
     gaps: bool = False
     persona: bool = False

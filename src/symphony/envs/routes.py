@@ -39,6 +39,7 @@ BESIDE = 20.0
 STRIDE = 4
 """Of the points of a route, the share (one in so many) by which the goal policy observes it."""
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
+TURN_FEATURES = 2 + POINTS - 2
 
 
 @dataclass(frozen=True)
@@ -221,10 +222,14 @@ def route_choices(
     points: Float[Tensor, "M N G K 2"],
     count: Int[Tensor, "M N G"],
     distance_scale: float,
+    *,
+    turns: bool = False,
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
     """Every feasible route as features in the agent's frame, and which of them exist.
 
-    A feature vector is position, direction and existence of every :data:`STRIDE`-th point.
+    A feature vector is position, direction and existence of every :data:`STRIDE`-th point. With ``turns`` also where
+    the route begins, resolved to decimetres near the agent, and the sine of the turn at every point: a route jumps
+    where it changes lanes, which points 12 m apart hardly show.
     """
     kept = points[..., ::STRIDE, :]
     angle = -state[..., None, None, 2]
@@ -233,8 +238,17 @@ def route_choices(
     direction = rotate(following / following.norm(dim=-1, keepdim=True).clamp_min(1e-3), angle)
     order = torch.arange(0, points.shape[-2], STRIDE, device=points.device)
     there = (order < count[..., None])[..., None].to(state.dtype)
-    features = torch.cat([local / distance_scale, direction, torch.ones_like(there)], -1) * there
-    return features.flatten(-2), count > 1
+    seen = torch.cat([local / distance_scale, direction, torch.ones_like(there)], -1) * there
+    features = seen.flatten(-2)
+    if turns:
+        step = points[..., 1:, :] - points[..., :-1, :]
+        x, y = (step / step.norm(dim=-1, keepdim=True).clamp_min(1e-3)).unbind(-1)
+        exists = count[..., None]
+        turn = x[..., :-1] * y[..., 1:] - y[..., :-1] * x[..., 1:]
+        inner = torch.arange(2, points.shape[-2], device=points.device) < exists
+        begin = (local[..., 0, :] / 3.0).tanh()
+        features = torch.cat([features, begin * (exists > 0), torch.where(inner, turn, 0.0)], -1)
+    return features, count > 1
 
 
 def pick_routes(

@@ -336,6 +336,7 @@ class SceneDataset:
             torch.from_numpy(points)[:, None].to(device),
             torch.from_numpy(counts)[:, None].to(device),
             observation.distance_scale,
+            turns=observation.turns,
         )
         batch.set(keys.ROUTES, features)
         batch.set(keys.ROUTES_MASK, mask)
