@@ -159,17 +159,26 @@ PARTS = (
 """What inputs, further updates, distillation and search each do, of one seed."""
 TOWNS = (
     ("BC, 3 290 towns, three seeds", "eight/{}-bc-*"),
-    ("BC, 10 000 towns", "towns/{}-bc"),
+    ("BC, 10 000 towns, two seeds", "towns/{}-bc-[0-9]*"),
     ("BC+TS, 3 290 towns, three seeds", "eight/{}-bc_ts-*"),
-    ("BC+TS, 10 000 towns", "towns/{}-bc_ts"),
-    ("BC+TS, 10 000 towns, 2 000 instead of 500 updates", "towns/{}-bc_ts-2000"),
+    ("BC+TS, 10 000 towns, 500 updates, one seed", "towns/{}-bc_ts"),
+    ("BC+TS, 10 000 towns, 2 000 updates, two seeds", "towns/{}-bc_ts-2000-*"),
     ("BC+H, 3 290 towns, three seeds", "eight/{}-bc_h-*"),
-    ("BC+H, 10 000 towns", "towns/{}-bc_h"),
+    ("BC+H, 10 000 towns, two seeds", "towns/{}-bc_h-[0-9]*"),
     ("BC+TS+H, 3 290 towns, three seeds", "eight/{}-bc_ts_h-*"),
-    ("BC+TS+H, 10 000 towns", "towns/{}-bc_ts_h"),
-    ("BC+TS+H, 10 000 towns, 2 000 instead of 500 updates", "towns/{}-bc_ts_h-2000"),
+    ("BC+TS+H, 10 000 towns, 500 updates, one seed", "towns/{}-bc_ts_h"),
+    ("BC+TS+H, 10 000 towns, 2 000 updates, two seeds", "towns/{}-bc_ts_h-2000-*"),
 )
 """What three times as many simulated towns do in as many updates."""
+TURNS = (
+    ("BC", "towns/{}-bc-40"),
+    ("BC+H", "towns/{}-bc_h-40"),
+    ("BC+H, goals that see lane changes", "turns/{}-bc_h"),
+    ("BC+TS", "towns/{}-bc_ts-2000-40"),
+    ("BC+TS+H", "towns/{}-bc_ts_h-2000-40"),
+    ("BC+TS+H, goals that see lane changes", "turns/{}-bc_ts_h"),
+)
+"""Agents of 10 000 towns with another goal policy, nothing else changed."""
 INPUTS = (
     ("the paper's inputs", "inputs/{}-paper"),
     ("+ gaps to others", "inputs/{}-gaps"),

@@ -19,6 +19,7 @@ from symphony.evaluation.planners import planner_grid
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from results_base import ROOT, Grid, beside, means, records
+from results_hard import hard
 from results_methods import (
     ADVERSARIAL,
     AGAIN,
@@ -36,6 +37,7 @@ from results_methods import (
     RATES,
     SEEDS,
     TOWNS,
+    TURNS,
     WAYS,
     against_paper,
     driven,
@@ -85,6 +87,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "roadside": roadside,
     "parts": lambda: driven(PARTS),
     "towns": lambda: driven(TOWNS),
+    "turns": lambda: driven(TURNS),
     "rates": lambda: driven(RATES),
     "longer": lambda: driven(LONGER),
     "mended": lambda: driven(MENDED),
@@ -106,6 +109,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "driving-town": lambda: searched("driving", "town"),
     "driving-ngsim": lambda: searched("driving", "ngsim"),
     "forest": forests,
+    "hard": hard,
     "again-town": lambda: searched("again", "town", AGAIN),
     "again-ngsim": lambda: searched("again", "ngsim", [row for row in AGAIN if "twice" not in row[0]]),
     "driving-places": lambda: by_place(2),

@@ -3,7 +3,8 @@
     python scripts/routes_drawn.py pretrained:bc_ts_h town/validation --json routes.json
 
 Every segment is simulated twice with the same random numbers, with drawn routes and with those of the log. Routes are
-told apart by whether the log may have taken them and whether they change lanes.
+told apart by whether the log may have taken them and whether they change lanes. How often that is, is counted of
+agents whose log tells (``told``).
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def main() -> None:
     torch.set_num_threads(1)
     agent, store = load_agent(args.agent), SegmentStore(args.store)
     policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
-    rows = []
+    rows, told = [], []
     for begin in range(0, len(store), BATCH):
         segments = [store[k] for k in range(begin, min(begin + BATCH, len(store)))]
         graphs = [LaneGraph(segment.road) for segment in segments]
@@ -87,6 +88,8 @@ def main() -> None:
                 took = goal[b, :, n].numpy()
                 # Where the log leaves several open, it changes lanes if all of them do.
                 log_changes = bool(change[table.right].all())
+                if log_changes or not change[table.right].any():
+                    told.append((log_changes, change[took].mean()))
                 kind = np.where(
                     table.right[took],
                     0,
@@ -101,6 +104,8 @@ def main() -> None:
         "segments": len(store),
         "agents": len(rows),
         "rollouts": args.rollouts,
+        "told": len(told),
+        "changes": dict(zip(("log", "drawn"), 100 * np.mean(told, 0), strict=True)),
         "collisions": {"drawn": 100 * one.mean(), "logged": 100 * other.mean()},
         "kinds": {
             name: {
