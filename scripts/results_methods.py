@@ -171,14 +171,21 @@ TOWNS = (
 )
 """What three times as many simulated towns do in as many updates."""
 TURNS = (
-    ("BC", "towns/{}-bc-40"),
-    ("BC+H", "towns/{}-bc_h-40"),
-    ("BC+H, goals that see lane changes", "turns/{}-bc_h"),
-    ("BC+TS", "towns/{}-bc_ts-2000-40"),
-    ("BC+TS+H", "towns/{}-bc_ts_h-2000-40"),
-    ("BC+TS+H, goals that see lane changes", "turns/{}-bc_ts_h"),
+    ("BC", "towns/{}-bc-[0-9]*"),
+    ("BC+H", "towns/{}-bc_h-[0-9]*"),
+    ("BC+H, goals that see lane changes", "turns/{}-bc_h-[0-9]*"),
+    ("BC+TS", "towns/{}-bc_ts-2000-*"),
+    ("BC+TS+H", "towns/{}-bc_ts_h-2000-*"),
+    ("BC+TS+H, goals that see lane changes", "turns/{}-bc_ts_h-*"),
 )
 """Agents of 10 000 towns with another goal policy, nothing else changed."""
+OFTEN = (
+    ("run segments drawn evenly", "hard/{}-even"),
+    ("half of them hard ones", "hard/{}-hard"),
+)
+"""1 000 further updates of BC, on the validation parts."""
+LARGE = ("towns/town-bc-[0-9]*", "turns/town-bc_h-*", "towns/town-bc_ts-2000-*", "turns/town-bc_ts_h-*")
+"""The four of 10 000 towns, with the goal policy of today."""
 INPUTS = (
     ("the paper's inputs", "inputs/{}-paper"),
     ("+ gaps to others", "inputs/{}-gaps"),

@@ -29,9 +29,11 @@ from results_methods import (
     HALVING,
     INPUTS,
     LABELS,
+    LARGE,
     LONGER,
     MENDED,
     NGSIM,
+    OFTEN,
     PARTS,
     POINTS,
     RATES,
@@ -84,6 +86,7 @@ PAGES = (
 BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.DOTALL)
 TABLES: dict[str, Callable[[], Grid]] = {
     "relations": lambda: held(["eight/town-*"]),
+    "relations-towns": lambda: held(LARGE),
     "roadside": roadside,
     "parts": lambda: driven(PARTS),
     "towns": lambda: driven(TOWNS),
@@ -110,6 +113,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "driving-ngsim": lambda: searched("driving", "ngsim"),
     "forest": forests,
     "hard": hard,
+    "often": lambda: driven(OFTEN),
     "again-town": lambda: searched("again", "town", AGAIN),
     "again-ngsim": lambda: searched("again", "ngsim", [row for row in AGAIN if "twice" not in row[0]]),
     "driving-places": lambda: by_place(2),

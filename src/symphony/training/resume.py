@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from symphony.agents.agent import Agent, read_spec
 from symphony.agents.checkpoint import latest, load_checkpoint, parts_of
@@ -53,15 +54,25 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
                 before.validation, data=config.validation.data, every=config.validation.every
             )
         before = dataclasses.replace(before, **free)
-        changed = [
-            f.name for f in dataclasses.fields(config) if getattr(before, f.name) != getattr(config, f.name)
-        ]
+        changed = _changed(before, config)
         if changed:
             raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
     if found is not None and not path.exists():
         raise ConfigError(
             f"{config.out} holds checkpoints of a run whose config.json is gone; choose another folder"
         )
+    return found
+
+
+def _changed(before: Any, after: Any, where: str = "") -> list[str]:
+    """Settings that differ, those within others by their full names, with what they were."""
+    found = []
+    for name in (field.name for field in dataclasses.fields(after)):
+        one, other = getattr(before, name), getattr(after, name)
+        if dataclasses.is_dataclass(one) and type(one) is type(other):
+            found += _changed(one, other, f"{where}{name}.")
+        elif one != other:
+            found.append(f"{where}{name} (was {one})")
     return found
 
 
