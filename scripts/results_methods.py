@@ -182,6 +182,7 @@ TURNS = (
 OFTEN = (
     ("run segments drawn evenly", "hard/{}-even"),
     ("half of them hard ones", "hard/{}-hard"),
+    ("evenly, states of standing vehicles a quarter as often", "hard/{}-standing"),
 )
 """1 000 further updates of BC, on the validation parts."""
 LARGE = ("towns/town-bc-[0-9]*", "turns/town-bc_h-*", "towns/town-bc_ts-2000-*", "turns/town-bc_ts_h-*")

@@ -39,7 +39,8 @@ BESIDE = 20.0
 STRIDE = 4
 """Of the points of a route, the share (one in so many) by which the goal policy observes it."""
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
-TURN_FEATURES = 2 + POINTS - 2
+TURN_FEATURES = 2 + (POINTS - 2)
+"""Where a route begins, and a turn at each of its points but the first and the last."""
 
 
 @dataclass(frozen=True)
