@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -170,14 +171,19 @@ def test_a_warm_start_without_personas_drives_as_before(store: Path, tmp_path: P
         ("bc_h", {"features": "road"}, {"features": "road"}),  # a route would stand before the road
         ("bc", {"features": "road"}, {"features": "road", "persona": True}),  # and so would a persona
         ("bc", {"features": "gaps"}, {"features": "road"}),
+        ("bc_h", {"goal_features": "points"}, {}),
     ],
 )
 def test_inputs_that_would_take_the_weights_of_others_are_refused(
     method: Any, before: dict[str, Any], after: dict[str, Any], store: Path, tmp_path: Path
 ) -> None:
     own = replace(OWN, persona=False)
-    run = train(tiny("bc", store, tmp_path / "before", agent=replace(own, **before)))
-    with pytest.raises(CheckpointError, match="policy"):
+    first = method if "goal_features" in before else "bc"
+    run = train(tiny(first, store, tmp_path / "before", agent=replace(own, **before)))
+    # Settings that differ are named with what they were.
+    told = [f"agent.{k} (was {v})" for k, v in before.items() if after.get(k) != v]
+    expected = f"(policy|goals)\\..*{re.escape(', '.join(told))}"
+    with pytest.raises(CheckpointError, match=expected):
         build(tiny(method, store, tmp_path / "after", agent=replace(own, **after), warm_start=run))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from symphony.agents.agent import Agent, read_spec
-from symphony.agents.checkpoint import latest, load_checkpoint, parts_of
+from symphony.agents.checkpoint import CheckpointError, latest, load_checkpoint, parts_of
 from symphony.agents.choice import choose, split_name
 from symphony.config import AgentSpec, RunConfig, read_json
 from symphony.errors import ConfigError
@@ -81,14 +81,21 @@ def warm_start(agent: Agent, run: Path) -> None:
 
     Raises:
         ConfigError: if there is no such run.
-        CheckpointError: if its networks have other shapes.
+        CheckpointError: if its networks have other shapes; names the settings of the agent that differ.
     """
     folder, which = split_name(str(run))
     source = choose(folder, which)
     there = parts_of(source)
     shared = {name: module for name, module in agent.modules.items() if name in there}
-    widen = agent.spec is not None and _only_personas(read_spec(folder), agent.spec)
-    load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=widen)
+    before = read_spec(folder)
+    widen = agent.spec is not None and _only_personas(before, agent.spec)
+    try:
+        load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=widen)
+    except CheckpointError as error:
+        changed = [] if agent.spec is None else _changed(before.agent, agent.spec.agent, "agent.")
+        if changed:
+            error.message += f"; its agent has another {', '.join(changed)}"
+        raise
 
 
 def _only_personas(before: AgentSpec, after: AgentSpec) -> bool:
