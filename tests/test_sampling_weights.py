@@ -69,6 +69,42 @@ def test_segments_that_went_badly_come_in_proportion(tmp_path: Path) -> None:
     assert dataset(SamplingConfig(hard=record, share=0.0)).draw(8, rng(1)) == dataset().draw(8, rng(1))
 
 
+def two_sources(path: Path) -> SegmentStore:
+    """Segment number 2 is of another source than the other seven."""
+    with StoreWriter(path) as writer:
+        for number, segment in enumerate(SegmentStore(builtin_store("train"))):
+            writer.append(segment.replace(source="other") if number == 2 else segment)
+            if number == 7:
+                break
+    return SegmentStore(path)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_every_source_comes_as_often(tmp_path: Path, share: float) -> None:
+    store = two_sources(tmp_path / "store")
+    assert dict(zip(*np.unique(store.sources, return_counts=True), strict=True)) == {"other": 1, "sumo": 7}
+    data = SceneDataset(store, 2, Bicycle(), sampling=SamplingConfig(even_sources=True, share=share))
+    generator, count = rng(), 2 if share == 0.5 else 1
+    drawn = torch.tensor([data.draw(count, generator)[0] for _ in range(2000)])
+    assert (drawn == 2).float().mean() == pytest.approx(0.5, abs=0.04)
+    assert torch.bincount(drawn)[drawn.unique() != 2].float().std() < 30  # of 143 each
+    # Sources are of the store, so a run resumes on what it learned from.
+    assert data.checksum() == SceneDataset(store, 2, Bicycle()).checksum()
+    # Of a part of one source all are alike.
+    rest = SceneDataset(store, 2, Bicycle(), [0, 1, 3], sampling=SamplingConfig(even_sources=True, share=1.0))
+    assert torch.tensor([rest.draw(1, generator)[0] for _ in range(300)]).unique().tolist() == [0, 1, 2]
+
+
+def test_hard_ones_of_a_small_source_come_more_often(tmp_path: Path) -> None:
+    store = two_sources(tmp_path / "store")
+    record = record_of(store, tmp_path / "hard.json", {store.ids[k]: 10.0 for k in (0, 1, 2)})
+    both = SamplingConfig(hard=record, even_sources=True, share=1.0)
+    generator, data = rng(), SceneDataset(store, 2, Bicycle(), sampling=both)
+    drawn = torch.tensor([data.draw(1, generator)[0] for _ in range(2000)])
+    assert drawn.unique().tolist() == [0, 1, 2]
+    assert (drawn == 2).float().mean() == pytest.approx(7 / 9, abs=0.04)
+
+
 def test_a_run_does_not_go_on_with_another_record(tmp_path: Path) -> None:
     store = SegmentStore(builtin_store("train"))
     record = record_of(store, tmp_path / "hard.json", {store.ids[0]: 1.0, store.ids[1]: 2.0})

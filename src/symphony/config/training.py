@@ -126,8 +126,11 @@ class SamplingConfig:
     hard: Path | None = None
     """Record of an evaluation on the store that is learned from (`symphony evaluate RUN --data STORE --json FILE`):
     run segments are drawn in proportion to the collision rate plus off-road time there."""
+    even_sources: bool = False
+    """Run segments of every source of logs (`sumo`, `womd`, ...; `symphony data info` counts them) are drawn as
+    often as those of any other, however few there are."""
     share: float = 0.5
-    """Of an update's run segments that are drawn so, if there is a record; the others are drawn evenly."""
+    """Of an update's run segments that are drawn so, with a record or even sources; the others are drawn evenly."""
 
     def __post_init__(self) -> None:
         positive(self, "interactive")

@@ -205,6 +205,11 @@ class SegmentStore(Sequence[RunSegment]):
         found = [group_of(self._tags(i), name) for i, name in enumerate(self.ids)]
         return np.array(found, np.str_)
 
+    @cached_property
+    def sources(self) -> NDArray[np.str_]:
+        """[segments] :attr:`RunSegment.source` of each."""
+        return np.array([self._text("source", i) for i in range(len(self))], np.str_)
+
     def _text(self, column: str, row: int) -> str:
         axis = SEGMENTS.axes[column]
         begin, count = (int(self._segments[row][key][axis]) for key in ("begin", "count"))
@@ -305,7 +310,7 @@ class SegmentStore(Sequence[RunSegment]):
             "segments": len(self),
             "agents": int(segments["count"][:, SEGMENTS.axes["agents"]].sum()),
             "signals": int(segments["count"][:, SEGMENTS.axes["signals"]].sum()),
-            "sources": dict(sorted(Counter(self._text("source", i) for i in range(len(self))).items())),
+            "sources": dict(sorted(Counter(self.sources.tolist()).items())),
             "steps": _span(steps),
             "dt": _span(dt),
             "duration": _span((steps - 1) * dt),

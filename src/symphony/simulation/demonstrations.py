@@ -32,7 +32,7 @@ from symphony.simulation.logged import expert_batch, logged, logged_routes
 from symphony.simulation.memory import ItemCache
 from symphony.simulation.personas import PersonaScale, styles
 from symphony.simulation.perturbation import perturbed
-from symphony.simulation.weights import infractions, some_of, state_weights
+from symphony.simulation.weights import segment_weights, some_of, state_weights
 from symphony.streams import stream_of, uniform
 
 GRAPHS = 64
@@ -89,8 +89,7 @@ class SceneDataset:
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.persona = routes, duration, keep, persona
         self.sampling = SamplingConfig() if sampling is None else sampling
-        hard = self.sampling.hard
-        self._hard = None if hard is None else infractions(hard, store, self.indices)
+        self._weights = segment_weights(self.sampling, store, self.indices)
         self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
@@ -148,9 +147,9 @@ class SceneDataset:
 
     def checksum(self) -> str:
         """Of the store, and of the record that says which segments are hard, if there is one."""
-        if self._hard is None:
+        if self._weights is None or self.sampling.hard is None:
             return self.store.checksum()
-        return hashlib.sha256(self.store.checksum().encode() + self._hard.numpy().tobytes()).hexdigest()
+        return hashlib.sha256(self.store.checksum().encode() + self._weights.numpy().tobytes()).hexdigest()
 
     def segment(self, i: int) -> RunSegment:
         """The run segment behind item ``i``, up to the duration."""
@@ -215,8 +214,8 @@ class SceneDataset:
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Different items at random (all, if there are fewer)."""
-        if self._hard is not None:
-            return some_of(self._hard, count, self.sampling.share, rng)
+        if self._weights is not None:
+            return some_of(self._weights, count, self.sampling.share, rng)
         return torch.randperm(len(self), generator=rng)[:count].tolist()
 
     def sample_states(

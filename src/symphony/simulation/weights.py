@@ -1,4 +1,4 @@
-"""What is learned from more often than the rest: run segments that went badly, states of some vehicles."""
+"""What is learned from more often than the rest: run segments that went badly, or of few; states of some vehicles."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -50,6 +51,22 @@ def infractions(record: Path, store: SegmentStore, indices: Sequence[int]) -> Fl
     if not bool(weights.any()):
         raise ConfigError(f"{record}: nothing went badly in these run segments")
     return weights
+
+
+def segment_weights(
+    config: SamplingConfig, store: SegmentStore, indices: Sequence[int]
+) -> Float[Tensor, " S"] | None:
+    """How often run segments are drawn, relative to others; None where all are drawn alike.
+
+    Raises:
+        ConfigError, DataError: as :func:`infractions`.
+    """
+    found = None if config.hard is None else infractions(config.hard, store, indices)
+    if not config.even_sources:
+        return found
+    _, which, counts = np.unique(store.sources[list(indices)], return_inverse=True, return_counts=True)
+    even = torch.from_numpy(1 / counts[which])
+    return even if found is None else found * even
 
 
 def some_of(weights: Float[Tensor, " S"], count: int, share: float, rng: torch.Generator) -> list[int]:

@@ -1,0 +1,138 @@
+"""Measure an agent wherever the pages show the included one.
+
+    python scripts/measure_included.py --data DIR --out results
+
+Runs one command of `symphony` after the other, prints each, and leaves records that are there as they are, so that it
+can be stopped. After an agent was replaced, write to a new folder and copy what it holds. ``DIR`` holds the stores::
+
+    town-small/test, town/validation, town/test   symphony data generate --preset town-small (town)
+    ngsim-validation, ngsim-test                  symphony data convert commonroad PART/*.xml --egos all --smooth 0.8
+    ngsim-10hz                                    the test part as docs/wosac.md converts it
+    lined-test                                    scripts/make_roadside.py
+    womd, argoverse2, interaction, nuscenes       as docs/roads.md converts them
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from results_base import RECORDS
+
+AGENT = "pretrained:bc_ts_h"
+RULES = {
+    "none": "--search none",
+    "systematic-tree": "--search tree --rule systematic --temperature 0.6 --goals tree",
+    "systematic-branch": "--search tree --rule systematic --temperature 0.6 --goals branch",
+    "replace-branch": "--search tree --rule replace --goals branch",
+}
+AGAIN = {
+    "16": "",
+    "32": "--branches 32",
+    "64": "--branches 64",
+    "retry-0": "--retries 1",
+    "retry-1": "--retries 1 --retry-above 1",
+    "retries-0": "--retries 2",
+}
+FOREST = {"none": "--search none", "one": "", "forest": "--trees 16 --goals tree"}
+ELSEWHERE = ("womd", "argoverse2", "interaction", "nuscenes")
+PLANNED = (*range(0, 70, 10), 80, 100, 110, *range(130, 220, 10), 230, 240, 270, 290, 430)
+"""Segments of town-small/test through which planners drive."""
+
+
+def segments(record: str) -> str:
+    """The ids of those that a record of the WOSAC score has."""
+    agent, *_ = json.loads((RECORDS / f"{record}.json").read_text())["agents"].values()
+    return " ".join(agent["segments"])
+
+
+def commands(agent: str) -> Iterator[tuple[str, str]]:
+    """Names of records, and what makes them: DIR, FILE and SIM stand for the stores, the record and a folder."""
+    town, ngsim = "DIR/town-small/test", "DIR/ngsim-test"
+    for name, rule in RULES.items():
+        for part, store in (("town", town), ("ngsim", ngsim)):
+            yield f"driving/{part}-{name}", f"evaluate {agent} {rule} --data {store} --json FILE"
+    for name, search in (("bc_h", "--search none"), ("bc_ts_h", "")):
+        for store in ELSEWHERE:
+            yield f"roads/{store}-{name}", f"evaluate {agent} {search} --data DIR/{store} --json FILE"
+    yield "roads/8-included-bc_ts_h", f"evaluate {agent} --interactive 8 --data {ngsim} --json FILE"
+    for name in ("none", "replace-branch"):
+        yield f"roadside/included-{name}", f"evaluate {agent} {RULES[name]} --data DIR/lined-test --json FILE"
+    chosen = " ".join(str(number) for number in PLANNED)
+    for number, search in enumerate(("--search none", "--trees 2 --branches 8")):
+        for planner in ("log", "idm", "coast"):
+            drives = "examples/coast.py:plan" if planner == "coast" else planner
+            crowd = f"--planner {drives} --interactive 8 --rollouts 2 {search}"
+            name = f"planners/{3 + number}-bctsh-{'search-' if number else ''}{planner}"
+            yield name, f"simulate {agent} {crowd} --data {town} --segments {chosen} --out SIM"
+    for name, how in (
+        ("bc_h", "--search none"),
+        ("bc_h-logged", "--search none --logged-goals"),
+        ("bc_ts_h", ""),
+    ):
+        for part, where in (("sumo", town), ("ngsim", "DIR/ngsim-10hz --horizon 5")):
+            more = f"{how} --branches 4 --no-baselines --segments {segments(f'wosac/{part}-bc')}"
+            yield f"wosac/{part}-{name}", f"wosac evaluate {agent} --data {where} {more} --json FILE"
+    for name, how in FOREST.items():
+        hundred = segments_of("forest/town-bc_ts-none")
+        yield (
+            f"forest/town-included-{name}",
+            f"evaluate {agent} {how} --data DIR/town/test {hundred} --json FILE",
+        )
+    for name, how in AGAIN.items():
+        yield f"again/town-{name}", f"evaluate {agent} {how} --data DIR/town/validation --json FILE"
+        if name != "retries-0":
+            yield f"again/ngsim-{name}", f"evaluate {agent} {how} --data DIR/ngsim-validation --json FILE"
+
+
+def segments_of(record: str) -> str:
+    """The same for a record of an evaluation."""
+    rows = json.loads((RECORDS / f"{record}.json").read_text())["per_segment"]
+    return " ".join(["--segments", *(row["segment"] for row in rows)])
+
+
+def main() -> None:
+    """Make all records that are not there."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--agent", default=AGENT, help="also the folder of a run")
+    parser.add_argument("--only", nargs="*", default=[], help="folders of records: driving, roads, ...")
+    given = parser.parse_args()
+    for name, template in commands(given.agent):
+        file, sim = given.out / f"{name}.json", given.out / "simulated" / name
+        if file.exists() or (given.only and name.split("/")[0] not in given.only):
+            continue
+        file.parent.mkdir(parents=True, exist_ok=True)
+        command = (
+            template.replace("DIR/", f"{given.data}/").replace("FILE", str(file)).replace("SIM", str(sim))
+        )
+        run(command)
+        if name.startswith("planners/"):
+            run(f"report {sim} --evaluated ego --no-view")
+            (sim / "report.json").rename(file)
+    if not given.only or "crowd" in given.only:
+        crowds = Path(__file__).with_name("make_crowd.py")
+        for part, store in (("town", "town-small/test"), ("ngsim", "ngsim-validation")):
+            count = "16" if part == "town" else "12"
+            more = ["--segments", count, "--name", part, "--out", str(given.out / "crowd")]
+            where = ["--agent", given.agent, "--data", str(given.data / store)]
+            subprocess.run([sys.executable, str(crowds), *where, *more], check=True)
+
+
+def run(command: str) -> None:
+    """One command of `symphony`."""
+    print(f"symphony {command[:150]}", flush=True)
+    subprocess.run(
+        [sys.executable, "-m", "symphony", *command.split()], check=True, stdout=subprocess.DEVNULL
+    )
+
+
+if __name__ == "__main__":
+    main()
