@@ -74,6 +74,8 @@ PAGES = (
         for name in (
             "results",
             "ablations",
+            "ablations-search",
+            "ablations-mgail",
             "roads",
             "roads-tables",
             "appendix",

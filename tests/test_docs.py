@@ -120,10 +120,22 @@ def test_a_changed_figure_is_found() -> None:
     assert page["rewritten"](text.replace(figure[0], "| BC | 0.1 ")) == text
 
 
-def test_links_of_the_readme_lead_somewhere() -> None:
-    for page in ("README.md", "CONTRIBUTING.md", "recipes/README.md"):
-        for link in re.findall(r"\]\(([^)#]+)[^)]*\)", (ROOT / page).read_text()):
-            assert link.startswith("https://") or ((ROOT / page).parent / link).exists(), f"{page}: {link}"
+def anchors(page: Path) -> set[str]:
+    """Of a page's headings, as they are made for it."""
+    headings = re.findall(r"(?m)^#+ (.+)$", page.read_text())
+    return {re.sub(r"[^a-z0-9 -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_links_lead_somewhere() -> None:
+    pages = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md")]
+    for page in (*pages, *(ROOT / "docs").glob("*.md")):
+        for link in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+            place, _, anchor = link.partition("#")
+            if link.startswith(("https://", "reference/")):  # the latter are made with the pages
+                continue
+            other = page.parent / place if place else page
+            assert other.exists(), f"{page}: {link}"
+            assert not anchor or anchor in anchors(other), f"{page}: {link}"
 
 
 def test_readme_is_short() -> None:
