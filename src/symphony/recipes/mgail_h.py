@@ -49,44 +49,32 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
     realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
     optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
+    inputs, begin = observation_of(spec, discriminator=False), config.mgail.regression
 
     # The order of updates, in three phases; goals are learned in all.
-    def goals_of(items: list[int]) -> Updates:
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
-
     def regression(step: int) -> Updates:
         items = data.draw(config.segments, rng)
-        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        experts = data.sample_states(items, config.states, inputs, rng, device, config.perturb.at(step))
         yield "policy", regression_loss(experts)
-        yield from goals_of(items)
+        yield "goals", goal_loss(data.sample_goals(items, config.goals, inputs, rng, device))
 
-    def discriminate(step: int) -> Updates:
+    def head_start(step: int) -> Updates:
         yield "search", replay.refresh(step)
         for _ in range(config.mgail.discriminator_updates):
             yield "discriminator", realism_loss(replay.both_kinds(rng))
-
-    def head_start(step: int) -> Updates:
         items = data.draw(config.segments, rng)
-        yield from discriminate(step)
-        yield from goals_of(items)
+        yield "goals", goal_loss(data.sample_goals(items, config.goals, inputs, rng, device))
 
     def adversarial(step: int) -> Updates:
-        items = data.draw(config.segments, rng)
-        yield from discriminate(step)
+        yield from head_start(step)
         losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
         if config.mgail.expert_weight:
-            experts = data.sample_states(
-                items, config.states, observation, rng, device, config.perturb.at(step)
-            )
+            items = data.draw(config.segments, rng)
+            experts = data.sample_states(items, config.states, inputs, rng, device, config.perturb.at(step))
             losses["loss_regression"] = config.mgail.expert_weight * regression_loss(experts)["loss_bc"]
         yield "policy", losses
-        yield from goals_of(items)
 
-    observation, begin = observation_of(spec, discriminator=False), config.mgail.regression
     slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
-    phases = [
-        Phase(begin, regression, cosine(rates, begin)),
-        Phase(begin + config.mgail.head_start, head_start, slower),
-        Phase(config.steps, adversarial, slower),
-    ]
+    ready = Phase(begin + config.mgail.head_start, head_start, slower)
+    phases = [Phase(begin, regression, cosine(rates, begin)), ready, Phase(config.steps, adversarial, slower)]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
