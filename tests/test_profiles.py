@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import tyro
+from tensordict.nn import TensorDictModule
 
+from symphony.agents import Agent, discriminator_network, goal_network, policy_network
 from symphony.cli import main
 from symphony.cli.profiles import expanded
 from symphony.cli.recipe import Arguments
-from symphony.config import METHODS, PROFILES, TrainConfig
+from symphony.config import METHODS, PROFILES, AgentSpec, TrainConfig
 from symphony.errors import ConfigError
 
 NEEDED = ["--data", "a", "--out", "b", "--test", "c"]
@@ -27,6 +30,21 @@ def test_every_profile_is_a_valid_configuration_of_every_method(method: str, pro
     config = settings(method, "--profile", profile)
     assert config.method == method
     assert (config == settings(method)) == (profile == "default")
+
+
+@pytest.mark.parametrize("actions", ["bicycle", "displacement"])
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_fits_both_action_spaces(
+    actions: Literal["bicycle", "displacement"], profile: str
+) -> None:
+    spec = settings("bc", "--profile", profile).spec(
+        actions, 0.2, goals=True, discriminator=True, searches=True
+    )
+    assert set(Agent("built", *networks(spec)).modules) == {"policy", "goals", "discriminator"}
+
+
+def networks(spec: AgentSpec) -> tuple[TensorDictModule, AgentSpec, TensorDictModule, TensorDictModule]:
+    return policy_network(spec), spec, goal_network(spec), discriminator_network(spec)
 
 
 def test_the_paper_is_followed() -> None:
@@ -70,7 +88,7 @@ def test_unknown_profiles_are_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     with pytest.raises(ConfigError, match="did you mean 'laptop'"):
         expanded(["bc", "--profile", "labtop"])
     assert main(["train", "bc", "--data", str(tmp_path), "--out", str(tmp_path), "--profile=fast"]) == 2
-    assert "profile is one of default, paper, laptop, tiny, smoke" in capsys.readouterr().err
+    assert "profile is one of default, paper, recommended, laptop, tiny, smoke" in capsys.readouterr().err
 
 
 def test_without_a_profile_nothing_changes() -> None:

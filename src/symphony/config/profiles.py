@@ -8,7 +8,7 @@ from typing import Literal
 
 from symphony.config.training import TrainConfig
 
-Profile = Literal["default", "paper", "laptop", "tiny", "smoke"]
+Profile = Literal["default", "paper", "recommended", "laptop", "tiny", "smoke"]
 
 
 def paper(config: TrainConfig) -> TrainConfig:
@@ -41,6 +41,23 @@ def paper(config: TrainConfig) -> TrainConfig:
             discriminator_updates=1,
         ),
         validation=replace(config.validation, segments=200, rollouts=16),
+    )
+
+
+def recommended(config: TrainConfig) -> TrainConfig:
+    """What gave the best agents so far: inputs beyond the paper's, displaced states once the policy drives, a search
+    that replaces only bad branches; of MGAIL the regression that its adversarial updates start from.
+    """
+    return replace(
+        config,
+        steps=3000,
+        checkpoint_every=500,
+        agent=replace(config.agent, num_points=200, num_lights=4, features="gaps", accelerations=21),
+        perturb=replace(config.perturb, share=0.5, begin=1500),
+        discriminator=replace(config.discriminator, features="foresight"),
+        search=replace(config.search, rule="replace", goals="branch"),
+        mgail=replace(config.mgail, regression=3000, learning_rate=5e-4, truncate=10),
+        validation=replace(config.validation, segments=64, rollouts=4),
     )
 
 
@@ -110,6 +127,7 @@ def demo(config: TrainConfig) -> TrainConfig:
 PROFILES: dict[Profile, Callable[[TrainConfig], TrainConfig]] = {
     "default": lambda config: config,
     "paper": paper,
+    "recommended": recommended,
     "laptop": laptop,
     "tiny": tiny,
     "smoke": smoke,
