@@ -159,24 +159,24 @@ PARTS = (
 """What inputs, further updates, distillation and search each do, of one seed."""
 TOWNS = (
     ("BC, 3 290 towns, three seeds", "eight/{}-bc-*"),
-    ("BC, 10 000 towns, two seeds", "towns/{}-bc-[0-9]*"),
+    ("BC, 10 000 towns, three seeds", "towns/{}-bc-[0-9]*"),
     ("BC+TS, 3 290 towns, three seeds", "eight/{}-bc_ts-*"),
     ("BC+TS, 10 000 towns, 500 updates, one seed", "towns/{}-bc_ts"),
-    ("BC+TS, 10 000 towns, 2 000 updates, two seeds", "towns/{}-bc_ts-2000-*"),
+    ("BC+TS, 10 000 towns, 2 000 updates, three seeds", "towns/{}-bc_ts-2000-*"),
     ("BC+H, 3 290 towns, three seeds", "eight/{}-bc_h-*"),
-    ("BC+H, 10 000 towns, two seeds", "towns/{}-bc_h-[0-9]*"),
+    ("BC+H, 10 000 towns, goals of today, three seeds", "turns/{}-bc_h-*"),
     ("BC+TS+H, 3 290 towns, three seeds", "eight/{}-bc_ts_h-*"),
     ("BC+TS+H, 10 000 towns, 500 updates, one seed", "towns/{}-bc_ts_h"),
-    ("BC+TS+H, 10 000 towns, 2 000 updates, two seeds", "towns/{}-bc_ts_h-2000-*"),
+    ("BC+TS+H, 10 000 towns, 2 000 updates, goals of today, three seeds", "turns/{}-bc_ts_h-*"),
 )
 """What three times as many simulated towns do in as many updates."""
 TURNS = (
-    ("BC", "towns/{}-bc-[0-9]*"),
-    ("BC+H", "towns/{}-bc_h-[0-9]*"),
-    ("BC+H, goals that see lane changes", "turns/{}-bc_h-[0-9]*"),
-    ("BC+TS", "towns/{}-bc_ts-2000-*"),
-    ("BC+TS+H", "towns/{}-bc_ts_h-2000-*"),
-    ("BC+TS+H, goals that see lane changes", "turns/{}-bc_ts_h-*"),
+    ("BC", "towns/{}-bc-[45]0"),
+    ("BC+H", "towns/{}-bc_h-[45]0"),
+    ("BC+H, goals that see lane changes", "turns/{}-bc_h-[45]0"),
+    ("BC+TS", "towns/{}-bc_ts-2000-[45]0"),
+    ("BC+TS+H", "towns/{}-bc_ts_h-2000-[45]0"),
+    ("BC+TS+H, goals that see lane changes", "turns/{}-bc_ts_h-[45]0"),
 )
 """Agents of 10 000 towns with another goal policy, nothing else changed."""
 OFTEN = (
@@ -185,6 +185,13 @@ OFTEN = (
     ("evenly, states of standing vehicles a quarter as often", "hard/{}-standing"),
 )
 """1 000 further updates of BC, on the validation parts."""
+EVEN = (
+    ("BC+H, one in twenty of NGSIM", "turns/{}-bc_h-60"),
+    ("BC+H, one in six", "even/{}-bc_h"),
+    ("BC+TS+H, one in twenty", "turns/{}-bc_ts_h-60"),
+    ("BC+TS+H, one in six", "even/{}-bc_ts_h"),
+)
+"""Of 10 000 towns, freeways and NGSIM, with sources drawn as they are or more evenly; third seed."""
 LARGE = ("towns/town-bc-[0-9]*", "turns/town-bc_h-*", "towns/town-bc_ts-2000-*", "turns/town-bc_ts_h-*")
 """The four of 10 000 towns, with the goal policy of today."""
 INPUTS = (
