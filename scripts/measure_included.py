@@ -51,7 +51,7 @@ def segments(record: str) -> str:
 
 
 def commands(agent: str) -> Iterator[tuple[str, str]]:
-    """Names of records, and what makes them: DIR, FILE and SIM stand for the stores, the record and a folder."""
+    """Names of records, and what makes them: DIR and FILE stand for the stores and the record."""
     town, ngsim = "DIR/town-small/test", "DIR/ngsim-test"
     for name, rule in RULES.items():
         for part, store in (("town", town), ("ngsim", ngsim)):
@@ -68,7 +68,7 @@ def commands(agent: str) -> Iterator[tuple[str, str]]:
             drives = "examples/coast.py:plan" if planner == "coast" else planner
             crowd = f"--planner {drives} --interactive 8 --rollouts 2 {search}"
             name = f"planners/{3 + number}-bctsh-{'search-' if number else ''}{planner}"
-            yield name, f"simulate {agent} {crowd} --data {town} --segments {chosen} --out SIM"
+            yield name, f"evaluate {agent} {crowd} --data {town} --segments {chosen} --json FILE"
     for name, how in (
         ("bc_h", "--search none"),
         ("bc_h-logged", "--search none --logged-goals"),
@@ -106,17 +106,11 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="folders of records: driving, roads, ...")
     given = parser.parse_args()
     for name, template in commands(given.agent):
-        file, sim = given.out / f"{name}.json", given.out / "simulated" / name
+        file = given.out / f"{name}.json"
         if file.exists() or (given.only and name.split("/")[0] not in given.only):
             continue
         file.parent.mkdir(parents=True, exist_ok=True)
-        command = (
-            template.replace("DIR/", f"{given.data}/").replace("FILE", str(file)).replace("SIM", str(sim))
-        )
-        run(command)
-        if name.startswith("planners/"):
-            run(f"report {sim} --evaluated ego --no-view")
-            (sim / "report.json").rename(file)
+        run(template.replace("DIR/", f"{given.data}/").replace("FILE", str(file)))
     if not given.only or "crowd" in given.only:
         crowds = Path(__file__).with_name("make_crowd.py")
         for part, store in (("town", "town-small/test"), ("ngsim", "ngsim-validation")):

@@ -37,7 +37,11 @@ def test_each_makes_a_record_that_is_there_with_its_settings(commands: dict[str,
         record: dict[str, Any] = json.loads((ROOT / "results" / f"{name}.json").read_text())
         command = app.cli(args=words.split(), config=settings)
         if isinstance(command, Evaluate):
-            known = record["config"] | {field: record[field] for field in ("rollouts", "seed", "interactive")}
+            known = (
+                record["settings"]
+                if command.planner
+                else record["config"] | {name: record[name] for name in ("rollouts", "seed", "interactive")}
+            )
             for field in fields(EvaluateConfig):
                 value = getattr(command.config, field.name)
                 if value != field.default and field.default is not MISSING:
