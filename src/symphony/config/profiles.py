@@ -57,7 +57,7 @@ def recommended(config: TrainConfig) -> TrainConfig:
         discriminator=replace(config.discriminator, features="foresight"),
         search=replace(config.search, rule="replace", goals="branch"),
         mgail=replace(config.mgail, regression=3000, learning_rate=5e-4, truncate=10),
-        validation=replace(config.validation, segments=64, rollouts=4),
+        validation=replace(config.validation, segments=60, rollouts=4),
     )
 
 

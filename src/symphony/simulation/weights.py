@@ -1,4 +1,4 @@
-"""What is drawn more often than the rest: run segments that went badly, or of small sources; states of some vehicles."""
+"""What is drawn more often: run segments that went badly, or of small sources; states of some vehicles."""
 
 from __future__ import annotations
 
