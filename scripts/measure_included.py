@@ -40,14 +40,16 @@ AGAIN = {
 }
 FOREST = {"none": "--search none", "one": "", "forest": "--trees 16 --goals tree"}
 ELSEWHERE = ("womd", "argoverse2", "interaction", "nuscenes")
-PLANNED = (*range(0, 70, 10), 80, 100, 110, *range(130, 220, 10), 230, 240, 270, 290, 430)
-"""Segments of town-small/test through which planners drive."""
 
 
 def segments(record: str) -> str:
-    """The ids of those that a record of the WOSAC score has."""
-    agent, *_ = json.loads((RECORDS / f"{record}.json").read_text())["agents"].values()
-    return " ".join(agent["segments"])
+    """An option that names those of a record: of an evaluation, of a planner's, or of WOSAC scores."""
+    found = json.loads((RECORDS / f"{record}.json").read_text())
+    if "agents" in found:
+        names = next(iter(found["agents"].values()))["segments"]
+    else:
+        names = [row["segment"] for row in found.get("per_segment") or found["per_run"]]
+    return " ".join(["--segments", *dict.fromkeys(names)])
 
 
 def commands(agent: str) -> Iterator[tuple[str, str]]:
@@ -62,37 +64,29 @@ def commands(agent: str) -> Iterator[tuple[str, str]]:
     yield "roads/8-included-bc_ts_h", f"evaluate {agent} --interactive 8 --data {ngsim} --json FILE"
     for name in ("none", "replace-branch"):
         yield f"roadside/included-{name}", f"evaluate {agent} {RULES[name]} --data DIR/lined-test --json FILE"
-    chosen = " ".join(str(number) for number in PLANNED)
+    some = segments("planners/0-log-log")
     for number, search in enumerate(("--search none", "--trees 2 --branches 8")):
         for planner in ("log", "idm", "coast"):
             drives = "examples/coast.py:plan" if planner == "coast" else planner
             crowd = f"--planner {drives} --interactive 8 --rollouts 2 {search}"
             name = f"planners/{3 + number}-bctsh-{'search-' if number else ''}{planner}"
-            yield name, f"evaluate {agent} {crowd} --data {town} --segments {chosen} --json FILE"
+            yield name, f"evaluate {agent} {crowd} --data {town} {some} --json FILE"
     for name, how in (
         ("bc_h", "--search none"),
         ("bc_h-logged", "--search none --logged-goals"),
         ("bc_ts_h", ""),
     ):
         for part, where in (("sumo", town), ("ngsim", "DIR/ngsim-10hz --horizon 5")):
-            more = f"{how} --branches 4 --no-baselines --segments {segments(f'wosac/{part}-bc')}"
+            more = f"{how} --branches 4 --no-baselines {segments(f'wosac/{part}-bc')}"
             yield f"wosac/{part}-{name}", f"wosac evaluate {agent} --data {where} {more} --json FILE"
+    hundred = segments("forest/town-bc_ts-none")
     for name, how in FOREST.items():
-        hundred = segments_of("forest/town-bc_ts-none")
-        yield (
-            f"forest/town-included-{name}",
-            f"evaluate {agent} {how} --data DIR/town/test {hundred} --json FILE",
-        )
+        whole = f"evaluate {agent} {how} --data DIR/town/test {hundred} --json FILE"
+        yield f"forest/town-included-{name}", whole
     for name, how in AGAIN.items():
         yield f"again/town-{name}", f"evaluate {agent} {how} --data DIR/town/validation --json FILE"
         if name != "retries-0":
             yield f"again/ngsim-{name}", f"evaluate {agent} {how} --data DIR/ngsim-validation --json FILE"
-
-
-def segments_of(record: str) -> str:
-    """The same for a record of an evaluation."""
-    rows = json.loads((RECORDS / f"{record}.json").read_text())["per_segment"]
-    return " ".join(["--segments", *(row["segment"] for row in rows)])
 
 
 def main() -> None:
@@ -110,22 +104,22 @@ def main() -> None:
         if file.exists() or (given.only and name.split("/")[0] not in given.only):
             continue
         file.parent.mkdir(parents=True, exist_ok=True)
-        run(template.replace("DIR/", f"{given.data}/").replace("FILE", str(file)))
+        words = [word.replace("DIR/", f"{given.data}/") for word in template.split()]
+        run("-m", "symphony", *(str(file) if word == "FILE" else word for word in words))
     if not given.only or "crowd" in given.only:
-        crowds = Path(__file__).with_name("make_crowd.py")
+        crowds = str(Path(__file__).with_name("make_crowd.py"))
         for part, store in (("town", "town-small/test"), ("ngsim", "ngsim-validation")):
-            count = "16" if part == "town" else "12"
-            more = ["--segments", count, "--name", part, "--out", str(given.out / "crowd")]
-            where = ["--agent", given.agent, "--data", str(given.data / store)]
-            subprocess.run([sys.executable, str(crowds), *where, *more], check=True)
+            more = ("--segments", "16" if part == "town" else "12", "--out", str(given.out / "crowd"))
+            where = ("--agent", given.agent, "--data", str(given.data / store), "--name", part)
+            run(crowds, *where, *more)
 
 
-def run(command: str) -> None:
-    """One command of `symphony`."""
-    print(f"symphony {command[:150]}", flush=True)
-    subprocess.run(
-        [sys.executable, "-m", "symphony", *command.split()], check=True, stdout=subprocess.DEVNULL
-    )
+def run(*words: str) -> None:
+    """One command of Python; its failure ends this one."""
+    print(" ".join(words)[:150], flush=True)
+    found = subprocess.run([sys.executable, *words], check=False, stdout=subprocess.DEVNULL)
+    if found.returncode:
+        raise SystemExit(found.returncode)
 
 
 if __name__ == "__main__":
