@@ -49,7 +49,7 @@ def segments(record: str) -> str:
         names = next(iter(found["agents"].values()))["segments"]
     else:
         names = [row["segment"] for row in found.get("per_segment") or found["per_run"]]
-    return " ".join(["--segments", *dict.fromkeys(names)])
+    return " ".join(["--segments", *names])
 
 
 def commands(agent: str) -> Iterator[tuple[str, str]]:
