@@ -64,6 +64,14 @@ def test_agents_refuse_another_rate_than_they_learned(
     assert "--rate 5" in capsys.readouterr().err
 
 
+def test_a_warm_start_from_another_rate_is_refused(stores: dict[float, Path], tmp_path: Path) -> None:
+    run = train(tiny("bc", stores[0.2], tmp_path / "run", steps=2))
+    train(tiny("bc", stores[0.2], tmp_path / "same", steps=2, warm_start=run))
+    with pytest.raises(ConfigError, match=r"run learned steps of 0\.2 s and can't drive in steps of 0\.1 s"):
+        train(tiny("bc", stores[0.1], tmp_path / "other", steps=2, warm_start=run))
+    assert not (tmp_path / "other").exists()
+
+
 def test_validation_at_another_rate_is_refused_before_the_first_update(
     stores: dict[float, Path], tmp_path: Path
 ) -> None:

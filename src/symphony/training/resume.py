@@ -80,7 +80,7 @@ def warm_start(agent: Agent, run: Path) -> None:
     """Take over the networks that another run has too; personas that they had not change nothing at first.
 
     Raises:
-        ConfigError: if there is no such run.
+        ConfigError: if there is no such run, or it learned another time step.
         CheckpointError: if its networks have other shapes; names the settings of the agent that differ.
     """
     folder, which = split_name(str(run))
@@ -88,6 +88,8 @@ def warm_start(agent: Agent, run: Path) -> None:
     there = parts_of(source)
     shared = {name: module for name, module in agent.modules.items() if name in there}
     before = read_spec(folder)
+    if agent.spec is not None:
+        dataclasses.replace(agent, name=str(run), spec=before).check_step(agent.spec.dt)
     widen = agent.spec is not None and _only_personas(before, agent.spec)
     try:
         load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=widen)
