@@ -56,6 +56,36 @@ def test_settings_of_the_user_take_precedence() -> None:
     assert outcome(MALLOC_TOP_PAD_="1024")[0] is False
 
 
+BESIDE = """
+import re, sys, numpy as np
+from symphony import allocator
+allocator.tune()
+# Something small stays after every large block, so that no end of the heap is free.
+both = [(np.ones(1 << 24, np.uint8), np.ones(1 << 16, np.uint8)) for _ in range(16)]
+stays = [small for _, small in both]
+del both
+if sys.argv[1] == "release":
+    assert allocator.release()
+print(*re.findall(r"VmRSS:\\s+(\\d+)", open("/proc/self/status").read()))
+"""
+
+
+@pytest.mark.skipif(not GLIBC, reason="not glibc")
+def test_memory_that_is_free_between_what_stays_is_given_back() -> None:
+    given = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "SYMPHONY_MALLOPT"))}
+    kept, released = (
+        int(subprocess.check_output([sys.executable, "-c", BESIDE, how], env=given, text=True))
+        for how in ("keep", "release")
+    )
+    # 256 MiB were freed.
+    assert released < kept - (200 << 10)
+
+
+def test_nothing_is_given_back_that_was_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(allocator, "_tuned", False)
+    assert allocator.release() is False
+
+
 def test_nothing_happens_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SYMPHONY_MALLOPT", raising=False)
     monkeypatch.setattr(platform, "system", lambda: "Darwin")

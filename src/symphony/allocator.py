@@ -5,6 +5,10 @@ the kernel, which must clear every page before it hands it out again: half of a 
 The ``symphony`` command calls :func:`tune`; programs of your own can do the same before their first large tensor, or
 be started with glibc's own ``MALLOC_MMAP_THRESHOLD_``, ``MALLOC_TRIM_THRESHOLD_`` and ``MALLOC_TOP_PAD_``, which take
 precedence. ``SYMPHONY_MALLOPT=0`` leaves everything as it is.
+
+What stays, such as a segment that is kept for later updates, settles where a large block was freed, and the next large
+block no longer fits there: with kept memory the heap of a long training grows without end. So training gives free pages
+back every now and then (:func:`release`).
 """
 
 from __future__ import annotations
@@ -22,6 +26,8 @@ MAPPED = 1 << 30
 """Bytes of a block from which on it is a mapping of its own."""
 PAD = 1 << 26
 """Bytes by which the heap grows beyond what is asked for."""
+
+_tuned = False
 
 
 def tune() -> bool:
@@ -41,4 +47,17 @@ def tune() -> bool:
     mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
     # Older versions take no mapping threshold above 32 MiB.
     mapped = mallopt(_MMAP_THRESHOLD, MAPPED) or mallopt(_MMAP_THRESHOLD, 1 << 25)
-    return bool(mapped and mallopt(_TRIM_THRESHOLD, KEPT) and mallopt(_TOP_PAD, PAD))
+    global _tuned
+    _tuned = bool(mapped and mallopt(_TRIM_THRESHOLD, KEPT) and mallopt(_TOP_PAD, PAD))
+    return _tuned
+
+
+def release() -> bool:
+    """Give pages that are free, wherever in the heap, back to the system, where :func:`tune` keeps them.
+
+    The next step asks for its part of them again, so once in many steps is enough.
+
+    Returns:
+        Whether any were given back.
+    """
+    return _tuned and bool(ctypes.CDLL(None).malloc_trim(0))

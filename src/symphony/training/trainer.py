@@ -19,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from symphony import allocator
 from symphony.agents.agent import FILE, Agent
 from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoint, prune, save_checkpoint
 from symphony.agents.choice import Best
@@ -187,6 +188,7 @@ class Trainer:
                 numbers = {name: value.item() for name, value in self.world.mean(values).items()}
                 numbers["updates_per_second"] = (step - first) / (time.perf_counter() - began)
                 numbers |= self._describe(numbers)
+                allocator.release()
             self.progress.update(self.task, completed=step)
             if self.tracker is None:
                 continue
