@@ -210,6 +210,12 @@ POINTS = (
     ("BC+TS, 512 points", "inputs/{}-points-512"),
 )
 """What more points are for policy and discriminator, likewise."""
+ATTENTION = (
+    ("the paper's encoder, 3 000 updates", "attention/{}-pooled"),
+    ("attention to others and lights, points pooled, 2 560 updates", "attention/{}-others"),
+    ("attention to everything, 1 040 updates", "attention/{}-everything"),
+)
+"""BC with other encoders after as much CPU time, on the validation parts."""
 ADVERSARIAL = (
     ("2 000 updates of regression at 0.01", "adversarial/{}-short"),
     ("6 000 at 0.01", "adversarial/{}-faster"),

@@ -19,6 +19,7 @@ from symphony.evaluation.planners import planner_grid
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from results_base import ROOT, Grid, beside, means, records
+from results_distilled import alone, distilled, spread
 from results_hard import hard
 from results_methods import (
     ADVERSARIAL,
@@ -118,6 +119,9 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "forest": forests,
     "hard": hard,
     "often": lambda: driven(OFTEN),
+    "distilled": distilled,
+    "spread": spread,
+    "alone": alone,
     "again-town": lambda: searched("again", "town", AGAIN),
     "again-ngsim": lambda: searched("again", "ngsim", [row for row in AGAIN if "twice" not in row[0]]),
     "driving-places": lambda: by_place(2),

@@ -81,8 +81,8 @@ def test_memory_that_is_free_between_what_stays_is_given_back() -> None:
     assert released < kept - (200 << 10)
 
 
-def test_nothing_is_given_back_that_was_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(allocator, "_tuned", False)
+def test_whoever_sets_it_otherwise_keeps_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SYMPHONY_MALLOPT", "0")
     assert allocator.release() is False
 
 
@@ -90,6 +90,7 @@ def test_nothing_happens_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SYMPHONY_MALLOPT", raising=False)
     monkeypatch.setattr(platform, "system", lambda: "Darwin")
     assert allocator.tune() is False
+    assert allocator.release() is False
 
 
 def test_the_command_sets_it_for_a_process_of_its_own_only(monkeypatch: pytest.MonkeyPatch) -> None:

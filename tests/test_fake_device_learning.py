@@ -95,7 +95,7 @@ def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
         "distillation": DistillationLoss(agent.policy, survivors="best"),
         "goal": GoalLoss(agent.goals),
         "discriminator": DiscriminatorLoss(agent.discriminator, gradient_penalty=1.0),
-        "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=3),
+        "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=2),
     }
 
 

@@ -6,9 +6,9 @@ The ``symphony`` command calls :func:`tune`; programs of your own can do the sam
 be started with glibc's own ``MALLOC_MMAP_THRESHOLD_``, ``MALLOC_TRIM_THRESHOLD_`` and ``MALLOC_TOP_PAD_``, which take
 precedence. ``SYMPHONY_MALLOPT=0`` leaves everything as it is.
 
-What stays, such as a segment that is kept for later updates, settles where a large block was freed, and the next large
-block no longer fits there: with kept memory the heap of a long training grows without end. So training gives free pages
-back every now and then (:func:`release`).
+What stays, such as a segment that is kept for later updates, settles where a large block was freed, and the next
+large block no longer fits there: with kept memory the heap of a long training grows without end. So training gives
+free pages back every now and then (:func:`release`).
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ MAPPED = 1 << 30
 PAD = 1 << 26
 """Bytes by which the heap grows beyond what is asked for."""
 
-_tuned = False
-
 
 def tune() -> bool:
     """Set the allocator of this process (Linux with glibc; elsewhere nothing happens).
@@ -36,28 +34,37 @@ def tune() -> bool:
     Returns:
         Whether it was set.
     """
-    if os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"} or any(name in os.environ for name in _VARIABLES):
+    library = _ours()
+    if library is None:
         return False
-    if platform.system() != "Linux" or platform.libc_ver()[0] != "glibc":
-        return False
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):
-        return False
+    mallopt = library.mallopt
     mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
     # Older versions take no mapping threshold above 32 MiB.
     mapped = mallopt(_MMAP_THRESHOLD, MAPPED) or mallopt(_MMAP_THRESHOLD, 1 << 25)
-    global _tuned
-    _tuned = bool(mapped and mallopt(_TRIM_THRESHOLD, KEPT) and mallopt(_TOP_PAD, PAD))
-    return _tuned
+    return bool(mapped and mallopt(_TRIM_THRESHOLD, KEPT) and mallopt(_TOP_PAD, PAD))
 
 
 def release() -> bool:
-    """Give pages that are free, wherever in the heap, back to the system, where :func:`tune` keeps them.
+    """Give pages that are free, wherever in the heap, back to the system (where :func:`tune` would set anything).
 
     The next step asks for its part of them again, so once in many steps is enough.
 
     Returns:
         Whether any were given back.
     """
-    return _tuned and bool(ctypes.CDLL(None).malloc_trim(0))
+    library = _ours()
+    return library is not None and bool(library.malloc_trim(0))
+
+
+def _ours() -> ctypes.CDLL | None:
+    """The C library, if it is glibc and nobody has said how it shall keep memory."""
+    if os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"} or any(name in os.environ for name in _VARIABLES):
+        return None
+    if platform.system() != "Linux" or platform.libc_ver()[0] != "glibc":
+        return None
+    try:
+        library = ctypes.CDLL(None)
+        library.mallopt, library.malloc_trim  # noqa: B018
+    except (OSError, AttributeError):
+        return None
+    return library
