@@ -24,6 +24,7 @@ from results_hard import hard
 from results_methods import (
     ADVERSARIAL,
     AGAIN,
+    ATTENTION,
     DRIVEN,
     EVEN,
     FEATURES,
@@ -122,6 +123,7 @@ TABLES: dict[str, Callable[[], Grid]] = {
     "distilled": distilled,
     "spread": spread,
     "alone": alone,
+    "attention": lambda: driven(ATTENTION),
     "again-town": lambda: searched("again", "town", AGAIN),
     "again-ngsim": lambda: searched("again", "ngsim", [row for row in AGAIN if "twice" not in row[0]]),
     "driving-places": lambda: by_place(2),

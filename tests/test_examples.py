@@ -7,16 +7,20 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from helpers_runs import tiny
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
+from symphony.recipes import train
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.saving import save_simulation
 
@@ -108,3 +112,35 @@ def test_many_machines(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(starts.unique(dim=0)) == 6  # each worker has segments of its own
         assert starts.isfinite().all()
     assert set(first.keys(True, True)) >= {keys.ACTION, ("collector", "beam_score")}
+
+
+@pytest.mark.parametrize("name", ["Everything", "Others"])
+def test_attention_looks_at_nothing_that_is_not_there(name: str, example: Any) -> None:
+    torch.manual_seed(0)
+    encoder = getattr(example("attention"), name)(3, [4, 2], hidden=8)
+    own, valid = torch.randn(2, 3, 3), torch.tensor([[True, True, False]] * 2)
+    few, many = torch.randn(2, 3, 5, 4), torch.randn(2, 3, 60, 2)
+    there, near = torch.rand(2, 3, 5) < 0.6, torch.rand(2, 3, 60) < 0.6
+    there[0, 0] = False
+    found = encoder(own, valid, few, there, many, near)
+    assert found.shape == (2, 3, encoder.width)
+    other = [torch.where(mask[..., None], x, 9.0) for x, mask in ((few, there), (many, near))]
+    torch.testing.assert_close(encoder(own, valid, other[0], there, other[1], near), found)
+    # The order of elements doesn't matter, those that are there do.
+    torch.testing.assert_close(
+        encoder(own, valid, few.flip(2), there.flip(2), many.flip(2), near.flip(2)), found
+    )
+    few[1, 0, there[1, 0].nonzero()[0]] += 1.0
+    changed = (encoder(own, valid, few, there, many, near) != found).any(-1)
+    assert changed.tolist() == [[False] * 3, [True, False, False]]
+    found.square().sum().backward()
+    gradients = [weight.grad for weight in encoder.parameters() if weight.grad is not None]
+    assert gradients
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_a_recipe_learns_with_attention(example: Any, tmp_path: Path) -> None:
+    assert example("attention").Others
+    config = tiny("bc", builtin_store("train"), tmp_path / "run", steps=2, checkpoint_every=2)
+    config = replace(config, agent=replace(config.agent, encoder="attention:Others", hidden=8))
+    assert "keys" in str(load_agent(str(train(config))).policy)
