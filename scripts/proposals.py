@@ -51,6 +51,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     agent, store = load_agent(args.agent), SegmentStore(args.store)
+    if not agent.dynamics.discrete:
+        parser.error(f"{args.agent} chooses no actions from a list, whose entropy could be told")
     policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
     count = min(args.segments or len(store), len(store))
     entropies: list[float] = []

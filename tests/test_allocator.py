@@ -6,10 +6,14 @@ import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from helpers_runs import tiny
 from symphony import allocator, cli
+from symphony.data.builtin import builtin_store
+from symphony.recipes import train
 
 GLIBC = platform.system() == "Linux" and platform.libc_ver()[0] == "glibc"
 
@@ -79,6 +83,13 @@ def test_memory_that_is_free_between_what_stays_is_given_back() -> None:
     )
     # 256 MiB were freed.
     assert released < kept - (200 << 10)
+
+
+def test_training_gives_back_at_every_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(allocator, "release", lambda: calls.append(1))
+    train(tiny("bc", builtin_store("train"), tmp_path / "run", steps=5, checkpoint_every=5, log_every=2))
+    assert len(calls) == 3  # after 2 and 4 updates, and at the end
 
 
 def test_whoever_sets_it_otherwise_keeps_memory(monkeypatch: pytest.MonkeyPatch) -> None:
