@@ -126,6 +126,10 @@ def test_attention_looks_at_nothing_that_is_not_there(name: str, example: Any) -
     assert found.shape == (2, 3, encoder.width)
     other = [torch.where(mask[..., None], x, 9.0) for x, mask in ((few, there), (many, near))]
     torch.testing.assert_close(encoder(own, valid, other[0], there, other[1], near), found)
+    # Nor does it matter how many are not there, nor what agents see that are not.
+    more, absent = torch.cat([few, few[:, :, :2]], 2), torch.zeros(2, 3, 2, dtype=torch.bool)
+    many[:, 2] += 1.0
+    torch.testing.assert_close(encoder(own, valid, more, torch.cat([there, absent], 2), many, near), found)
     # The order of elements doesn't matter, those that are there do.
     torch.testing.assert_close(
         encoder(own, valid, few.flip(2), there.flip(2), many.flip(2), near.flip(2)), found

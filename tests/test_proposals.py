@@ -23,14 +23,14 @@ def _proposals(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_spread_is_the_distance_to_the_mean(proposals: Any) -> None:
-    # Two rollouts, three steps, two agents: the first drive 3 m to either side of their mean, the second is gone.
-    state = torch.zeros(1, 2, 3, 2, 4)
+    # Three rollouts of two agents: the first stays, or drives 3 m to either side; the second is gone.
+    state = torch.zeros(1, 3, 3, 2, 4)
     state[0, 0, 2, 0, 1], state[0, 1, 2, 0, 1] = 3.0, -3.0
-    counted = torch.ones(1, 2, 2, 2, dtype=torch.bool)
+    counted = torch.ones(1, 3, 2, 2, dtype=torch.bool)
     counted[0, 1, 1, 1] = False
     assert proposals.spread(state, counted, 1) == [0.0, 0.0]
-    assert proposals.spread(state, counted, 2) == [3.0]
-    assert proposals.spread(state + 100.0, counted, 2) == [3.0]
+    assert proposals.spread(state, counted, 2) == pytest.approx([6.0**0.5])
+    assert proposals.spread(state + 100.0, counted, 2) == pytest.approx([6.0**0.5])
 
 
 def test_it_measures_an_agent(
