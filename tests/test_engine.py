@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import multiprocessing
 import os
@@ -163,6 +164,28 @@ def test_leaving_early_abandons_what_is_under_way(tmp_path: Path) -> None:
     results.close()
     assert not multiprocessing.active_children()
     assert [p.name for p in tmp_path.iterdir()] == ["quick"]
+
+
+def goes_on(path: Path) -> None:
+    """A task that doesn't end when it is interrupted."""
+    if path.name == "quick":
+        return
+    path.touch()
+    until = time.monotonic() + 300
+    while time.monotonic() < until:
+        with contextlib.suppress(KeyboardInterrupt):
+            time.sleep(1)
+
+
+def test_a_task_that_ignores_the_interrupt_ends_with_its_process(tmp_path: Path) -> None:
+    results = ordered_map(goes_on, [tmp_path / name for name in ("quick", "a", "b")], workers=2)
+    next(results)
+    while not list(tmp_path.iterdir()):
+        time.sleep(0.1)
+    begun = time.monotonic()
+    results.close()
+    assert time.monotonic() - begun < 200
+    assert not multiprocessing.active_children()
 
 
 SCRIPT = """

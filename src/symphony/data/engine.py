@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -26,6 +27,8 @@ R = TypeVar("R")
 
 Engine = Literal["local", "ray"]
 
+PATIENCE = 5.0
+"""Seconds that an interrupted task may take to end before its process does."""
 IN_FLIGHT = 2
 """Tasks per worker that are submitted and not yet collected."""
 # A worker has one core: OpenMP threads of several workers would only take the cores from each other.
@@ -149,7 +152,8 @@ def _local_map(
 class _Worker:
     """State of this process as a worker."""
 
-    busy = False  # with a task
+    busy = False  # with a task that can be interrupted
+    working = False  # with a task, interrupted or not
     stopped = False  # the parent wants no more results
 
 
@@ -172,6 +176,7 @@ def _watch(lifeline: Connection) -> None:
     with contextlib.suppress(EOFError, OSError):
         lifeline.recv_bytes()
     _Worker.stopped = True
+    until = time.monotonic() + PATIENCE
     parent = multiprocessing.parent_process()
     while parent is not None and parent.is_alive():
         if _Worker.busy:
@@ -179,6 +184,8 @@ def _watch(lifeline: Connection) -> None:
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
             else:
                 _thread.interrupt_main()
+        elif _Worker.working and time.monotonic() > until:
+            break  # the task caught the interrupt, or it was raised where Python ignores it: in a destructor
         parent.join(0.05)  # and again: a signal just before a sleep would not end it
     os._exit(1)
 
@@ -186,12 +193,12 @@ def _watch(lifeline: Connection) -> None:
 def _interruptible(function: Callable[[T], R], task: T) -> R:
     """One task in a worker."""
     try:
-        _Worker.busy = True
+        _Worker.busy = _Worker.working = True
         if _Worker.stopped:
             raise KeyboardInterrupt
         return function(task)
     finally:
-        _Worker.busy = False
+        _Worker.busy = _Worker.working = False
 
 
 def _mask(how: int) -> None:
