@@ -16,16 +16,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictSequential
 from torch.distributions import Categorical
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from symphony import keys
+from symphony import EvaluateConfig, keys
 from symphony.agents import load_agent
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.modules import SeededNoise
-from symphony.simulation.rollouts import simulate, start_states
+from symphony.simulation.driving import simulated
+from symphony.simulation.rollouts import start_states
 
 BATCH = 8
 SECONDS = (1.0, 2.0, 4.0, 8.0)
@@ -53,25 +52,24 @@ def main() -> None:
     agent, store = load_agent(args.agent), SegmentStore(args.store)
     if not agent.dynamics.discrete:
         parser.error(f"{args.agent} chooses no actions from a list, whose entropy could be told")
-    policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
+    config = EvaluateConfig(rollouts=args.rollouts, search="none")
     count = min(args.segments or len(store), len(store))
     entropies: list[float] = []
     apart: dict[float, list[float]] = {seconds: [] for seconds in SECONDS}
     for begin in range(0, count, BATCH):
         segments = [store[k] for k in range(begin, min(begin + BATCH, count))]
         scenes = collate([scene(s, 2) for s in segments])
+        found = simulated(agent, scenes, config)
         env = DrivingEnv(scenes, agent.dynamics, agent.observation)
-        start = start_states(env, agent.goals, trees=args.rollouts, branches=1, seed=0)
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            first = agent.policy(SeededNoise(0, agent.dynamics.numbers)(start.clone()))
+        start = start_states(env, agent.goals, trees=args.rollouts, branches=1, seed=config.seed)
+        with torch.no_grad():
+            first = agent.policy(SeededNoise(config.seed, agent.dynamics.numbers)(start))
         there = scenes.interactive_valid[:, None, None].expand(first[keys.LOGITS].shape[:-1])
         entropies += Categorical(logits=first[keys.LOGITS]).entropy()[there].tolist()
-        found = simulate(env, policy, start)
-        state, counted = found.state[:, :, 0], found.counted[:, :, 0]
         for seconds in SECONDS:
             step = round(seconds / segments[0].dt)
-            if step < state.shape[2]:
-                apart[seconds] += spread(state, counted, step)
+            if step < found.state.shape[2]:
+                apart[seconds] += spread(found.state, found.counted, step)
         print(f"{begin + len(segments)} of {count}", end="\r", flush=True)
     record: dict[str, Any] = {
         "agent": args.agent,

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from symphony.evaluation.paired import clustered_mean
+
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results"
 Record = dict[str, Any]
@@ -85,6 +87,13 @@ def mean_of(values: Sequence[float], digits: int) -> str:
         return f"{values[0]:.{digits}f}"
     error = np.std(values, ddof=1) / len(values) ** 0.5
     return f"{np.mean(values):.{digits}f} ± {error:.{digits}f}"
+
+
+def over(rows: Sequence[Record], key: str, digits: int) -> str:
+    """Mean of a figure over some segments of a record, ± standard error over their recordings."""
+    groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
+    mean, error = clustered_mean(np.array([row[key] for row in rows], np.float64), groups)
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"
 
 
 def figures(row: Record, columns: dict[str, tuple[str, int]]) -> list[str]:

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
+from results_base import COLUMNS, Grid, mean_of, over, records
+from results_methods import DRIVEN, cells
 
-from results_base import COLUMNS, Grid, mean_of, records
-from results_methods import cells
-from symphony.evaluation.paired import clustered_mean
-
-KNOWN = {"town": "towns", "ngsim": "real roads"}
 NEW = {"lined": "beside parked cars", "elsewhere": "other real roads"}
 ROWS = (
     ("BC", "towns/{}-bc-[0-9]*", "distilled/{}-bc-none-[0-9]*"),
@@ -35,17 +31,17 @@ ROADS = {
 def distilled() -> Grid:
     """Policies before and after distillation, each with no search and with that of the distilled one."""
     columns = ("collision_rate", "min_sade")
-    places = KNOWN | NEW
+    places = DRIVEN | NEW
     grid = [["", *(f"{title}: {COLUMNS[key][0]}" for title in places.values() for key in columns)]]
     for label, known, new in ROWS:
-        found = [records((known if place in KNOWN else new).format(place)) for place in places]
+        found = [records((known if place in DRIVEN else new).format(place)) for place in places]
         grid.append([label, *(cell for one in found for cell in cells(one, columns))])
     return grid
 
 
 def spread() -> Grid:
     """How varied proposals are without a search: mean over seeds, ± standard error over seeds."""
-    places = {"town": "towns", "ngsim": "real roads", "elsewhere": "other real roads"}
+    places = DRIVEN | {"elsewhere": NEW["elsewhere"]}
     heads = ("entropy", "apart after 2 s, m", "after 8 s, m")
     grid = [["", *(f"{title}: {head}" for title in places.values() for head in heads)]]
     for label, method in (("BC", "bc"), ("distilled", "bc_ts")):
@@ -67,9 +63,6 @@ def alone() -> Grid:
         for store, among in ROADS.values():
             (record,) = records(f"distilled/{store}-alone-{name}")
             rows = [row for row in record["per_segment"] if among(row["group"])]
-            groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
-            for key in columns:
-                mean, error = clustered_mean(np.array([row[key] for row in rows], np.float64), groups)
-                line.append(f"{mean:.{COLUMNS[key][1]}f} ± {error:.{COLUMNS[key][1]}f}")
+            line += [over(rows, key, COLUMNS[key][1]) for key in columns]
         grid.append(line)
     return grid

@@ -6,8 +6,7 @@ import json
 
 import numpy as np
 
-from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, figures, records
-from symphony.evaluation.paired import clustered_mean
+from results_base import COLUMNS, PLAYBACK, RECORDS, Grid, Record, figures, over, records
 
 REAL = {"US101": "US-101", "Lanker": "Lankershim", "Peach": "Peachtree"}
 ROAD_BASELINES = (("log playback", "playback"), ("constant velocity", "constant_velocity"), ("IDM", "idm"))
@@ -91,13 +90,8 @@ def by_place(count: int) -> Grid:
         line = [label, source]
         for place in REAL:
             rows = [row for row in record["per_segment"] if place in row["group"]]
-            groups = np.unique([row["group"] for row in rows], return_inverse=True)[1]
-            for key, digits in (("collision_rate", 1), ("ade", 2)):
-                values = np.array([row[key] for row in rows], np.float64)
-                mean, error = clustered_mean(values, groups)
-                ghosts = np.mean([row["collision_with_playback"] for row in rows])
-                aside = f" ({ghosts:.1f})" if key == "collision_rate" else ""
-                line.append(f"{mean:.{digits}f} ± {error:.{digits}f}{aside}")
+            ghosts = np.mean([row["collision_with_playback"] for row in rows])
+            line += [f"{over(rows, 'collision_rate', 1)} ({ghosts:.1f})", over(rows, "ade", 2)]
         grid.append(line)
     return grid
 

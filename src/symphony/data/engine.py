@@ -152,8 +152,7 @@ def _local_map(
 class _Worker:
     """State of this process as a worker."""
 
-    busy = False  # with a task that can be interrupted
-    working = False  # with a task, interrupted or not
+    task: Literal["", "running", "interrupted"] = ""
     stopped = False  # the parent wants no more results
 
 
@@ -167,8 +166,8 @@ def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
 
 def _interrupt(number: int, frame: object) -> None:
     # Only a task, once: a result that is half sent would hang the parent.
-    if _Worker.busy:
-        _Worker.busy = False
+    if _Worker.task == "running":
+        _Worker.task = "interrupted"
         raise KeyboardInterrupt
 
 
@@ -179,12 +178,12 @@ def _watch(lifeline: Connection) -> None:
     until = time.monotonic() + PATIENCE
     parent = multiprocessing.parent_process()
     while parent is not None and parent.is_alive():
-        if _Worker.busy:
+        if _Worker.task == "running":
             if hasattr(signal, "pthread_kill"):  # a real signal also ends a sleep or a read
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
             else:
                 _thread.interrupt_main()
-        elif _Worker.working and time.monotonic() > until:
+        elif _Worker.task and time.monotonic() > until:
             break  # the task caught the interrupt, or it was raised where Python ignores it: in a destructor
         parent.join(0.05)  # and again: a signal just before a sleep would not end it
     os._exit(1)
@@ -193,12 +192,12 @@ def _watch(lifeline: Connection) -> None:
 def _interruptible(function: Callable[[T], R], task: T) -> R:
     """One task in a worker."""
     try:
-        _Worker.busy = _Worker.working = True
+        _Worker.task = "running"
         if _Worker.stopped:
             raise KeyboardInterrupt
         return function(task)
     finally:
-        _Worker.busy = _Worker.working = False
+        _Worker.task = ""
 
 
 def _mask(how: int) -> None:
