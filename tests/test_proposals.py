@@ -39,6 +39,11 @@ def test_it_measures_an_agent(
     out = tmp_path / "found.json"
     given = ["pretrained:bc_ts_h", str(builtin_store("test")), "--segments", "2", "--rollouts", "3"]
     monkeypatch.setattr(sys, "argv", ["proposals.py", *given, "--json", str(out)])
+    searches: list[str] = []
+    simulated = proposals.simulated
+    monkeypatch.setattr(
+        proposals, "simulated", lambda a, s, config: searches.append(config.search) or simulated(a, s, config)
+    )
     proposals.main()
     record = json.loads(out.read_text())
     assert (record["segments"], record["rollouts"]) == (2, 3)
@@ -46,4 +51,5 @@ def test_it_measures_an_agent(
     spreads = [record["spread"][seconds] for seconds in sorted(record["spread"], key=float)]
     assert spreads == sorted(spreads)
     assert 0 < spreads[0] < 5
+    assert searches == ["none"]
     assert "entropy" in capsys.readouterr().out
