@@ -1,20 +1,24 @@
 """A device that exists in name only, to test code for accelerators on a machine that has none.
 
 Inside :func:`pretend` tensors have shapes, types and devices but no numbers. PyTorch itself refuses to mix devices
-and to read a number; copies between device and host, which would wait for the device, are noted here.
+and to read a number; copies between device and host, which would wait for the device, are noted here. Constants that
+the package makes once per device are counted apart.
 
     env = DrivingEnv(...)  # on the host, with numbers
     with pretend() as device:
         on(device, env)
         ...
     assert not device.waits
+    assert device.constants < 10
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
+from unittest import mock
 
 import torch
 from tensordict import TensorDictBase
@@ -40,11 +44,20 @@ class PretendDevice:
     Attributes:
         device: for tensors made inside.
         waits: copies between it and the host so far, as text.
+        constants: how many were made for it so far.
     """
 
     def __init__(self) -> None:
         self.device = torch.device(NAME, 0)
         self.waits: list[str] = []
+        self.constants = 0
+
+    def constant(self, *given: Any) -> Tensor:
+        """One that the package makes; to be kept by whoever calls this."""
+        self.constants, waits = self.constants + 1, len(self.waits)
+        made = _MADE(*given)
+        del self.waits[waits:]
+        return made
 
 
 class _Watch(TorchDispatchMode):
@@ -85,6 +98,7 @@ class _Backend(_DummyBackendModule):
             self.pretended.waits.append("synchronize")
 
 
+_MADE = constants.made.__wrapped__
 BACKEND = _Backend()
 
 
@@ -104,13 +118,11 @@ def pretend() -> Iterator[PretendDevice]:
     """Everything made inside is without numbers; what is made on the device is noted to be there."""
     BACKEND.pretended = device = PretendDevice()
     # Constants without numbers must not be found by what runs later, nor those with numbers by what runs here.
-    constants.made.cache_clear()
     try:
-        with FakeTensorMode(), _Watch(device):
+        with mock.patch.object(constants, "made", cache(device.constant)), FakeTensorMode(), _Watch(device):
             yield device
     finally:
         BACKEND.pretended = None
-        constants.made.cache_clear()
 
 
 def on(device: PretendDevice, given: Any) -> Any:

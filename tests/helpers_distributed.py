@@ -1,4 +1,4 @@
-"""Two processes that train together: run as a program, with STORE OUT; writes what they found to OUT."""
+"""Two processes that train together and write what they find, started from one that has no threads."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import shutil
 import socket
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -183,17 +184,20 @@ def fork(action: Callable[..., None], *args: Any) -> int:
         os._exit(status)
 
 
-if __name__ == "__main__":
-    where = (Path(sys.argv[1]), Path(sys.argv[2]))
-    lone = dict(os.environ)
+def both(store: Path, out: Path) -> int:
+    """What two processes do, and then one alone; whether one of them failed."""
+    warnings.simplefilter("error")
+    if Path("/sys/class/net/lo").exists():
+        # Else gloo asks for the address of the machine's name, which may have none.
+        os.environ["GLOO_SOCKET_IFNAME"] = "lo"
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     # As torchrun does.
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(WORLD)}
     os.environ["TORCHELASTIC_RUN_ID"] = "test"
-    children = [fork(main, rank, *where) for rank in range(WORLD)]
+    children = [fork(main, rank, store, out) for rank in range(WORLD)]
     codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
     del os.environ["TORCHELASTIC_RUN_ID"]
-    codes.append(os.waitstatus_to_exitcode(os.waitpid(fork(alone, *where), 0)[1]))
-    raise SystemExit(int(any(codes)))
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(fork(alone, store, out), 0)[1]))
+    return int(any(codes))

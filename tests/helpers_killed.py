@@ -1,4 +1,4 @@
-"""Training that is killed again and again: run as a program, with STORE OUT METHOD...
+"""Training that is killed again and again, in a process of its own that has no threads.
 
 For each method ``OUT/METHOD/whole`` is trained in one go, and ``OUT/METHOD/killed`` by processes that kill themselves
 one after the other. Prints what they died at.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,7 +94,3 @@ def main(store: Path, out: Path, methods: list[str]) -> int:
         if ends != [-signal.SIGKILL] * len(DEATHS) or live(part) or live(whole):
             return 1
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]))

@@ -122,7 +122,9 @@ def test_the_command_sets_it_for_a_process_of_its_own_only(monkeypatch: pytest.M
 
 def test_threads_wait_as_the_command_has_set_it() -> None:
     given = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    script = "import sys; from symphony.cli import main; sys.argv = ['symphony', 'doctor']; main()"
+    # A short command that needs torch.
+    show = ["data", "info", str(builtin_store("test"))]
+    script = f"import sys; from symphony.cli import main; sys.argv = ['symphony', *{show}]; main()"
     # The library tells what it was loaded with.
     shown = subprocess.run(
         [sys.executable, "-c", script],

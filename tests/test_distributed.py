@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +11,7 @@ import torch
 
 import helpers_distributed
 from helpers_distributed import LOSSES, TRAINED
+from helpers_processes import apart
 from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import checkpoints, latest, load_checkpoint
@@ -32,15 +30,10 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
         for seed in range(2):
             writer.append(straight_road(4, seed=seed, steps=9))
             writer.append(crossing(4, seed=seed, steps=8))
-    # TorchRL warns about its own classes while it is imported.
-    strict = ["-W", "error", "-W", "ignore:Creating:DeprecationWarning"]
-    command = [sys.executable, *strict, helpers_distributed.__file__, str(base / "store"), str(base)]
-    alone = {**os.environ, "OMP_NUM_THREADS": "1"}
-    if Path("/sys/class/net/lo").exists():
-        # Else gloo asks for the address of the machine's name, which may have none.
-        alone["GLOO_SOCKET_IFNAME"] = "lo"
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=alone, timeout=500)
-    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
+    said = base / "said.txt"
+    process = apart(helpers_distributed.both, base / "store", base, said=said)
+    process.join(500)
+    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
     return base, [json.loads((base / f"rank{rank}.json").read_text()) for rank in range(2)]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
+import json
 import multiprocessing
 import os
 import signal
@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -120,34 +119,37 @@ def test_a_worker_that_is_killed_is_told() -> None:
     assert not multiprocessing.active_children()
 
 
+PRELOADED = """
+import json, os, sys
+from symphony.data.engine import ordered_map
+import symphony.data.store
+from preloaded import what
+names = ["symphony.data.store", "numpy", "symphony.no_such_module"]
+if __name__ == "__main__":
+    print(json.dumps([os.getpid(), *ordered_map(what, [names] * 8, workers=2)]))
+"""
+TASK = """
+import os, sys
 IMPORTED_BY = os.getpid()
-
-
-def who_imported(_: int) -> tuple[int, int]:
-    return IMPORTED_BY, os.getpid()
+def what(names):
+    return IMPORTED_BY, os.getpid(), [name in sys.modules for name in names]
+"""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
-def test_workers_share_what_was_imported_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # one of earlier tests
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
-    found = list(ordered_map(who_imported, range(8), workers=2))
-    servers, workers = {importer for importer, _ in found}, {worker for _, worker in found}
+def test_workers_share_what_was_imported_for_them(tmp_path: Path) -> None:
+    # Also what the process had imported that they need nothing of: what evaluates needs seconds to import, and a
+    # conversion may have been the first.
+    (tmp_path / "preloaded.py").write_text(TASK)
+    (tmp_path / "script.py").write_text(PRELOADED)
+    path = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, tmp_path / "script.py"]
+    done = subprocess.run(command, env=path, capture_output=True, text=True, check=True)
+    this, *found = json.loads(done.stdout)
+    servers, workers = {importer for importer, _, _ in found}, {worker for _, worker, _ in found}
     assert len(servers) == 1
-    assert not servers & {*workers, os.getpid()}
-
-
-def is_imported(name: str) -> bool:
-    return name in sys.modules
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
-def test_later_work_finds_what_was_imported_before_the_first() -> None:
-    # What evaluates needs seconds to import; a conversion, which needs none of it, may have been the first.
-    importlib.import_module("symphony.simulation.workers")
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # one of earlier tests
-    names = ["symphony.simulation.workers", "torchrl", "symphony.no_such_module"]
-    assert list(ordered_map(is_imported, names, workers=2)) == [True, True, False]
+    assert not servers & {*workers, this}
+    assert all(imported == [True, True, False] for _, _, imported in found)
 
 
 def mark_unless_stopped(path: Path) -> Path:

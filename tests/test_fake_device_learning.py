@@ -24,11 +24,12 @@ from symphony.roadgraph import LaneGraph
 from symphony.simulation.rollouts import simulate, start_states
 from symphony.simulation.search import mean_then_sum, search
 
-LOGGED = 4  # a search of them prunes once
+LOGGED = 3  # a search of them prunes once
 SCENES = collate(
     [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=LOGGED), crossing(6, steps=LOGGED))]
 )
 ROWS = 4
+FEW = 12  # constants that are made once, in however many steps
 
 
 def spec(space: Any) -> AgentSpec:
@@ -60,33 +61,23 @@ def world(space: Any = "bicycle") -> Iterator[tuple[PretendDevice, Any, DrivingE
 def test_simulations_stay_on_the_device(space: Any) -> None:
     with world(space) as (device, agent, env):
         policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
-
-        def run() -> Any:
-            return simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
-
-        run()
-        device.waits.clear()
-        found = run()
+        found = simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
         assert found.state.shape == (2, 2, 1, LOGGED, 2, 4)
         assert {part.device.type for part in found} == {NAME}
         assert device.waits == []
+        assert device.constants < FEW
 
 
 @pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6), KeepAll(), ReplaceBad(0.0)], ids=repr)
 def test_searches_stay_on_the_device(rule: PruningRule) -> None:
     with world() as (device, agent, env), torch.no_grad():
-
-        def run() -> Any:
-            start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
-            how: Any = {"rule": rule, "prune_every": 2, "leaves": 3, "aggregate": mean_then_sum}
-            return search(env, agent.policy, agent.discriminator, start, seed=0, **how)
-
-        run()
-        device.waits.clear()
-        found = run()
+        start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
+        how: Any = {"rule": rule, "prune_every": 1, "leaves": 3, "aggregate": mean_then_sum}
+        found = search(env, agent.policy, agent.discriminator, start, seed=0, **how)
         assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
         assert found.totals.device.type == NAME
         assert device.waits == []
+        assert device.constants < FEW
 
 
 def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
@@ -124,18 +115,14 @@ def test_losses_and_their_gradients_stay_on_the_device(name: str, space: str) ->
         loss = losses(agent, env)[name]
         row = torch.arange(ROWS, device=device.device) % 2
         batch = batch_of(env, env.start(row, row))
-
-        def step() -> None:
-            out = loss(batch.exclude(keys.ACTION) if name == "mgail" else batch)
-            total = sum(value for key, value in out.items() if key.startswith("loss"))
-            assert isinstance(total, torch.Tensor)
-            assert total.device.type == NAME
-            total.backward()
-
-        step()
         device.waits.clear()
-        step()
+        out = loss(batch.exclude(keys.ACTION) if name == "mgail" else batch)
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        assert isinstance(total, torch.Tensor)
+        assert total.device.type == NAME
+        total.backward()
         assert device.waits == []
+        assert device.constants < FEW
 
 
 def test_every_loss_is_among_them() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import subprocess
-import sys
 import warnings
 
 import pytest
@@ -354,15 +352,3 @@ def test_label_smoothing_expects_nothing_of_categories_that_are_impossible():
     last.weight, last.bias = nn.Parameter(last.weight[:4]), nn.Parameter(last.bias[:4])
     fewer = BCLoss(actor, label_smoothing=0.2)(td)
     torch.testing.assert_close(found["loss_bc"], fewer["loss_bc"])
-
-
-def test_it_works_where_nothing_knows_of_driving():
-    code = (
-        "import sys, torch, symphony.objectives;"
-        "rooms = {m for m in sys.modules if m.startswith('symphony')};"
-        "rooms = {m for m in rooms if not m.startswith('symphony.objectives')};"
-        "assert rooms <= {'symphony', 'symphony._version', 'symphony.keys', 'symphony.errors'}, rooms;"
-        "print('fine')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "fine", done.stderr

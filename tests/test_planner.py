@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import json
 import threading
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
-from symphony.agents import load_agent
+from symphony.agents import Agent, load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
@@ -323,6 +324,12 @@ def test_the_command_simulates_reports_and_shows(
     assert "mine:Planner" in (Path(sim) / "view.html").read_text()
 
 
+@cache
+def loaded() -> Agent:
+    """Once for all examples."""
+    return load_agent(AGENT)
+
+
 @settings(max_examples=200, deadline=None)
 @given(
     runs=st.integers(1, 300),
@@ -333,7 +340,7 @@ def test_the_command_simulates_reports_and_shows(
 def test_runs_are_spread_over_as_many_segments_as_there_are(
     runs: int, segments: int, search: str, trees: int
 ) -> None:
-    agent, tilt = load_agent(AGENT), search == "tilted"
+    agent, tilt = loaded(), search == "tilted"
     config = EvaluateConfig(
         search="tree" if tilt else search, trees=trees, tilt=float(tilt), rule="systematic"
     )  # type: ignore[arg-type]

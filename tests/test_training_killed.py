@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import helpers_killed
+from helpers_processes import apart
 from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
@@ -59,12 +60,11 @@ def records(run: Path) -> list[dict[str, Any]]:
 def killed(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of several methods, each once in one go and once in many."""
     out = tmp_path_factory.mktemp("killed")
-    command = [sys.executable, helpers_killed.__file__, str(store), str(out), *METHODS]
-    # A child does not survive the fork of a process that computes with several threads.
-    alone = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=alone)
-    assert done.returncode == 0, done.stdout + done.stderr[-2000:]
-    assert done.stdout.split() == [name for name, _, _ in helpers_killed.DEATHS] * len(METHODS)
+    said = out / "said.txt"
+    process = apart(helpers_killed.main, store, out, list(METHODS), said=said)
+    process.join()
+    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
+    assert said.read_text().split() == [name for name, _, _ in helpers_killed.DEATHS] * len(METHODS)
     return out
 
 

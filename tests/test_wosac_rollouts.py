@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,12 @@ def mixed_segment() -> RunSegment:
     return validate(scenario_to_segment(mixed_record()))
 
 
+@cache
+def driven(settings: WosacSettings) -> RolloutArrays:
+    """Rollouts of the mixed segment, which several tests look at."""
+    return wosac_rollouts(load_agent(AGENT), mixed_segment(), settings)
+
+
 def same(a: RolloutArrays, b: RolloutArrays) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("object_id", *STATES))
 
@@ -105,7 +112,7 @@ def test_nothing_of_the_future_is_used(settings: WosacSettings) -> None:
         valid=segment.valid & ~later,
         signal_state=np.where(later, SignalState.STOP, segment.signal_state).astype(np.uint8),
     )
-    found = wosac_rollouts(agent, segment, settings)
+    found = driven(settings)
     assert same(found, wosac_rollouts(agent, other, settings))
     # The present is used.
     moved = segment.replace(velocity=0.5 * segment.velocity)
@@ -115,7 +122,7 @@ def test_nothing_of_the_future_is_used(settings: WosacSettings) -> None:
 @pytest.mark.parametrize("settings", [PLAIN, SEARCH], ids=["none", "tree"])
 def test_vehicles_are_driven_and_others_keep_their_velocity(settings: WosacSettings) -> None:
     segment = mixed_segment()
-    found, steady = wosac_rollouts(load_agent(AGENT), segment, settings), constant_velocity(segment)
+    found, steady = driven(settings), constant_velocity(segment)
     assert found.object_id.tolist() == [100, 102, 103, 104]
     for name in STATES:
         array = getattr(found, name)
