@@ -215,7 +215,7 @@ class Drawing(Walk):
     ("env", "why"),
     [
         (lambda: SerialEnv(2, Walk), "batch-locked"),
-        (lambda: ParallelEnv(1, Walk), "batch-locked"),
+        (lambda: ParallelEnv(1, Walk, mp_start_method="forkserver"), "batch-locked"),
         (lambda: TransformedEnv(Counting(), StepCounter()), r"another \('agents', 'x'\) when stepped"),
         (Counting, r"another \('agents', 'x'\) when stepped"),
     ],

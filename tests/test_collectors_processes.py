@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 from pathlib import Path
 
@@ -26,10 +27,21 @@ from helpers_collectors import (
     noise,
 )
 from symphony.collectors import BeamSearchCollector, KeyScore, Systematic, with_rows
+from symphony.data import engine
 
 ROWS, STEPS, WORKERS = 3, 8, 2
 FRAMES = ROWS * STEPS
 EXTRAS = {("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")}
+
+
+@pytest.fixture
+def _started_quickly():
+    """TorchRL starts processes as the global setting says, anew if there is none, which is what the example does."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method(engine._START, force=True)
+    engine.get_ready([__name__])
+    yield
+    multiprocessing.set_start_method(before, force=True)
 
 
 def make_env():
@@ -64,6 +76,7 @@ def assert_same(first, second):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_started_quickly")
 def test_a_worker_collects_what_the_collector_does_here():
     collector = several(workers=1)
     try:
@@ -91,6 +104,7 @@ def test_a_worker_collects_what_the_collector_does_here():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_started_quickly")
 def test_two_workers_fill_a_replay_buffer_with_data_of_their_own():
     """Nobody seeded them; a score's network is the one that is trained here."""
     score = Weighted()

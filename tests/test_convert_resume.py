@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import multiprocessing
@@ -9,19 +10,19 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from helpers_convert import FakeReader
+from helpers_processes import apart
 from symphony.cli import main
 from symphony.data import convert as converting
-from symphony.data import parts, store_format, unfinished
+from symphony.data import engine, parts, store_format, unfinished
 from symphony.data.convert import convert
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
@@ -115,25 +116,19 @@ def test_killed_between_any_two_changes_of_a_file(
         assert [p.name for p in moment.iterdir()] == ["store"]
 
 
-MAIN = """
-import os, sys
-os.fsync = lambda descriptor: None
-sys.path.insert(0, sys.argv[1])
-from pathlib import Path
-from helpers_convert import FakeReader
-from symphony.cli import main
-from symphony.data import convert as converting
-from symphony.data import parts
-converting.CHECKPOINT, parts.PART_FILES = 0.01, 3
+def converted(folder: Path, workers: int, told: Connection) -> None:
+    """Convert in a process that may be killed, and tell how it goes."""
+    os.fsync = lambda descriptor: None
+    converting.CHECKPOINT, parts.PART_FILES = 0.01, 3
+    # Of all that this process holds, workers need little.
+    preload = multiprocessing.get_context("forkserver").set_forkserver_preload
+    engine.get_ready = lambda _: preload([convert.__module__, FakeReader.__module__])
 
-def show(*_):
-    print("on", flush=True)
+    def progress(*_: Any) -> None:
+        told.send("on")
 
-if __name__ == "__main__":
-    folder = Path(sys.argv[2])
-    converting.convert(FakeReader(), [folder / "logs"], folder / "store", workers=int(sys.argv[3]), progress=show)
-    print("end", flush=True)
-"""
+    convert(FakeReader(), [folder / "logs"], folder / "store", workers=workers, progress=progress)
+    told.send("end")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
@@ -144,22 +139,24 @@ def test_kill_9_at_random_moments(tmp_path: Path, workers: int) -> None:
     logs = {f"{k:02d}.scene": list(itertools.islice(scenes, 4)) for k in range(16)}
     files = write(tmp_path / "logs", logs)
     whole = convert(FakeReader(), files, tmp_path / "whole")
-    (tmp_path / "main.py").write_text(MAIN)
-    command = [sys.executable, tmp_path / "main.py", Path(__file__).parent, tmp_path, str(workers)]
     kills = 0
     for _ in range(40):
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            process.stdout.readline()
-            if kills < 3 - workers:  # to start two workers takes seconds
-                time.sleep(rng.uniform(0, 0.04))
-                process.kill()
-            ended = process.stdout.read().endswith("end\n")
-        kills += process.returncode == -signal.SIGKILL
+        heard, told = multiprocessing.Pipe(duplex=False)
+        process = apart(converted, tmp_path, workers, told)
+        told.close()
+        ended = heard.recv() == "end"
+        if kills < 3 - workers:  # to start two workers takes seconds
+            time.sleep(rng.uniform(0, 0.04))
+            process.kill()
+        with contextlib.suppress(EOFError):
+            while not ended:
+                ended = heard.recv() == "end"
+        process.join()
+        kills += process.exitcode == -signal.SIGKILL
         if ended:
             break
     assert kills >= 1
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["logs", "main.py", "store", "whole"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["logs", "store", "whole"]
     assert content(tmp_path / "store") == content(tmp_path / "whole")
     assert SegmentStore(tmp_path / "store").report == whole.to_json()
 

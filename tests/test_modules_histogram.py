@@ -162,10 +162,10 @@ def test_shapes(batch):
 def test_a_policy_tells_two_manners_apart():
     """Where half of the experts brake and half accelerate, one Gaussian learns to do neither."""
     torch.manual_seed(0)
-    td, brakes = observed(200), torch.rand(200, 3) < 0.5
-    wanted = torch.stack([torch.where(brakes, -1.0, 1.0), torch.zeros(200, 3)], -1)
+    td, brakes = observed(120), torch.rand(120, 3) < 0.5
+    wanted = torch.stack([torch.where(brakes, -1.0, 1.0), torch.zeros(120, 3)], -1)
     bounds, between, left = policy().get_dist(td.clone()), [], []
-    td[ACTION] = bounds.displacement(wanted + 0.1 * torch.randn(200, 3, 2)).detach()
+    td[ACTION] = bounds.displacement(wanted + 0.1 * torch.randn(120, 3, 2)).detach()
     for cells in (0, 11):
         actor = policy(cells=cells)
         loss, optimizer = BCLoss(actor), torch.optim.Adam(actor.parameters(), lr=0.02)
@@ -174,7 +174,7 @@ def test_a_policy_tells_two_manners_apart():
             loss(td)["loss_bc"].backward()
             optimizer.step()
         assert all(p.grad is not None and p.grad.norm() > 0 for p in actor.parameters())
-        actions = actor(td.clone().set(NOISE, torch.rand(200, 3, 2)))[ACTION]
+        actions = actor(td.clone().set(NOISE, torch.rand(120, 3, 2)))[ACTION]
         # One that stands does not show whether it brakes.
         fast = td[VALID] & (td[STATE][..., 3] > 2)
         drawn = bounds.latent(actions)[fast][:, 0]

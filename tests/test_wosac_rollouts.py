@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from helpers_wosac import womd_record
-from symphony.agents import load_agent
+from symphony.agents import Agent, build_agent, load_agent
 from symphony.cli import main
-from symphony.config import WosacSettings
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, WosacSettings
 from symphony.data.resample import resample, wrap
 from symphony.data.rollouts import STATES, RolloutArrays
 from symphony.data.segment import AgentType, RunSegment, SignalState, validate
@@ -66,9 +66,24 @@ def mixed_segment() -> RunSegment:
 
 
 @cache
+def small() -> Agent:
+    """An agent with goals and a discriminator, quicker than the one that comes with the package."""
+    torch.manual_seed(0)
+    spec = AgentSpec(
+        action_space="bicycle",
+        dt=0.2,
+        goals=True,
+        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
+        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        searches=True,
+    )
+    return build_agent("small", spec)
+
+
+@cache
 def driven(settings: WosacSettings) -> RolloutArrays:
     """Rollouts of the mixed segment, which several tests look at."""
-    return wosac_rollouts(load_agent(AGENT), mixed_segment(), settings)
+    return wosac_rollouts(small(), mixed_segment(), settings)
 
 
 def same(a: RolloutArrays, b: RolloutArrays) -> bool:
@@ -103,7 +118,7 @@ def test_states_between_decisions_are_those_of_resampling(seed: int, dt: float) 
 
 @pytest.mark.parametrize("settings", [PLAIN, SEARCH], ids=["none", "tree"])
 def test_nothing_of_the_future_is_used(settings: WosacSettings) -> None:
-    agent, segment = load_agent(AGENT), mixed_segment()
+    agent, segment = small(), mixed_segment()
     later = np.arange(segment.num_steps) > 10
     other = segment.replace(
         position=np.where(later[:, None], segment.position + 7, segment.position),
@@ -131,7 +146,7 @@ def test_vehicles_are_driven_and_others_keep_their_velocity(settings: WosacSetti
     # Every rollout is one of its own.
     assert len(np.unique(found.x[:, 1:, -1], axis=0)) == 32
     assert (found.z == found.z[:1, :, :1]).all()
-    other = wosac_rollouts(load_agent(AGENT), segment, replace(settings, seed=1))
+    other = wosac_rollouts(small(), segment, replace(settings, seed=1))
     assert not np.isin(other.x[:, 1:, -1], found.x[:, 1:, -1]).any()
     # They begin where the log was last seen: 0.1 s at speeds between 10 and 15 m/s further on.
     now = segment.position[[2, 3, 4], 10, 0] + segment.origin[0]
@@ -140,7 +155,7 @@ def test_vehicles_are_driven_and_others_keep_their_velocity(settings: WosacSetti
 
 def test_trees_are_independent_however_many_are_searched_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("symphony.simulation.wosac.AT_ONCE", 12 * 2 * 3)
-    found = wosac_rollouts(load_agent(AGENT), mixed_segment(), SEARCH)
+    found = wosac_rollouts(small(), mixed_segment(), SEARCH)
     assert found.x.shape == (32, 4, 80)
     assert len(np.unique(found.x[:, 1:, -1], axis=0)) == 32
 
@@ -298,7 +313,7 @@ def test_short_logs_have_a_shorter_history() -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_a_shorter_horizon_is_the_beginning_of_the_whole(seed: int) -> None:
     segment = resample(crossing(num_agents=4, seed=seed), 0.1)
-    agent, short = load_agent(AGENT), replace(PLAIN, horizon=3.5)
+    agent, short = small(), replace(PLAIN, horizon=3.5)
     whole, part = (wosac_scenario(segment), wosac_scenario(segment, short.future))
     window = wosac_window(segment, short.future)
     assert (window.num_steps, part.steps, part.future) == (46, 46, 35)
