@@ -30,7 +30,7 @@ table: $(CORE)  ## train, evaluate and compare all eight methods, tiny, in out/t
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile
 
 test: $(DEV)  ## run the tests, in a process per core
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest $(PYTEST_ARGS)
 
 FUZZ_ARGS ?= --inputs 2000
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import gc
 import os
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from symphony.data import engine
 
 # A busy machine must not fail a test.
 settings.register_profile("symphony", deadline=None)
@@ -21,6 +24,27 @@ os.environ.setdefault("WANDB_MODE", "disabled")
 # What a shell starts in the background ignores interrupts, and so would all that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+GIVEN_TO_WORKERS = (
+    "helpers_distributed",
+    "helpers_killed",
+    "helpers_workers",
+    "test_collectors_processes",
+    "test_workers",
+)
+"""Modules of tests that other processes need; they import all others that are needed."""
+_get_ready = engine.get_ready
+
+
+def _get_ready_for_tests(imports: Sequence[str]) -> None:
+    """Have them imported before workers are forked: each worker by itself needs seconds for it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+        _get_ready([*GIVEN_TO_WORKERS, *imports])
+
+
+engine.get_ready = _get_ready_for_tests
 
 
 def pytest_collection_finish() -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from helpers_convert import FakeReader
-from symphony.data import parts
+from symphony.data import engine, parts
 from symphony.data.convert import convert
 from symphony.data.engine import WorkerError, ordered_map
 from symphony.data.store import SegmentStore
@@ -179,7 +179,10 @@ def goes_on(path: Path) -> None:
             time.sleep(1)
 
 
-def test_a_task_that_ignores_the_interrupt_ends_with_its_process(tmp_path: Path) -> None:
+def test_a_task_that_ignores_the_interrupt_ends_with_its_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "PATIENCE", 0.5)
     results = ordered_map(goes_on, [tmp_path / name for name in ("quick", "a", "b")], workers=2)
     next(results)
     while not list(tmp_path.iterdir()):

@@ -27,7 +27,7 @@ from symphony.recipes import train
 from symphony.training import trainer as training
 from symphony.training.logging import Tracker, read_metrics
 
-METHODS = ("bc", "bc_ts")
+METHODS = ("bc_ts",)
 
 
 @pytest.fixture(scope="module")

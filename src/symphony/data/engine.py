@@ -125,7 +125,7 @@ def _local_map(
     lifeline, stop = context.Pipe(duplex=False)
     # A server keeps the environment that it was started with.
     environment = {**os.environ, **WORKER_ENVIRONMENT}
-    pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
+    pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment, PATIENCE))
 
     def submit(task: T) -> Any:
         with (
@@ -156,12 +156,12 @@ class _Worker:
     stopped = False  # the parent wants no more results
 
 
-def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
+def _begin_worker(lifeline: Connection, environment: dict[str, str], patience: float) -> None:
     """Stop when the parent closes its end of the pipe, and end when it ends, in whatever way."""
     os.environ.update(environment)
     signal.signal(signal.SIGINT, _interrupt)
     _mask(signal.SIG_UNBLOCK)
-    threading.Thread(target=_watch, args=(lifeline,), daemon=True).start()
+    threading.Thread(target=_watch, args=(lifeline, patience), daemon=True).start()
 
 
 def _interrupt(number: int, frame: object) -> None:
@@ -171,11 +171,11 @@ def _interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
 
-def _watch(lifeline: Connection) -> None:
+def _watch(lifeline: Connection, patience: float) -> None:
     with contextlib.suppress(EOFError, OSError):
         lifeline.recv_bytes()
     _Worker.stopped = True
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + patience
     parent = multiprocessing.parent_process()
     while parent is not None and parent.is_alive():
         if _Worker.task == "running":
