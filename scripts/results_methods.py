@@ -205,11 +205,12 @@ INPUTS = (
     ("all four, interactive agents' states four times as often", "inputs/{}-interactive"),
 )
 """What changes of the paper's inputs do alone, and their records on the validation parts."""
-POINTS = (
-    ("BC+TS, 200 points", "inputs/{}-points-200"),
-    ("BC+TS, 512 points", "inputs/{}-points-512"),
+POINTS = tuple(
+    (f"{method}, {count} points", f"points/{{}}-{kind}-{count}-*")
+    for method, kind in (("BC", "bc"), ("BC+TS", "ts"))
+    for count in (128, 200, 512, 1000)
 )
-"""What more points are for policy and discriminator, likewise."""
+"""How many points policy and discriminator observe, on the validation parts."""
 ATTENTION = (
     ("the paper's encoder, 3 000 updates", "attention/{}-pooled"),
     ("attention to others and lights, points pooled, 2 560 updates", "attention/{}-others"),
@@ -270,6 +271,16 @@ ROADSIDE = (
     ),
 )
 """Labels, and records among parked cars and on the two test parts."""
+
+
+def points() -> Grid:
+    """More or fewer map points, and what they cost."""
+    grid = driven(POINTS)
+    grid[0].append("CPU s")
+    for line, (_, pattern) in zip(grid[1:], POINTS, strict=True):
+        found = records(pattern.format("town"))
+        line.append(f"{np.mean([record['cost']['simulation'] / record['segments'] for record in found]):.2f}")
+    return grid
 
 
 def settings() -> Grid:
