@@ -74,7 +74,8 @@ def _generate(out: Path) -> None:
 
 
 def _convert(logs: Path, out: Path) -> None:
-    if (out / "store").exists():  # it was done when it was killed, and would be refused
+    # It was done when it was killed, and would be refused, unless it had not tidied up.
+    if (out / "store").exists() and not (out / "store.partial" / "journal.jsonl").exists():
         return
     convert(FakeReader(), sorted(logs.glob("*.scene")), out / "store")
 

@@ -29,7 +29,7 @@ SCENES = collate(
     [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=LOGGED), crossing(6, steps=LOGGED))]
 )
 ROWS = 4
-FEW = 12  # constants that are made once, in however many steps
+FEW = 7  # constants that are made once, in however many steps
 
 
 def spec(space: Any) -> AgentSpec:
