@@ -45,6 +45,8 @@ class Edges(NamedTuple):
         for neighbor, beyond, ahead in corners:
             at = np.flatnonzero(beyond)
             at = at[neighbor[nearest[at]] >= 0]
+            if len(at) == 0:
+                continue
             here, other = nearest[at], neighbor[nearest[at]]
             _, beside = self._side(other, x[at], y[at])
             first, second = (here, other) if ahead else (other, here)
