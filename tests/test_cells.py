@@ -158,8 +158,12 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     tables = Tables(batch, FEW)
     expected = oracle.road_distance(batch, row, where)
     sure = expected.abs() > 1e-3
-    assert torch.equal(offroad_flags(batch, row, where, tables)[sure], (expected > 0)[sure])
+    flags = offroad_flags(batch, row, where, tables)
+    assert torch.equal(flags[sure], (expected > 0)[sure])
     assert (tables.edge_cells.sign != 0).any()
+    # Whoever is alone at a corner is on the same side of it.
+    alone = [offroad_flags(batch, row, place, tables) for place in where[:, :300].split(1, 1)]
+    assert torch.equal(torch.cat(alone, 1), flags[:, :300])
 
 
 @pytest.mark.usefixtures("at_once")

@@ -124,10 +124,10 @@ def test_a_worker_that_is_killed_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 PRELOADED = """
 import json, os, sys
 from symphony.data.engine import ordered_map
-import symphony.data.store
 from preloaded import what
 names = ["symphony.data.store", "numpy", "symphony.no_such_module"]
-if __name__ == "__main__":
+if __name__ == "__main__":  # else workers would import it, too
+    import symphony.data.store
     print(json.dumps([os.getpid(), *ordered_map(what, [names] * 8, workers=2)]))
 """
 TASK = """

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from helpers_wosac import womd_record
-from symphony.agents import Agent, build_agent, load_agent
+from symphony.agents import load_agent
 from symphony.cli import main
-from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, WosacSettings
+from symphony.config import WosacSettings
 from symphony.data.resample import resample, wrap
 from symphony.data.rollouts import STATES, RolloutArrays
 from symphony.data.segment import AgentType, RunSegment, SignalState, validate
@@ -35,10 +35,13 @@ from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wos
 from symphony.evaluation.wosac_table import read_wosac, wosac_grid
 from symphony.metrics.wosac import SimulatedRollouts, StepFeatures, WosacScenario, compute_features, score
 from symphony.simulation.wosac import between_decisions, constant_velocity, history_only, wosac_rollouts
+from test_finite import agent as make_agent
 
 AGENT = "pretrained:bc_ts_h"
 PLAIN = WosacSettings(search="none")
 SEARCH = WosacSettings(search="tree", branches=2)
+small = cache(make_agent)
+"""An agent with goals and a discriminator, quicker than the one that comes with the package."""
 META = (
     *("--account-name", "somebody@example.org", "--unique-method-name", "made"),
     *(
@@ -63,21 +66,6 @@ def mixed_record(name: str = "0123456789abcdef") -> pb.Scenario:
 
 def mixed_segment() -> RunSegment:
     return validate(scenario_to_segment(mixed_record()))
-
-
-@cache
-def small() -> Agent:
-    """An agent with goals and a discriminator, quicker than the one that comes with the package."""
-    torch.manual_seed(0)
-    spec = AgentSpec(
-        action_space="bicycle",
-        dt=0.2,
-        goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
-        searches=True,
-    )
-    return build_agent("small", spec)
 
 
 @cache
