@@ -33,6 +33,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     said = base / "said.txt"
     process = apart(helpers_distributed.both, base / "store", base, said=said)
     process.join(500)
+    process.kill()  # where it hangs
+    process.join()
     assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
     return base, [json.loads((base / f"rank{rank}.json").read_text()) for rank in range(2)]
 

@@ -112,7 +112,7 @@ def test_weights_that_are_not_finite_are_found_at_once(
 
 
 @pytest.mark.parametrize(("search", "rule"), SEARCHES)
-@pytest.mark.parametrize("value", [math.nan, -math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("batch", [1, 3])
 def test_segment_and_step_are_those_where_it_began(
     store: SegmentStore, search: Any, rule: str, value: float, batch: int
