@@ -216,7 +216,7 @@ def preparation(segments: int = 64) -> Work:
     return once, segments
 
 
-def evaluation(segments: int = 8, rollouts: int = 16) -> Work:
+def evaluation(segments: int = 16, rollouts: int = 16) -> Work:
     """An agent that comes with the package on built-in test segments, with its search."""
     agent, store = load_agent("pretrained:bc_ts_h"), SegmentStore(builtin_store("test"))
     config = EvaluateConfig(rollouts=rollouts)

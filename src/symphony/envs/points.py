@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from symphony.envs.compiled import point_writer
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
@@ -112,8 +113,9 @@ def _among_all(
         across -= here_y[rows, None]
         np.square(squared, out=squared)
         squared += np.square(across, out=across)
-        chosen = smallest(squared, count).reshape(-1, count) % total
-        flat[rows] = chosen + (scene[rows] * total)[:, None]
+        # From places in the block to numbers among all points; a remainder would take five times as long.
+        shift = (scene[rows] - np.arange(len(rows))) * total
+        flat[rows] = smallest(squared, count).reshape(-1, count) + shift[:, None]
 
 
 def _exist(tables: Tables, flat: Int[Tensor, "M N K"]) -> Bool[Tensor, "M N K"]:
@@ -174,16 +176,14 @@ def _features_in_place(
     out = tables.points.new_empty(agents, count, POINT_FEATURES)
     angle = -heading.reshape(-1, 1)
     own, x, y = (speed / config.speed_scale).reshape(-1, 1), *origin.reshape(-1, 2, 1).unbind(1)
-    pose = (x.numpy(), y.numpy(), angle.cos().numpy(), angle.sin().numpy(), own.numpy())
-    table, order, block = tables.points.numpy(), index.numpy(), max(1, _ROWS // count)
-    buffers = np.empty((4, block, count), table.dtype)
-    for a in range(0, agents, block):
-        part = out[a : a + block].numpy()
-        chosen = order[a * count : (a + len(part)) * count]
-        # "clip" writes straight to its target; the numbers are in range.
-        np.take(table, chosen, axis=0, out=part.reshape(-1, POINT_FEATURES), mode="clip")
-        here = [value[a : a + block] for value in pose]
-        _to_frame(part, here, config.distance_scale, buffers[:, : len(part)])
+    pose = [v.numpy() for v in (x, y, angle.cos(), angle.sin(), own)]
+    rows, table = index.view(agents, count).numpy(), tables.points.numpy()
+    compiled = point_writer()
+    if compiled is None:
+        _write_in_blocks(rows, table, pose, config.distance_scale, out.numpy())
+    else:
+        flat_pose = [np.ascontiguousarray(value[:, 0]) for value in pose]
+        compiled(rows, table, *flat_pose, np.float32(config.distance_scale), out.numpy())
     seen = out.view(*flat.shape, POINT_FEATURES)
     if tables.light is not None:
         light = tables.light.index_select(0, index)
@@ -195,6 +195,20 @@ def _features_in_place(
     if not tables.enough_points:
         out.view(-1, POINT_FEATURES)[(~mask).flatten()] = 0.0
     return seen
+
+
+def _write_in_blocks(
+    rows: np.ndarray, table: np.ndarray, pose: list[np.ndarray], scale: float, out: np.ndarray
+) -> None:
+    """Rows of the table, copied to ``out`` and overwritten block by block."""
+    agents, count = rows.shape
+    block = max(1, _ROWS // count)
+    buffers = np.empty((4, block, count), table.dtype)
+    for a in range(0, agents, block):
+        part = out[a : a + block]
+        # "clip" writes straight to its target; the numbers are in range.
+        np.take(table, rows[a : a + block], axis=0, out=part, mode="clip")
+        _to_frame(part, [value[a : a + block] for value in pose], scale, buffers[:, : len(part)])
 
 
 def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: np.ndarray) -> None:
