@@ -10,7 +10,6 @@ import os
 import warnings
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 from symphony.envs.tables import POINT_FEATURES
 from symphony.geometry.edges import Indices, Reals
@@ -23,7 +22,7 @@ Writer = Callable[..., None]
 def point_writer() -> Writer | None:
     """:func:`_write_points`, compiled; None without numba, or where ``SYMPHONY_COMPILED=0`` asks for none.
 
-    Compiled at the first call and kept beside this file, or in the user's cache where that can't be written to.
+    Compiled at the first call in a process.
     """
     if os.environ.get("SYMPHONY_COMPILED") == "0" or importlib.util.find_spec("numba") is None:
         return None
@@ -32,12 +31,9 @@ def point_writer() -> Writer | None:
     except ImportError as error:
         warnings.warn(f"numba can't be used, so nothing is compiled: {error}", RuntimeWarning, stacklevel=2)
         return None
-    # No fast mathematics, which would round otherwise; a division by zero is what it is in NumPy.
-    how: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    try:
-        return njit(cache=True, **how)(_write_points)
-    except RuntimeError:  # nowhere to keep it
-        return njit(**how)(_write_points)
+    # No fast mathematics, which would round otherwise; a division by zero is what it is in NumPy. Not kept on disk,
+    # where it would be a pickle: to compile takes a sixth of a second.
+    return njit(nogil=True, error_model="numpy")(_write_points)
 
 
 def _write_points(
@@ -61,7 +57,7 @@ def _write_points(
         cos: [R] of the angle by which the world is turned.
         sin: likewise.
         speed: [R] of the agents, scaled.
-        scale: metres that become 1, float32.
+        scale: metres that become 1, of the table's type.
         out: [R, K, F], written to.
     """
     for r in range(index.shape[0]):

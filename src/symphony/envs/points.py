@@ -5,6 +5,8 @@ Shapes: M rows (any flattened batch), N observing agents, K points each observes
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -174,16 +176,11 @@ def _features_in_place(
     config, count = tables.config, flat.shape[-1]
     agents, index = flat.numel() // count, flat.flatten()
     out = tables.points.new_empty(agents, count, POINT_FEATURES)
-    angle = -heading.reshape(-1, 1)
-    own, x, y = (speed / config.speed_scale).reshape(-1, 1), *origin.reshape(-1, 2, 1).unbind(1)
-    pose = [v.numpy() for v in (x, y, angle.cos(), angle.sin(), own)]
+    angle, (x, y) = -heading.flatten(), origin.reshape(-1, 2).t().contiguous()
+    pose = [v.numpy() for v in (x, y, angle.cos(), angle.sin(), (speed / config.speed_scale).flatten())]
     rows, table = index.view(agents, count).numpy(), tables.points.numpy()
-    compiled = point_writer()
-    if compiled is None:
-        _write_in_blocks(rows, table, pose, config.distance_scale, out.numpy())
-    else:
-        flat_pose = [np.ascontiguousarray(value[:, 0]) for value in pose]
-        compiled(rows, table, *flat_pose, np.float32(config.distance_scale), out.numpy())
+    write = point_writer() or _write_in_blocks
+    write(rows, table, *pose, table.dtype.type(config.distance_scale), out.numpy())
     seen = out.view(*flat.shape, POINT_FEATURES)
     if tables.light is not None:
         light = tables.light.index_select(0, index)
@@ -197,10 +194,9 @@ def _features_in_place(
     return seen
 
 
-def _write_in_blocks(
-    rows: np.ndarray, table: np.ndarray, pose: list[np.ndarray], scale: float, out: np.ndarray
-) -> None:
-    """Rows of the table, copied to ``out`` and overwritten block by block."""
+def _write_in_blocks(rows: np.ndarray, table: np.ndarray, *pose_scale_out: Any) -> None:
+    """Rows of the table, copied and overwritten block by block; arguments as of what is compiled."""
+    *pose, scale, out = pose_scale_out
     agents, count = rows.shape
     block = max(1, _ROWS // count)
     buffers = np.empty((4, block, count), table.dtype)
@@ -208,7 +204,7 @@ def _write_in_blocks(
         part = out[a : a + block]
         # "clip" writes straight to its target; the numbers are in range.
         np.take(table, rows[a : a + block], axis=0, out=part, mode="clip")
-        _to_frame(part, [value[a : a + block] for value in pose], scale, buffers[:, : len(part)])
+        _to_frame(part, [value[a : a + block, None] for value in pose], scale, buffers[:, : len(part)])
 
 
 def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: np.ndarray) -> None:
