@@ -19,7 +19,7 @@ from symphony.envs.road import road_distance
 from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, along_route, route_ahead
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, POINT_FEATURES, Tables
-from symphony.geometry.boxes import box_corners, box_gap
+from symphony.geometry.boxes import box_corners, gap_between
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
 from symphony.geometry.nearest import nearest, on_host
@@ -367,17 +367,14 @@ def _gaps(
     size: Float[Tensor, "M N O 2"],
 ) -> Float[Tensor, "M N O H"]:
     """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
-    # Times come first, so that operations run along everything else.
-    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None, None]
-    wide, wide_size = own[..., None, :].expand_as(state), own_size[..., None, :].expand_as(size)
-    gap = box_gap(
-        wide[..., :2] + times * wide[..., 3:],
-        wide[..., 2],
-        wide_size,
-        state[..., :2] + times * state[..., 3:],
-        state[..., 2],
-        size,
+    # Times come first, and components apart, so that operations run along everything else.
+    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None]
+    wide = own[..., None, :]
+    x, y = (
+        (state[..., k] + times * state[..., 3 + k]) - (wide[..., k] + times * wide[..., 3 + k])
+        for k in (0, 1)
     )
+    gap = gap_between(x, y, wide[..., 2], own_size[..., None, :], state[..., 2], size)
     return gap.movedim(0, -1).contiguous()
 
 

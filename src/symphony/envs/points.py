@@ -34,11 +34,7 @@ def observed_points(
 ) -> tuple[Float[Tensor, "M N K F"], Bool[Tensor, "M N K"]]:
     """Features of the nearest points in each agent's frame, and which of them exist."""
     flat, mask = nearest_points(tables, scene, origin.detach())
-    wants_gradient = torch.is_grad_enabled() and any(v.requires_grad for v in (origin, heading, speed))
-    if wants_gradient or not on_host(origin):
-        return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
-    with torch.no_grad():
-        return _features_in_place(tables, scene, step, flat, mask, origin, heading, speed), mask
+    return _seen(tables, scene, step, flat, mask, origin, heading, speed), mask
 
 
 def observed_lights(
@@ -60,7 +56,22 @@ def observed_lights(
         squared = (position[scene][:, None] - origin[..., None, :]).square().sum(-1)
         chosen, mask = nearest(squared, count)
         flat = number[scene].gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
-    return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
+    return _seen(tables, scene, step, flat, mask, origin, heading, speed), mask
+
+
+def _seen(
+    tables: Tables,
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    flat: Int[Tensor, "M N K"],
+    mask: Bool[Tensor, "M N K"],
+    *pose: Float[Tensor, "M N ..."],
+) -> Float[Tensor, "M N K F"]:
+    """Features of the points ``flat``, for agents at a position, with a heading and a speed."""
+    if not on_host(flat) or (torch.is_grad_enabled() and any(value.requires_grad for value in pose)):
+        return _features(tables, scene, step, flat, mask, *pose)
+    with torch.no_grad():
+        return _features_in_place(tables, scene, step, flat, mask, *pose)
 
 
 @torch.no_grad()
@@ -189,7 +200,7 @@ def _features_in_place(
         row = place // (count * origin.shape[1])
         state = _light_now(tables, scene, step)[row, light[place].long()]
         out.view(-1, POINT_FEATURES)[place, LIGHT_COLUMN + state] = 1.0
-    if not tables.enough_points:
+    if not bool(mask.all()):
         out.view(-1, POINT_FEATURES)[(~mask).flatten()] = 0.0
     return seen
 

@@ -169,26 +169,28 @@ def along_route(
         points: the agents' routes, :data:`SPACING` apart.
         count: points of each route that exist; 0 for none.
     """
-    place = torch.cat([own[..., None, :2], others[..., :2]], -2)
+    # Component by component: operations on a last dimension of 2 are slow.
+    x, y, speed_x, speed_y = (
+        torch.cat([own[..., k, None], others[..., k]], -1) for k in (0, 1, 3, 4)
+    )
+    points_x, points_y = points.unbind(-1)
     with torch.no_grad():
         exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
         # |p - q|^2 less |p|^2, about the agent so that numbers stay small: [M, N, 1 + O, K]
-        here, line = place - place[..., :1, :], points - place[..., :1, :]
-        own_part = line.square().sum(-1).masked_fill(~exists, torch.inf)
-        nearest = first_smallest(own_part[..., None, :] - 2.0 * here @ line.mT)
+        here = torch.stack([x - x[..., :1], y - y[..., :1]], -1)
+        line = torch.stack([points_x - x[..., :1], points_y - y[..., :1]], -2)
+        own_part = line.square().sum(-2).masked_fill(~exists, torch.inf)
+        nearest = first_smallest(own_part[..., None, :] - 2.0 * here @ line)
         start = nearest.minimum((count[..., None] - 2).clamp_min(0))
-    first, second = (
-        points.gather(2, index[..., None].expand(*index.shape, 2))
-        for index in (start, (start + 1).clamp_max(points.shape[2] - 1))
-    )
-    direction = second - first
-    direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-3)
-    away = place - first
-    beyond = (away * direction).sum(-1)
-    along = SPACING * start + beyond
-    left = direction[..., 0] * away[..., 1] - direction[..., 1] * away[..., 0]
-    velocity = torch.cat([own[..., None, 3:], others[..., 3:]], -2)
-    speed = (velocity * direction).sum(-1)
+        following = (start + 1).clamp_max(points.shape[2] - 1)
+    first_x, first_y = points_x.gather(2, start), points_y.gather(2, start)
+    along_x, along_y = points_x.gather(2, following) - first_x, points_y.gather(2, following) - first_y
+    length = (along_x.square() + along_y.square()).sqrt().clamp_min(1e-3)
+    along_x, along_y = along_x / length, along_y / length
+    away_x, away_y = x - first_x, y - first_y
+    along = SPACING * start + (away_x * along_x + away_y * along_y)
+    left = along_x * away_y - along_y * away_x
+    speed = speed_x * along_x + speed_y * along_y
     end = SPACING * (count[..., None] - 1)
     known = (along > -SPACING) & (along < end + SPACING) & (left.abs() < BESIDE) & (count[..., None] > 1)
     known = known[..., 1:] & known[..., :1]

@@ -42,7 +42,7 @@ def boxes_overlap(
     reaches strictly inside that one; two coincident points do not overlap. The result is the same with the
     boxes swapped, and true exactly where :func:`box_gap` is negative.
     """
-    pair = _relation(center_a, heading_a, center_b, heading_b)
+    pair = _relation(*_way(center_a, center_b), heading_a, heading_b)
     return _separations(pair, size_a, size_b) < 0
 
 
@@ -59,7 +59,19 @@ def box_gap(
     Apart: the Euclidean gap. Overlapping: minus the penetration depth, the length of the shortest translation
     that separates them. Differentiable in every argument, with finite gradients everywhere.
     """
-    pair = _relation(center_a, heading_a, center_b, heading_b)
+    return gap_between(*_way(center_a, center_b), heading_a, size_a, heading_b, size_b)
+
+
+def gap_between(
+    x: Float[Tensor, "*#batch"],
+    y: Float[Tensor, "*#batch"],
+    heading_a: Float[Tensor, "*#batch"],
+    size_a: Float[Tensor, "*#batch 2"],
+    heading_b: Float[Tensor, "*#batch"],
+    size_b: Float[Tensor, "*#batch 2"],
+) -> Float[Tensor, "*batch"]:
+    """:func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
+    pair = _relation(x, y, heading_a, heading_b)
     separation = _separations(pair, size_a, size_b)
     # Of two disjoint convex polygons the nearest points include a corner of one of them.
     apart = torch.minimum(
@@ -92,13 +104,16 @@ class _Pair(NamedTuple):
     turn: _Plane
 
 
+def _way(center_a: Float[Tensor, "*#b 2"], center_b: Float[Tensor, "*#b 2"]) -> _Plane:
+    return center_b[..., 0] - center_a[..., 0], center_b[..., 1] - center_a[..., 1]
+
+
 def _relation(
-    center_a: Float[Tensor, "*#b 2"],
+    x: Float[Tensor, "*#b"],
+    y: Float[Tensor, "*#b"],
     heading_a: Float[Tensor, "*#b"],
-    center_b: Float[Tensor, "*#b 2"],
     heading_b: Float[Tensor, "*#b"],
 ) -> _Pair:
-    x, y = (center_b[..., k] - center_a[..., k] for k in (0, 1))
     turn = heading_b - heading_a
     return _Pair(_turned(x, y, heading_a), _turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
 

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from symphony.geometry.nearest import on_host
-from symphony.modules.rows import plain_layers, reusing
+from symphony.modules.rows import FEWER, equal_rows, plain_layers, reusing
 from symphony.modules.winners import own_channel, won
 
+ALIGNED = 8
+"""Sets begin at multiples of so many rows: some kernels add in another order where a row lies elsewhere in a tile."""
 PoolMode = Literal["auto", "dense", "winner"]
 ROWS = 2048
-"""Elements encoded at a time: their activations (512 KiB at width 64) stay in a core's L2 cache."""
+"""Elements encoded at a time, at most: their activations (512 KiB at width 64) stay in a core's L2 cache."""
 FEW = 48
 """Largest set for which encoding everything with a graph is faster than finding winners first (measured on one
 CPU core at width 64: the two meet between 48 and 64 elements)."""
@@ -41,7 +45,7 @@ def pool_elements(
         mask: `[..., K]` bool, True where an element is valid.
         rows: elements encoded at a time where work is done in chunks.
         mode: `"dense"` encodes everything at once and differentiates through all of it. `"winner"` encodes
-            in chunks of fixed size without a graph, and then, where a gradient is asked for, encodes the at
+            in chunks without a graph, and then, where a gradient is asked for, encodes the at
             most H winning elements of each set again with one. Both have the same values and gradients, those
             of any order included, up to rounding. `"auto"` is `"winner"` on the CPU (but `"dense"` for the
             gradient of small sets, where that is faster) and `"dense"` elsewhere.
@@ -65,13 +69,16 @@ def pool_elements(
     gradient = _wants_gradient(function, elements)
     if mode == "auto":
         mode = "dense" if elements.device.type != "cpu" or (gradient and count <= FEW) else "winner"
+    # As many whole sets as fit: full blocks then lie together in memory.
+    most = _aligned(count)
+    rows = max(1, rows // most) * most
     if mode == "dense":
         pooled = _dense(function, sets, valid)
     elif gradient:
         pooled = _through_winners(function, sets, valid, rows)
     else:
         with torch.no_grad():
-            pooled, _ = _in_chunks(function, sets, valid, rows, index=False)
+            pooled, _ = _in_blocks(_values(function, sets), sets, valid, equal_rows(function, sets, rows))
             pooled = torch.where(valid.any(1, keepdim=True), pooled, 0.0)
     return pooled.reshape(*batch, pooled.shape[-1])
 
@@ -88,84 +95,148 @@ def _dense(
     function: Callable[[Tensor], Tensor], sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"]
 ) -> Float[Tensor, "n H"]:
     n, count, features = sets.shape
-    encoded = function(torch.where(valid[..., None], sets, 0.0).reshape(-1, features)).reshape(n, count, -1)
+    flat = sets.reshape(n * count, features)
+    place = valid.flatten().nonzero().squeeze(-1) if on_host(valid) else None
+    if place is None or len(place) in (0, n * count):
+        encoded = function(torch.where(valid.view(-1, 1), flat, 0.0)).view(n, count, -1)
+        encoded = encoded.masked_fill(~valid[..., None], -torch.inf)
+    else:
+        found = function(flat.index_select(0, place))
+        nothing = found.new_full((n * count, found.shape[-1]), -torch.inf)
+        encoded = nothing.index_copy(0, place, found).view(n, count, -1)
     # Not amax, which would share the gradient between equal elements.
-    pooled = encoded.masked_fill(~valid[..., None], -torch.inf).max(1).values
-    return torch.where(valid.any(1, keepdim=True), pooled, 0.0)
+    return torch.where(valid.any(1, keepdim=True), encoded.max(1).values, 0.0)
 
 
 def _first_valid(valid: Bool[Tensor, "n K"]) -> Int[Tensor, " n"]:
     return valid.to(torch.uint8).argmax(1)
 
 
-def _blocks(
-    sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], size: int
-) -> Iterator[tuple[Float[Tensor, "sK F"], int]]:
-    """The elements of ``size`` sets at a time, and how many of these there are; the last block is filled up."""
-    n, count, features = sets.shape
-    flat = sets.reshape(n * count, features)
-    order = None
-    if not (on_host(valid) and bool(valid.all())):
-        # A masked element repeats a valid one: cheaper than masking the H-wide outputs, and the maximum is the same.
-        place = torch.arange(n * count, device=sets.device).view(n, count)
-        order = torch.where(valid, place, place.gather(1, _first_valid(valid)[:, None])).view(-1)
-    for start in range(0, n * count, size * count):
-        stop = start + size * count
-        block = flat[start:stop] if order is None else flat.index_select(0, order[start:stop])
-        missing = size * count - block.shape[0]
-        if missing:
-            # A fixed number of rows fixes the kernel, hence the rounding, of every matrix product.
-            block = torch.cat([block, block.new_zeros(missing, features)])
-        yield block, size - missing // count
+_Pool = Callable[[Tensor, torch.Size], tuple[Tensor, Tensor | None]]
+"""Encodes elements [rows, F], of which the first are s sets of w each; maxima [s, H], and the place in its set of each."""
 
 
-def _in_chunks(
-    function: Callable[[Tensor], Tensor],
-    sets: Float[Tensor, "n K F"],
-    valid: Bool[Tensor, "n K"],
-    rows: int,
-    *,
-    index: bool,
-) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"] | None]:
-    """Maxima `[n, H]`, and on request the element `[n, H]` of each; arbitrary for sets without valid elements."""
-    count = sets.shape[1]
-    size = max(1, rows // count)
+def _values(function: Callable[[Tensor], Tensor], sets: Float[Tensor, "n K F"]) -> _Pool:
     # Elsewhere there is no cache to stay in, and layers may be anything.
-    function = reusing(function) if on_host(sets) else function
-    maxima, winners = [], []
-    for block, sets_in_it in _blocks(sets, valid, size):
-        encoded = function(block).reshape(size, count, -1)[:sets_in_it]
-        if index:
-            best, where = encoded.max(1)
-            winners.append(where)
-        else:
-            best = encoded.amax(1)
-        maxima.append(best)
-    return torch.cat(maxima), torch.cat(winners) if index else None
+    encode = reusing(function) if on_host(sets) else function
+    return lambda block, shape: (encode(block)[: shape.numel()].unflatten(0, shape).amax(1), None)
 
 
-def _by_channel(
-    linears: Sequence[nn.Linear], sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], rows: int
-) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"]]:
+def _winners(function: Callable[[Tensor], Tensor]) -> _Pool:
+    return lambda block, shape: tuple(function(block)[: shape.numel()].unflatten(0, shape).max(1))
+
+
+def _by_channel(linears: Sequence[nn.Linear]) -> _Pool:
     """The same of an :func:`symphony.modules.mlp` on the CPU: outputs lie channel by channel, where the place of a
     maximum is found five times as fast.
     """
-    count = sets.shape[1]
-    size = max(1, rows // count)
     *before, (weight, bias) = ((layer.weight, layer.bias[:, None]) for layer in linears)
-    # Written to the same memory for each block, which stays in the cache.
-    between = [weight.new_empty(size * count, len(inner)) for inner, _ in before]
-    out = weight.new_empty(len(weight), size * count)
-    maxima, winners = [], []
-    for block, sets_in_it in _blocks(sets, valid, size):
+    memory: list[Tensor] = []
+
+    def pool(block: Float[Tensor, "rows F"], shape: torch.Size) -> tuple[Tensor, Tensor]:
+        if not memory or len(memory[0]) != len(block):
+            # Written to the same memory for each block, which stays in the cache.
+            memory[:] = [weight.new_empty(len(block), len(inner)) for inner, _ in before]
+            memory.append(weight.new_empty(len(weight), len(block)))
         hidden = block
-        for (inner, shift), place in zip(before, between, strict=True):
-            hidden = torch.addmm(shift[:, 0], hidden, inner.t(), out=place).relu_()
-        encoded = torch.addmm(bias, weight, hidden.t(), out=out).view(-1, size, count)[:, :sets_in_it]
+        for (inner, shift), out in zip(before, memory, strict=False):
+            hidden = torch.addmm(shift[:, 0], hidden, inner.t(), out=out).relu_()
+        out = torch.addmm(bias, weight, hidden.t(), out=memory[-1])
+        encoded = out[:, : shape.numel()].unflatten(1, shape)
         where = torch.from_numpy(encoded.numpy().argmax(-1))
-        winners.append(where.t())
-        maxima.append(encoded.gather(-1, where[..., None])[..., 0].t())
-    return torch.cat(maxima), torch.cat(winners)
+        return encoded.gather(2, where[..., None]).squeeze(2).t(), where.t()
+
+    return pool
+
+
+def _in_blocks(
+    pool: _Pool, sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"], sizes: Sequence[int]
+) -> tuple[Float[Tensor, "n H"], Int[Tensor, "n H"] | None]:
+    """Maxima, and on request the place among the elements of all sets of each; arbitrary for sets without any.
+
+    On the CPU only valid elements are encoded.
+
+    Args:
+        pool: what is done to each block.
+        sets: elements.
+        valid: which of them count.
+        sizes: rows that a block may have, ascending; each has as few as hold its elements. A number of rows fixes the
+            kernel, hence the rounding, of every matrix product; what a block does not fill nobody looks at.
+    """
+    n, count, features = sets.shape
+    flat, plan = sets.reshape(n * count, features), _plan(valid, sizes[-1])
+    maxima, winners = [], []
+    for start, some, width in plan.blocks:
+        held = some * width
+        rows = next(size for size in sizes if size >= held)
+        if plan.index is None:
+            block = flat[start : start + rows]
+            block = pad(block, (0, 0, 0, rows - len(block))) if len(block) < rows else block
+        else:
+            block = flat.index_select(0, plan.index[start : start + rows])
+        best, where = pool(block, torch.Size((some, width)))
+        maxima.append(best)
+        if where is not None:
+            winners.append(where + torch.arange(start, start + held, width, device=sets.device)[:, None])
+    found = torch.cat(maxima)
+    place = torch.cat(winners) if winners else None
+    if place is not None and plan.index is not None:
+        place = plan.index[place]
+    if plan.order is None:
+        return found, place
+    return found.new_zeros(n, found.shape[1]).index_copy(0, plan.order, found), (
+        None if place is None else place.new_zeros(n, place.shape[1]).index_copy(0, plan.order, place)
+    )
+
+
+class _Plan(NamedTuple):
+    """Which elements are encoded together.
+
+    Attributes:
+        blocks: first element, number of sets, elements of each set.
+        index: places of the elements among those of all sets, block by block and enough of them for the last block's
+            rows; None for all as they lie.
+        order: of the sets [m] in the blocks; None for all as they are.
+    """
+
+    blocks: list[tuple[int, int, int]]
+    index: Int[Tensor, " E"] | None = None
+    order: Int[Tensor, " m"] | None = None
+
+
+def _aligned(count: int) -> int:
+    return -(-count // ALIGNED) * ALIGNED
+
+
+def _plan(valid: Bool[Tensor, "n K"], rows: int) -> _Plan:
+    n, count = valid.shape
+    size = rows // _aligned(count)
+    blocks = [(first * count, min(size, n - first), count) for first in range(0, n, size)]
+    if not on_host(valid):
+        # A masked element repeats a valid one: cheaper than masking the outputs, and the maximum is the same.
+        place = torch.arange(n * count, device=valid.device).view(n, count)
+        place = torch.where(valid, place, place.gather(1, _first_valid(valid)[:, None]))
+        return _Plan(blocks, pad(place.flatten(), (0, rows)))
+    if (count % ALIGNED == 0 and bool(valid.all())) or not bool(valid.any()):
+        return _Plan(blocks)
+    mask = valid.numpy()
+    element, number = np.flatnonzero(mask), np.count_nonzero(mask, axis=1)
+    # Those with most elements first, so that sets of a block are almost equally large.
+    order = np.argsort(-number, kind="stable")[: np.count_nonzero(number)]
+    held = number[order].tolist()
+    blocks, start, k = [], 0, 0
+    while k < len(held):
+        most = _aligned(held[k])
+        size = min(rows // most, len(held) - k)
+        blocks.append((start, size, most))
+        start, k = start + size * most, k + size
+    # Of each place in the blocks the one among the valid elements; past its last one a set repeats it.
+    end = number.cumsum()[order]
+    width = np.repeat([width for _, _, width in blocks], [some for _, some, _ in blocks])
+    place = np.arange(start) + np.repeat(end - number[order] - (width.cumsum() - width), width)
+    index = np.zeros(start + rows, np.int64)
+    index[:start] = element[np.minimum(place, np.repeat(end - 1, width))]
+    return _Plan(blocks, torch.from_numpy(index), torch.from_numpy(order))
 
 
 def _through_winners(
@@ -173,20 +244,13 @@ def _through_winners(
 ) -> Float[Tensor, "n H"]:
     linears = plain_layers(function) if on_host(sets) else []
     with torch.no_grad():
-        if linears:
-            best, winners = _by_channel(linears, sets.detach(), valid, rows)
-        else:
-            best, found = _in_chunks(function, sets, valid, rows, index=True)
-            if found is None:  # pragma: no cover - asked for just above
-                raise RuntimeError("no winners were returned")
-            winners = found
+        pool = _by_channel(linears) if linears else _winners(function)
+        best, place = _in_blocks(pool, sets.detach(), valid, (*(few for few in FEWER if few < rows), rows))
+        if place is None:  # pragma: no cover - asked for just above
+            raise RuntimeError("no winners were returned")
         occupied = valid.any(1, keepdim=True)
-        # A winning masked element is a copy of the first valid one.
-        winners = torch.where(valid.gather(1, winners), winners, _first_valid(valid)[:, None])
     n, count, features = sets.shape
-    # Of a place [n, H] in a set the one among the elements of all sets.
-    place = (winners + torch.arange(0, n * count, count, device=sets.device)[:, None]).flatten()
-    chosen = sets.reshape(n * count, features).index_select(0, place).view(n, -1, features)
+    chosen = sets.reshape(n * count, features).index_select(0, place.flatten()).view(n, -1, features)
     if not (on_host(occupied) and bool(occupied.all())):
         chosen = torch.where(occupied[..., None], chosen, 0.0)
     if linears:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from symphony.geometry.nearest import transformed
+from symphony.geometry.nearest import on_host, transformed
 
 BLOCK = 64
 """Rows per block: large enough that the cost of the calls vanishes, small enough that padding stays cheap."""
@@ -24,6 +25,10 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
         # In place: nothing reads what comes out of a linear layer, and fresh memory costs more than the maximum.
         layers += [nn.Linear(width_in, width_out), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
+
+
+FEWER = (64, 256, 1000)
+"""Rows of smaller products, for what a block holds little of."""
 
 
 def in_blocks(
@@ -63,6 +68,36 @@ def plain_layers(function: Callable[[Tensor], Tensor]) -> list[nn.Linear]:
     linears = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
     plain = bool(linears) and layers[::2] == linears and layers[-1] is linears[-1]
     return linears if plain and all(type(layer) is nn.ReLU for layer in layers[1::2]) else []
+
+
+def equal_rows(function: Callable[[Tensor], Tensor], x: Float[Tensor, "*b F"], rows: int) -> tuple[int, ...]:
+    """Numbers of rows, ascending up to ``rows``, with which a row-wise function gives a row the same bits.
+
+    Known of an :func:`mlp` on the CPU in float32, of anything else ``rows`` alone.
+    """
+    if x.dtype != torch.float32 or not on_host(x):
+        return (rows,)
+    shapes = [tuple(layer.weight.shape) for layer in plain_layers(function)]
+    few = [size for size in FEWER if size < rows] if shapes else []
+    threads = torch.get_num_threads()
+    return (*(size for size in few if all(_alike(*shape, size, rows, threads) for shape in shapes)), rows)
+
+
+@cache
+@torch.no_grad()
+def _alike(outputs: int, inputs: int, few: int, rows: int, threads: int) -> bool:
+    """Whether rows have the same bits in a product of few as in one of many, tried out with random numbers.
+
+    Which kernel computes a product, and so in which order it adds, is decided by its shape on a machine.
+    """
+    rng = torch.Generator().manual_seed(0)
+    x, weight, bias = (
+        torch.randn(shape, generator=rng, device="cpu", dtype=torch.float32)
+        for shape in ((rows, inputs), (outputs, inputs), (outputs,))
+    )
+    together = torch.addmm(bias, x, weight.t())
+    parts = slice(0, few), slice(rows - few, rows)
+    return all(torch.equal(torch.addmm(bias, x[part], weight.t()), together[part]) for part in parts)
 
 
 def _hooked(module: nn.Module) -> bool:
