@@ -7,7 +7,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from symphony.data.segment import SignalState
-from symphony.envs.observation import Objects, ObservationConfig
+from symphony.envs.objects import Objects
+from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry import boxes_overlap, rotate, signed_distance
 

@@ -17,7 +17,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.observation import objects_at
+from symphony.envs.objects import objects_at
 from symphony.envs.points import nearest_points, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.tables import Tables

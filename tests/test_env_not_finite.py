@@ -13,7 +13,8 @@ from symphony import keys
 from symphony.envs import Bicycle, Displacement, DrivingEnv, collate, scene
 from symphony.envs import flags as module
 from symphony.envs.flags import collision_flags
-from symphony.envs.observation import Objects, ObservationConfig
+from symphony.envs.objects import Objects
+from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
 from symphony.geometry import box_gap, boxes_overlap, signed_distance
 from symphony.roadgraph import LaneGraph

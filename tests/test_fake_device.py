@@ -13,7 +13,8 @@ from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.observation import objects_at, observe
+from symphony.envs.objects import objects_at
+from symphony.envs.observation import observe
 from symphony.roadgraph import LaneGraph
 
 EVERYTHING = ObservationConfig(

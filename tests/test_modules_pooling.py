@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from symphony.modules import in_blocks, mlp, pool_elements
+from symphony.modules import in_blocks, mlp, pool_elements, pooling, rows
 
 
 def make(n=7, count=60, features=5, hidden=16, share=0.6, dtype=torch.float64, seed=0):
@@ -132,13 +132,20 @@ def test_among_equal_elements_the_first_gets_the_gradient(mode):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize(("count", "features"), [(16, 10), (200, 9), (1000, 8)])
-def test_without_gradients_a_result_does_not_depend_on_its_batch(threads, count, features):
+@pytest.mark.parametrize(
+    # Small products add in another order where a row lies elsewhere in a tile.
+    ("count", "features", "hidden"),
+    [(16, 10, 64), (200, 9, 64), (1000, 8, 64), (16, 15, 2), (16, 5, 4), (13, 23, 8), (200, 23, 4)],
+)
+def test_without_gradients_a_result_does_not_depend_on_its_batch(threads, count, features, hidden):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         n = 12
-        network, elements, mask = make(n=n, count=count, features=features, hidden=64, dtype=torch.float32)
+        network, elements, mask = make(
+            n=n, count=count, features=features, hidden=hidden, dtype=torch.float32
+        )
+        mask[2] &= torch.arange(count) == 5
         with torch.no_grad():
             whole = pool_elements(network, elements, mask)
             for part in (slice(0, 1), slice(3, 5), slice(5, 12)):
@@ -149,6 +156,38 @@ def test_without_gradients_a_result_does_not_depend_on_its_batch(threads, count,
             assert torch.equal(many, whole.repeat(20, 1))
     finally:
         torch.set_num_threads(before)
+
+
+def test_fewer_rows_are_multiplied_only_where_that_changes_nothing(monkeypatch) -> None:
+    network, x = mlp((5, 24, 16)), torch.randn(2048, 5)
+    with torch.no_grad():
+        whole = network(x.clone())
+        sizes = rows.equal_rows(network, x, 2048)
+        assert sizes[-1] == 2048
+        assert sorted(sizes) == list(sizes)
+        for size in sizes:
+            assert torch.equal(network(x[:size].clone()), whole[:size])
+        for other, given in ((network.double(), x.double()), (network.forward, x)):
+            assert rows.equal_rows(other, given, 2048) == (2048,)
+        assert rows.equal_rows(network, x, 100) in ((64, 100), (100,))
+        monkeypatch.setattr(rows, "_alike", lambda outputs, inputs, few, *_: few != 256)
+        assert rows.equal_rows(network, x, 2048) == (64, 1000, 2048)
+
+
+def test_only_valid_elements_are_encoded(monkeypatch) -> None:
+    """Of a set with few of them few rows are, with a gradient and without."""
+    network, elements, _ = make(n=100, count=16, dtype=torch.float32)
+    mask = torch.zeros(100, 16, dtype=torch.bool)
+    mask[::10, ::8] = True
+    encoded = []
+    network.register_forward_hook(lambda module, inputs, out: encoded.append(len(out)))
+    monkeypatch.setattr(rows, "_hooked", lambda module: False)
+    pool_elements(network, elements, mask)
+    assert encoded == [20]
+    monkeypatch.setattr(pooling, "reusing", lambda function: function)
+    with torch.no_grad():
+        pool_elements(network, elements, mask)
+    assert encoded[1] < 300  # at most the next size
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 63, 64, 65, 200])

@@ -15,7 +15,8 @@ from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.observation import Objects, Observation, ObservationConfig, objects_at, observe
+from symphony.envs.objects import Objects, objects_at
+from symphony.envs.observation import Observation, ObservationConfig, observe
 from symphony.envs.routes import pick_routes, route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.specs import make_specs
@@ -290,7 +291,7 @@ class DrivingEnv(EnvBase):
             state: x, y, heading, speed of the driven agents.
             valid: which of them are there.
         """
-        index = self.scenes.interactive[row]
+        index = self.scenes.interactive.index_select(0, row)
         found = objects_at(self.scenes, row, step, state, index, valid)
         # One that has left, or not entered yet, must not be played back in the meantime.
         return (
@@ -334,7 +335,7 @@ class DrivingEnv(EnvBase):
         shape = scene.shape
         row, at = scene.flatten(), step.flatten()
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
-        index = self.scenes.interactive[row]
+        index = self.scenes.interactive.index_select(0, row)
         objects = self.objects(row, at, moved, real)
         routes = None
         if self.observation.route or self.observation.along:
@@ -353,32 +354,29 @@ class DrivingEnv(EnvBase):
             return value.reshape((*shape, *value.shape[1:]))
 
         each = [*shape, self.num_agents]
-        agents = TensorDict(
-            {
-                "valid": valid,
-                "state": state,
-                "goal": goal,
-                "collision": back(collision)[..., None],
-                "offroad": back(offroad)[..., None],
-            },
-            batch_size=each,
-            device=self.device,  # one without a device would be taken for a transfer, and waited for
-        )
+        agents: dict[str, Tensor | TensorDict] = {
+            "valid": valid,
+            "state": state,
+            "goal": goal,
+            "collision": back(collision)[..., None],
+            "offroad": back(offroad)[..., None],
+        }
         if waiting is not None:
-            agents.set("waiting", waiting)
+            agents["waiting"] = waiting
         if self.observation.persona:
             # A state that says nothing of it, such as one of the log, is of no style in particular.
-            agents.set("persona", state.new_zeros(*each, 2) if persona is None else persona)
+            agents["persona"] = state.new_zeros(*each, 2) if persona is None else persona
         if observation:
             parts = {name: back(value) for name, value in observation.items()}
-            agents.set("observation", TensorDict(parts, batch_size=each, device=self.device))
+            agents["observation"] = TensorDict(parts, batch_size=each, device=self.device)
         return TensorDict(
             {
                 "scene": scene[..., None],
                 "step": step[..., None],
                 "stream": stream[..., None],
                 "segment": self.scenes.segment[scene][..., None],
-                "agents": agents,
+                # One without a device would be taken for a transfer, and waited for.
+                "agents": TensorDict(agents, batch_size=each, device=self.device),
                 "done": back(truncated | terminated)[..., None],
                 "truncated": back(truncated)[..., None],
                 "terminated": back(terminated)[..., None],

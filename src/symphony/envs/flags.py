@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.envs.observation import Objects
+from symphony.envs.objects import Objects
 from symphony.envs.road import road_distance
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import Tables

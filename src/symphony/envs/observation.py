@@ -9,35 +9,30 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 from torchrl.data import Binary, Composite, Unbounded
 
+from symphony.envs.objects import OBJECT_FEATURES, Objects, Seen, observed_objects
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
-from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, along_route, route_ahead
+from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, route_ahead
 from symphony.envs.scene import SceneBatch
-from symphony.envs.tables import AGENT_FEATURES, POINT_FEATURES, Tables
-from symphony.geometry.boxes import box_corners, gap_between
+from symphony.envs.tables import POINT_FEATURES, Tables
+from symphony.geometry.boxes import box_corners
 from symphony.geometry.constants import constant
-from symphony.geometry.frames import rotate, wrap
-from symphony.geometry.nearest import nearest, on_host
 
 __all__ = [
     "OBJECT_FEATURES",
     "POINT_FEATURES",
     "SELF_FEATURES",
-    "Objects",
     "Observation",
     "ObservationConfig",
-    "objects_at",
     "observe",
     "road_distance",
 ]
 
 SELF_FEATURES = 4
-OBJECT_FEATURES = 8 + AGENT_FEATURES
 
 
 @dataclass(frozen=True)
@@ -91,22 +86,6 @@ class ObservationConfig:
     def nothing(cls) -> ObservationConfig:
         """Of agents that look at nothing but their state."""
         return cls(num_objects=0, num_points=0, own=False)
-
-
-class Objects(NamedTuple):
-    """All agents of a scene at one step.
-
-    Attributes:
-        state: [M, A, 5] x, y, heading, velocity x, velocity y.
-        valid: [M, A].
-        size: [M, A, 2].
-        kind: [M, A] int64, ``AgentType``.
-    """
-
-    state: Tensor
-    valid: Tensor
-    size: Tensor
-    kind: Tensor
 
 
 class Observation(NamedTuple):
@@ -174,45 +153,6 @@ def observation_spec(config: ObservationConfig, agents: int, device: torch.devic
     return Composite({**numbers, **flags}, shape=(agents,))
 
 
-def objects_at(
-    scenes: SceneBatch,
-    scene: Int[Tensor, " M"],
-    step: Int[Tensor, " M"],
-    state: Float[Tensor, "M N 4"] | None = None,
-    index: Int[Tensor, "M N"] | None = None,
-    index_valid: Bool[Tensor, "M N"] | None = None,
-) -> Objects:
-    """The agents of each row's scene at a step: log playback, with simulated ones put in their place.
-
-    Args:
-        scenes: the static part.
-        scene: rows of ``scenes``.
-        step: logged step (past the end of the log nothing is valid).
-        state: x, y, heading, speed of the simulated agents.
-        index: their rows among the scene's agents.
-        index_valid: which of them are real.
-    """
-    steps = scenes.log_state.shape[1]
-    row = scene * steps + step.clamp(max=steps - 1)
-    logged = scenes.log_state.flatten(0, 1).index_select(0, row)
-    valid = scenes.log_valid.flatten(0, 1).index_select(0, row)
-    valid = valid & (step <= scenes.last_step[scene])[:, None]
-    if state is not None and index is not None and index_valid is not None:
-        x, y, heading, speed = state.unbind(-1)
-        simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
-        wide = index[..., None].expand(*index.shape, 5)
-        if on_host(state) and bool(index_valid.all()):
-            logged, valid = logged.scatter(1, wide, simulated), valid.scatter(1, index, True)
-        else:
-            # Those not there are written to a column past the last one, which is cut off again.
-            agents = logged.shape[1]
-            column = torch.where(index_valid, index, agents)
-            wide = column[..., None].expand_as(wide)
-            logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
-            valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
-    return Objects(logged, valid, scenes.box_size[scene], scenes.agent_type[scene])
-
-
 def observe(
     scenes: SceneBatch,
     scene: Int[Tensor, " M"],
@@ -244,7 +184,8 @@ def observe(
     own = _take(objects.state, index)
     own_size = _take(objects.size, index)
     origin, heading = own[..., :2], own[..., 2]
-    speed = rotate(own[..., 3:], -heading)[..., 0]
+    turn = -heading
+    speed = turn.cos() * own[..., 3] - turn.sin() * own[..., 4]
     features, points, points_mask, road, route = None, None, None, None, None
     lights, lights_mask, road_ahead = None, None, None
     if config.own:
@@ -257,9 +198,9 @@ def observe(
             ],
             -1,
         )
-    seen = _Seen()
+    seen = Seen()
     if config.num_objects:
-        seen = _observed_objects(tables, scene, objects, index, own, own_size, routes)
+        seen = observed_objects(tables, scene, objects, index, own, own_size, routes)
     if config.num_points:
         points, points_mask = observed_points(tables, scene, step, origin, heading, speed)
     if config.num_lights:
@@ -291,91 +232,6 @@ def observe(
         route=route,
         along=seen.along,
     )
-
-
-class _Seen(NamedTuple):
-    features: Tensor | None = None
-    mask: Tensor | None = None
-    gap: Tensor | None = None
-    gap_ahead: Tensor | None = None
-    along: Tensor | None = None
-
-
-def _observed_objects(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    objects: Objects,
-    index: Int[Tensor, "M N"],
-    own: Float[Tensor, "M N 5"],
-    own_size: Float[Tensor, "M N 2"],
-    routes: tuple[Tensor, Tensor] | None,
-) -> _Seen:
-    config = tables.config
-    origin, heading = own[..., :2], own[..., 2]
-    agents = objects.state.shape[1]
-    with torch.no_grad():
-        x, y = (objects.state[:, None, :, k] - origin[..., k, None] for k in (0, 1))
-        hidden = ~objects.valid[:, None] | (torch.arange(agents, device=index.device) == index[..., None])
-        squared = (x.square() + y.square()).masked_fill(hidden, torch.inf)
-        chosen, mask = nearest(squared, config.num_objects)
-    shape, flat = chosen.shape, chosen.flatten(1)
-    row = (flat + (scene * agents)[:, None]).flatten()
-    # Places among all agents there are now, and among those of all scenes.
-    now = (flat + torch.arange(0, objects.valid.numel(), agents, device=flat.device)[:, None]).flatten()
-    state = objects.state.flatten(0, 1).index_select(0, now).unflatten(0, shape)
-    # Whoever is not seen may hold anything, and neither its numbers nor their gradient may get through.
-    state = torch.where(mask[..., None], state, 0.0)
-    static = tables.agents.index_select(0, row).unflatten(0, shape)
-    # Component by component: operations on a last dimension of 2 are slow.
-    angle, (_, _, _, own_x, own_y) = -heading[..., None], own[..., None, :].unbind(-1)
-    cos, sin = angle.cos(), angle.sin()
-
-    def turned(x: Float[Tensor, "M N O"], y: Float[Tensor, "M N O"], scale: float) -> list[Tensor]:
-        return [(cos * x - sin * y) / scale, (sin * x + cos * y) / scale]
-
-    x, y, course, speed_x, speed_y = state.unbind(-1)
-    relative = wrap(course + angle)
-    dynamic = [
-        *turned(x - origin[..., None, 0], y - origin[..., None, 1], config.distance_scale),
-        relative.cos(),
-        relative.sin(),
-        *turned(speed_x, speed_y, config.speed_scale),
-        # Elements are encoded one by one, so each must tell how fast it is approached.
-        *turned(speed_x - own_x, speed_y - own_y, config.speed_scale),
-    ]
-    features = torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(own.dtype)[..., None]
-    follows = config.along and routes is not None
-    measures = config.clearance or config.gaps
-    if not follows and not measures:
-        return _Seen(features, mask)
-    size = objects.size.flatten(0, 1).index_select(0, now).unflatten(0, shape)
-    along = None
-    if follows and routes is not None:
-        along = along_route(own, own_size, state, size, *routes) * mask[..., None]
-    if not measures:
-        return _Seen(features, mask, along=along)
-    gap = _gaps(config.foresight, own, own_size, state, size)
-    gap = torch.where(mask[..., None], gap, 0.0)
-    return _Seen(features, mask, gap[..., 0], gap[..., 1:] if config.foresight else None, along)
-
-
-def _gaps(
-    foresight: tuple[float, ...],
-    own: Float[Tensor, "M N 5"],
-    own_size: Float[Tensor, "M N 2"],
-    state: Float[Tensor, "M N O 5"],
-    size: Float[Tensor, "M N O 2"],
-) -> Float[Tensor, "M N O H"]:
-    """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
-    # Times come first, and components apart, so that operations run along everything else.
-    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None]
-    wide = own[..., None, :]
-    x, y = (
-        (state[..., k] + times * state[..., 3 + k]) - (wide[..., k] + times * wide[..., 3 + k])
-        for k in (0, 1)
-    )
-    gap = gap_between(x, y, wide[..., 2], own_size[..., None, :], state[..., 2], size)
-    return gap.movedim(0, -1).contiguous()
 
 
 def _take(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:

@@ -16,7 +16,7 @@ from symphony.envs.compiled import point_writer
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
-from symphony.geometry.nearest import nearest, on_host, smallest
+from symphony.geometry.nearest import mere_numbers, nearest, on_host, smallest
 
 _ROWS = 1 << 13
 """Points whose features are written together, so that they stay in the cache."""
@@ -68,10 +68,8 @@ def _seen(
     *pose: Float[Tensor, "M N ..."],
 ) -> Float[Tensor, "M N K F"]:
     """Features of the points ``flat``, for agents at a position, with a heading and a speed."""
-    if not on_host(flat) or (torch.is_grad_enabled() and any(value.requires_grad for value in pose)):
-        return _features(tables, scene, step, flat, mask, *pose)
-    with torch.no_grad():
-        return _features_in_place(tables, scene, step, flat, mask, *pose)
+    written = _features_in_place if mere_numbers(*pose) else _features
+    return written(tables, scene, step, flat, mask, *pose)
 
 
 @torch.no_grad()
@@ -173,6 +171,7 @@ def _features(
     return features * mask[..., None]
 
 
+@torch.no_grad()
 def _features_in_place(
     tables: Tables,
     scene: Int[Tensor, " M"],

@@ -170,9 +170,7 @@ def along_route(
         count: points of each route that exist; 0 for none.
     """
     # Component by component: operations on a last dimension of 2 are slow.
-    x, y, speed_x, speed_y = (
-        torch.cat([own[..., k, None], others[..., k]], -1) for k in (0, 1, 3, 4)
-    )
+    x, y, speed_x, speed_y = (torch.cat([own[..., k, None], others[..., k]], -1) for k in (0, 1, 3, 4))
     points_x, points_y = points.unbind(-1)
     with torch.no_grad():
         exists = torch.arange(points.shape[2], device=points.device) < count[..., None]

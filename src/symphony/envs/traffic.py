@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.observation import Objects
+from symphony.envs.objects import Objects
 from symphony.geometry.boxes import box_gap
 
 CLEAR = 1.0

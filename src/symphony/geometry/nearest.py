@@ -25,6 +25,11 @@ def on_host(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling() and not transformed()
 
 
+def mere_numbers(*values: Tensor) -> bool:
+    """Whether NumPy may compute with tensors: on the CPU, and without a gradient."""
+    return all(on_host(value) and not value.requires_grad for value in values)
+
+
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     """Places, in the flattened array, of the ``count`` smallest elements of each row [R, W], ascending.
 

@@ -113,7 +113,8 @@ def _first_valid(valid: Bool[Tensor, "n K"]) -> Int[Tensor, " n"]:
 
 
 _Pool = Callable[[Tensor, torch.Size], tuple[Tensor, Tensor | None]]
-"""Encodes elements [rows, F], of which the first are s sets of w each; maxima [s, H], and the place in its set of each."""
+"""Encodes elements `[rows, F]`, the first of which are s sets of w each; gives maxima `[s, H]`, and on request the
+place of each in its set."""
 
 
 def _values(function: Callable[[Tensor], Tensor], sets: Float[Tensor, "n K F"]) -> _Pool:
@@ -169,19 +170,19 @@ def _in_blocks(
     for start, some, width in plan.blocks:
         held = some * width
         rows = next(size for size in sizes if size >= held)
-        if plan.index is None:
+        if plan.places is None:
             block = flat[start : start + rows]
             block = pad(block, (0, 0, 0, rows - len(block))) if len(block) < rows else block
         else:
-            block = flat.index_select(0, plan.index[start : start + rows])
+            block = flat.index_select(0, plan.places[start : start + rows])
         best, where = pool(block, torch.Size((some, width)))
         maxima.append(best)
         if where is not None:
             winners.append(where + torch.arange(start, start + held, width, device=sets.device)[:, None])
     found = torch.cat(maxima)
     place = torch.cat(winners) if winners else None
-    if place is not None and plan.index is not None:
-        place = plan.index[place]
+    if place is not None and plan.places is not None:
+        place = plan.places[place]
     if plan.order is None:
         return found, place
     return found.new_zeros(n, found.shape[1]).index_copy(0, plan.order, found), (
@@ -194,13 +195,13 @@ class _Plan(NamedTuple):
 
     Attributes:
         blocks: first element, number of sets, elements of each set.
-        index: places of the elements among those of all sets, block by block and enough of them for the last block's
+        places: of the elements among those of all sets, block by block and enough of them for the last block's
             rows; None for all as they lie.
         order: of the sets [m] in the blocks; None for all as they are.
     """
 
     blocks: list[tuple[int, int, int]]
-    index: Int[Tensor, " E"] | None = None
+    places: Int[Tensor, " E"] | None = None
     order: Int[Tensor, " m"] | None = None
 
 
@@ -230,13 +231,17 @@ def _plan(valid: Bool[Tensor, "n K"], rows: int) -> _Plan:
         size = min(rows // most, len(held) - k)
         blocks.append((start, size, most))
         start, k = start + size * most, k + size
-    # Of each place in the blocks the one among the valid elements; past its last one a set repeats it.
-    end = number.cumsum()[order]
-    width = np.repeat([width for _, _, width in blocks], [some for _, some, _ in blocks])
-    place = np.arange(start) + np.repeat(end - number[order] - (width.cumsum() - width), width)
-    index = np.zeros(start + rows, np.int64)
-    index[:start] = element[np.minimum(place, np.repeat(end - 1, width))]
-    return _Plan(blocks, torch.from_numpy(index), torch.from_numpy(order))
+    # Of each place in the blocks the one among the valid elements of all sets. Past its last element a set repeats
+    # that, and past its own multiple of eight the eight before: in the same places of a tile, so with the same bits.
+    end, width = number.cumsum()[order], np.repeat(*np.array(blocks).T[[2, 1]])
+    begin = width.cumsum() - width
+    own = begin + number[order] + -number[order] % ALIGNED
+    at = np.arange(start)
+    at = np.where(at < np.repeat(own, width), at, np.repeat(own - ALIGNED, width) + at % ALIGNED)
+    at += np.repeat(end - number[order] - begin, width)
+    places = np.zeros(start + rows, np.int64)
+    places[:start] = element[np.minimum(at, np.repeat(end - 1, width))]
+    return _Plan(blocks, torch.from_numpy(places), torch.from_numpy(order))
 
 
 def _through_winners(

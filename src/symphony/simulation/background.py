@@ -18,7 +18,7 @@ from symphony import keys
 from symphony.data.segment import SignalState
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import WHEELBASE, bicycle_step
-from symphony.envs.observation import Objects
+from symphony.envs.objects import Objects
 from symphony.envs.routes import SPACING, pick_routes
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap

@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from symphony import keys
-from symphony.envs.observation import ObservationConfig, objects_at, observe
+from symphony.envs.objects import objects_at
+from symphony.envs.observation import ObservationConfig, observe
 from symphony.envs.routes import POINTS, RouteTable
 from symphony.envs.scene import SceneBatch
 from symphony.geometry.frames import with_speed

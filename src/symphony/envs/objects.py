@@ -1,0 +1,212 @@
+"""What an agent observes of others: who is nearest, where, how fast, and how far apart their boxes are.
+
+Shapes: M rows (any flattened batch), N observing agents, A agents of the scene, O objects.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import pad
+
+from symphony.envs.routes import along_route
+from symphony.envs.scene import SceneBatch
+from symphony.envs.tables import AGENT_FEATURES, Tables
+from symphony.geometry.boxes import gap_between
+from symphony.geometry.constants import constant
+from symphony.geometry.frames import wrap
+from symphony.geometry.nearest import nearest, on_host
+
+OBJECT_FEATURES = 8 + AGENT_FEATURES
+
+
+class Objects(NamedTuple):
+    """All agents of a scene at one step.
+
+    Attributes:
+        state: [M, A, 5] x, y, heading, velocity x, velocity y.
+        valid: [M, A].
+        size: [M, A, 2].
+        kind: [M, A] int64, ``AgentType``.
+    """
+
+    state: Tensor
+    valid: Tensor
+    size: Tensor
+    kind: Tensor
+
+
+def objects_at(
+    scenes: SceneBatch,
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    state: Float[Tensor, "M N 4"] | None = None,
+    index: Int[Tensor, "M N"] | None = None,
+    index_valid: Bool[Tensor, "M N"] | None = None,
+) -> Objects:
+    """The agents of each row's scene at a step: log playback, with simulated ones put in their place.
+
+    Args:
+        scenes: the static part.
+        scene: rows of ``scenes``.
+        step: logged step (past the end of the log nothing is valid).
+        state: x, y, heading, speed of the simulated agents.
+        index: their rows among the scene's agents.
+        index_valid: which of them are real.
+    """
+    steps = scenes.log_state.shape[1]
+    row = scene * steps + step.clamp(max=steps - 1)
+    logged = scenes.log_state.flatten(0, 1).index_select(0, row)
+    valid = scenes.log_valid.flatten(0, 1).index_select(0, row)
+    valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
+    if state is not None and index is not None and index_valid is not None:
+        logged, valid = _put(logged, valid, state, index, index_valid)
+    size, kind = (value.index_select(0, scene) for value in (scenes.box_size, scenes.agent_type))
+    return Objects(logged, valid, size, kind)
+
+
+def _put(
+    logged: Float[Tensor, "M A 5"],
+    valid: Bool[Tensor, "M A"],
+    state: Float[Tensor, "M N 4"],
+    index: Int[Tensor, "M N"],
+    real: Bool[Tensor, "M N"],
+) -> tuple[Float[Tensor, "M A 5"], Bool[Tensor, "M A"]]:
+    """Simulated agents among the logged ones."""
+    x, y, heading, speed = state.unbind(-1)
+    simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
+    wide = index[..., None].expand(*index.shape, 5)
+    if on_host(state) and bool(real.all()):
+        return logged.scatter(1, wide, simulated), valid.scatter(1, index, True)
+    # Those not there are written to a column past the last one, which is cut off again.
+    agents = logged.shape[1]
+    column = torch.where(real, index, agents)
+    wide = column[..., None].expand_as(wide)
+    return (
+        pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents],
+        pad(valid, (0, 1)).scatter(1, column, True)[:, :agents],
+    )
+
+
+class Seen(NamedTuple):
+    """What agents see of objects; what was not asked for is None.
+
+    Attributes:
+        features: [M, N, O, 15], zero where masked.
+        mask: [M, N, O].
+        gap: [M, N, O] metres between boxes.
+        gap_ahead: [M, N, O, H] likewise at H times ahead.
+        along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
+    """
+
+    features: Tensor | None = None
+    mask: Tensor | None = None
+    gap: Tensor | None = None
+    gap_ahead: Tensor | None = None
+    along: Tensor | None = None
+
+
+def observed_objects(
+    tables: Tables,
+    scene: Int[Tensor, " M"],
+    objects: Objects,
+    index: Int[Tensor, "M N"],
+    own: Float[Tensor, "M N 5"],
+    own_size: Float[Tensor, "M N 2"],
+    routes: tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]] | None,
+) -> Seen:
+    """The nearest others, by the distance between centres.
+
+    Args:
+        tables: of the scenes and of what is seen.
+        scene: rows of the scenes.
+        objects: all agents of each row.
+        index: those that observe.
+        own: their states.
+        own_size: length and width of their boxes.
+        routes: points of their routes and how many of them exist; without, nothing is seen along routes.
+    """
+    config, agents = tables.config, objects.valid.shape[1]
+    chosen, mask = _nearest(objects, index, own, config.num_objects)
+    # Places among all agents there are now, and among those of all scenes.
+    now = chosen + torch.arange(0, objects.valid.numel(), agents, device=chosen.device)[:, None, None]
+    row = chosen + (scene * agents)[:, None, None]
+    # Whoever is not seen may hold anything, and neither its numbers nor their gradient may get through.
+    state = objects.state.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
+    state = torch.where(mask[..., None], state, 0.0)
+    features = _features(tables, state, row, mask, own)
+    follows, measures = config.along and routes is not None, config.clearance or config.gaps
+    if not follows and not measures:
+        return Seen(features, mask)
+    size = objects.size.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
+    along = None
+    if follows and routes is not None:
+        along = along_route(own, own_size, state, size, *routes) * mask[..., None]
+    if not measures:
+        return Seen(features, mask, along=along)
+    gap = _gaps(config.foresight, own, own_size, state, size)
+    gap = torch.where(mask[..., None], gap, 0.0)
+    return Seen(features, mask, gap[..., 0], gap[..., 1:] if config.foresight else None, along)
+
+
+@torch.no_grad()
+def _nearest(
+    objects: Objects, index: Int[Tensor, "M N"], own: Float[Tensor, "M N 5"], count: int
+) -> tuple[Int[Tensor, "M N O"], Bool[Tensor, "M N O"]]:
+    """Places in the scene of the nearest others, and which of them exist."""
+    x, y = (objects.state[:, None, :, k] - own[..., k, None] for k in (0, 1))
+    place = torch.arange(objects.valid.shape[1], device=index.device)
+    hidden = ~objects.valid[:, None] | (place == index[..., None])
+    return nearest((x.square() + y.square()).masked_fill(hidden, torch.inf), count)
+
+
+def _features(
+    tables: Tables,
+    state: Float[Tensor, "M N O 5"],
+    row: Int[Tensor, "M N O"],
+    mask: Bool[Tensor, "M N O"],
+    own: Float[Tensor, "M N 5"],
+) -> Float[Tensor, "M N O F"]:
+    """Features of objects in states, rows of the table of all agents."""
+    config = tables.config
+    static = tables.agents.index_select(0, row.flatten()).unflatten(0, row.shape)
+    # Component by component: operations on a last dimension of 2 are slow.
+    origin_x, origin_y, heading, own_x, own_y = own[..., None, :].unbind(-1)
+    cos, sin = (-heading).cos(), (-heading).sin()
+
+    def turned(x: Float[Tensor, "M N O"], y: Float[Tensor, "M N O"], scale: float) -> list[Tensor]:
+        return [(cos * x - sin * y) / scale, (sin * x + cos * y) / scale]
+
+    x, y, course, speed_x, speed_y = state.unbind(-1)
+    relative = wrap(course - heading)
+    dynamic = [
+        *turned(x - origin_x, y - origin_y, config.distance_scale),
+        relative.cos(),
+        relative.sin(),
+        *turned(speed_x, speed_y, config.speed_scale),
+        # Elements are encoded one by one, so each must tell how fast it is approached.
+        *turned(speed_x - own_x, speed_y - own_y, config.speed_scale),
+    ]
+    return torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(own.dtype)[..., None]
+
+
+def _gaps(
+    foresight: tuple[float, ...],
+    own: Float[Tensor, "M N 5"],
+    own_size: Float[Tensor, "M N 2"],
+    state: Float[Tensor, "M N O 5"],
+    size: Float[Tensor, "M N O 2"],
+) -> Float[Tensor, "M N O H"]:
+    """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
+    # Times come first, and components apart, so that operations run along everything else.
+    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None]
+    wide = own[..., None, :]
+    x, y = (
+        (state[..., k] + times * state[..., 3 + k]) - (wide[..., k] + times * wide[..., 3 + k])
+        for k in (0, 1)
+    )
+    gap = gap_between(x, y, wide[..., 2], own_size[..., None, :], state[..., 2], size)
+    return gap.movedim(0, -1).contiguous()
