@@ -125,6 +125,19 @@ def builtin(count: int, agents: int = 2) -> SceneBatch:
     return collate([scene(store[k], agents) for k in range(count)])
 
 
+GROUPS = (
+    ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
+    ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
+)
+
+
+def actions_of_few() -> Work:
+    """What two agents of one scene do, by an untrained policy: beside the smallest step, what a planner waits for."""
+    start = DrivingEnv(builtin(1), Bicycle(), ObservationConfig(16, 128)).start(torch.arange(1))
+    policy = discrete_policy(SELF_FEATURES, GROUPS)
+    return lambda: policy(start.copy()), 2
+
+
 def search(
     points: int = 128,
     features: Any = "foresight",
@@ -146,12 +159,8 @@ def search(
     """
     ahead = (0.5, 1.0, 2.0) if features == "foresight" else ()
     config = ObservationConfig(16, points, clearance=features != "paper", foresight=ahead)
-    groups = (
-        ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES),
-        ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES),
-    )
     torch.manual_seed(0)
-    policy = discrete_policy(SELF_FEATURES, groups)
+    policy = discrete_policy(SELF_FEATURES, GROUPS)
     realism = discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, radius=1.0, features=features)
     env = DrivingEnv(builtin(segments), Bicycle(), config)
     rows = torch.arange(segments)[:, None].expand(-1, branches)
@@ -262,6 +271,7 @@ WORKLOADS: dict[str, Callable[[], Work]] = {
     "16 objects, 200 points": lambda: rings(16, 200),
     "16 objects, 1000 points": lambda: rings(16, 1000),
     "smallest step": lambda: step_of(builtin(1), ObservationConfig(16, 128), torch.arange(1)),
+    "actions of two": actions_of_few,
     "search 16 x 16 x 50": search,
     "bc update": lambda: update("bc"),
     "bc update, paper size": lambda: update("bc", states=1600, points=1000),
