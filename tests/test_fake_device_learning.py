@@ -1,18 +1,25 @@
-"""Search, simulation and every loss on a device that isn't the CPU: nothing mixes devices or waits for it."""
+"""Search, simulation and every loss on a device that isn't the CPU: nothing mixes devices or waits for it, and all
+tensors are what signatures say."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from jaxtyping import Bool, Float, Int, jaxtyped
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
+from torch import Tensor
 
 from helpers_device import NAME, PretendDevice, on, pretend
 from helpers_segments import crossing, straight_road
+from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
@@ -131,3 +138,40 @@ def test_every_loss_is_among_them() -> None:
         known = {type(loss) for loss in losses(agent, env).values()}
     there = [getattr(objectives, name) for name in objectives.__all__ if name.endswith("Loss")]
     assert known == set(there)
+
+
+def test_what_is_taken_and_returned_is_what_signatures_say() -> None:
+    """All that runs for a step and a loss, with shapes and kinds of numbers checked."""
+    # In a process of its own, as the package must be instrumented when it is first imported; on a device without
+    # numbers, where nothing is computed.
+    hook = "--jaxtyping-packages=symphony,helpers_shapes.tensors_only"
+    given = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", hook]
+    here = Path(__file__)
+    done = subprocess.run(
+        [*given, here.name, "-k", "losses_and"], cwd=here.parent, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-4000:]
+    assert "6 passed" in done.stdout
+
+
+@jaxtyped(typechecker=tensors_only)
+def counted(
+    scores: Float[Tensor, "*b N"], valid: Bool[Tensor, "*b N"] | None, *more: Float[Tensor, "*b"]
+) -> tuple[Int[Tensor, "*b"], dict[str, Float[Tensor, "*b"]]]:
+    """Whatever the last argument is, comes back."""
+    number = torch.zeros(scores.shape[:-1], dtype=torch.int64)
+    return number, {"more": more[-1] if more else scores.mean(-1)}
+
+
+def test_the_check_finds_what_is_wrong() -> None:
+    scores, flags = torch.zeros(2, 3), torch.ones(2, 3, dtype=torch.bool)
+    counted(scores, flags, scores[:, 0])
+    counted(scores, None)
+    for arguments in (
+        [scores.long(), None],
+        [scores, flags[:, :2]],
+        [scores, flags.float()],
+        [scores, None, scores],
+    ):
+        with pytest.raises(TypeError):
+            counted(*arguments)

@@ -199,7 +199,7 @@ def _features_in_place(
         row = place // (count * origin.shape[1])
         state = _light_now(tables, scene, step)[row, light[place].long()]
         out.view(-1, POINT_FEATURES)[place, LIGHT_COLUMN + state] = 1.0
-    if not bool(mask.all()):
+    if not mask.numpy().all():
         out.view(-1, POINT_FEATURES)[(~mask).flatten()] = 0.0
     return seen
 

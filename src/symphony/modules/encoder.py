@@ -12,6 +12,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from symphony.geometry.nearest import on_host
 from symphony.keys import OWN, VALID
 from symphony.modules.pooling import PoolMode, pool_elements
 from symphony.modules.rows import in_blocks, mlp
@@ -84,10 +85,12 @@ class SceneEncoder(nn.Module):
             raise ValueError(
                 f"expected elements and mask of {len(self.groups)} groups, got {len(elements_and_masks)} tensors"
             )
-        parts = [in_blocks(self.own, torch.where(valid[..., None], own, 0.0))]
+        everyone = on_host(valid) and bool(valid.all())
+        parts = [in_blocks(self.own, own if everyone else torch.where(valid[..., None], own, 0.0))]
         pairs = zip(elements_and_masks[::2], elements_and_masks[1::2], strict=True)
         for encoder, (elements, mask) in zip(self.groups, pairs, strict=True):
-            parts.append(pool_elements(encoder, elements, mask & valid[..., None], mode=self.pool))
+            seen = mask if everyone else mask & valid[..., None]
+            parts.append(pool_elements(encoder, elements, seen, mode=self.pool))
         # ReLU is monotone: after the maximum it is the same as before it, and far cheaper.
         return torch.relu(torch.cat(parts, -1))
 
