@@ -31,7 +31,13 @@ GIVEN_TO_WORKERS = (
     "helpers_killed",
     "helpers_workers",
     "test_collectors_processes",
+    "test_convert_resume",
+    "test_engine",
+    "test_generate",
+    "test_limits",
     "test_workers",
+    "test_wosac_evaluation",
+    "test_wosac_files",
 )
 """Modules of tests that other processes need; they import all others that are needed."""
 _get_ready = engine.get_ready
