@@ -96,24 +96,28 @@ def checked_out(commit: str) -> Iterator[Path]:
             subprocess.run([*git, "remove", "--force", str(old)], check=True, capture_output=True)  # noqa: S603
 
 
-HEADER = """| workload | agent-steps/s before | after | ratio | memory kept | ratio | page faults | peak MiB |
-| --- | --- | --- | --- | --- | --- | --- | --- |"""
+HEADER = """| workload, a second | before | after | ratio | memory kept: before | after | ratio | page faults | peak MiB |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- |"""
+WAYS = {"before": (), "after": (), "before kept": ("--keep-memory",), "after kept": ("--keep-memory",)}
 
 
 def report(old: Path, names: list[str], rounds: int) -> None:
     """Measure and print."""
+    from measure import HOW, Row  # noqa: PLC0415
+
     print(HEADER, flush=True)
     for name in names:
-        once = name.startswith("search")
-        warm = "1" if once else "40"
-        workers = {"after": Worker(ROOT, name, "--warm", warm)}
-        if name not in YARDSTICKS:
-            workers["kept"] = Worker(ROOT, name, "--keep-memory", "--warm", warm)
-            workers["before"] = Worker(old, name, "--warm", "1" if once else "3")
-        found = {which: [] for which in workers}
+        # The same for both: what is made once and kept, such as scenes, would else be paid by one of them.
+        warm = str(HOW[name].get("warm", Row.warm))
+        workers = {
+            way: Worker(ROOT if way.startswith("after") else old, name, "--warm", warm, *options)
+            for way, options in WAYS.items()
+            if name not in YARDSTICKS or way == "after"
+        }
+        found = {way: [] for way in workers}
         for _ in range(rounds):
-            for which, worker in workers.items():
-                found[which].append(worker.measure())
+            for way, worker in workers.items():
+                found[way].append(worker.measure())
         for worker in workers.values():
             worker.close()
         print(row(name, found), flush=True)
@@ -122,18 +126,21 @@ def report(old: Path, names: list[str], rounds: int) -> None:
 def row(name: str, found: dict[str, list[dict[str, float]]]) -> str:
     """A line of the table."""
 
-    def middle(which: str, what: str) -> float:
-        return statistics.median(one[what] for one in found[which])
+    def middle(way: str, what: str) -> float:
+        return statistics.median(one[what] for one in found[way])
 
-    speed = {which: found[which][0]["steps"] / middle(which, "seconds") for which in found}
+    speed = {way: found[way][0]["steps"] / middle(way, "seconds") for way in found}
     faults, peak = (
-        " → ".join(f"{middle(which, what):,.0f}" for which in ("before", "after", "kept") if which in found)
+        " → ".join(f"{middle(way, what):,.0f}" for way in WAYS if way in found)
         for what in ("faults", "mebibytes")
     )
     if name in YARDSTICKS:
-        return f"| {name} | | {speed['after']:,.0f} | | | | {faults} | {peak} |"
-    ratios = [f"{speed[which]:,.0f} | {speed[which] / speed['before']:.2f}" for which in ("after", "kept")]
-    return f"| {name} | {speed['before']:,.0f} | {' | '.join(ratios)} | {faults} | {peak} |"
+        return f"| {name} | | {speed['after']:,.0f} | | | | | {faults} | {peak} |"
+    pairs = [
+        f"{speed[before]:,.4g} | {speed[after]:,.4g} | {speed[after] / speed[before]:.2f}"
+        for before, after in (("before", "after"), ("before kept", "after kept"))
+    ]
+    return f"| {name} | {' | '.join(pairs)} | {faults} | {peak} |"
 
 
 if __name__ == "__main__":
