@@ -96,7 +96,7 @@ def checked_out(commit: str) -> Iterator[Path]:
             subprocess.run([*git, "remove", "--force", str(old)], check=True, capture_output=True)  # noqa: S603
 
 
-HEADER = """| workload, a second | before | after | ratio | memory kept: before | after | ratio | page faults | peak MiB |
+HEADER = """| a second of | before | after | ratio | memory kept: before | after | ratio | faults | peak MiB |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""
 WAYS = {"before": (), "after": (), "before kept": ("--keep-memory",), "after kept": ("--keep-memory",)}
 
