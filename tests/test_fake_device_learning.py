@@ -145,7 +145,8 @@ def test_what_is_taken_and_returned_is_what_signatures_say() -> None:
     # In a process of its own, as the package must be instrumented when it is first imported; on a device without
     # numbers, where nothing is computed.
     hook = "--jaxtyping-packages=symphony,helpers_shapes.tensors_only"
-    given = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", hook]
+    # Without what tests share, which imports it.
+    given = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--noconftest", hook]
     here = Path(__file__)
     done = subprocess.run(
         [*given, here.name, "-k", "losses_and"], cwd=here.parent, capture_output=True, text=True, check=False
