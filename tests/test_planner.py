@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from helpers_segments import crossing, hide, straight_road
@@ -330,6 +330,7 @@ def loaded() -> Agent:
     return load_agent(AGENT)
 
 
+@example(runs=53, segments=2, search="tree", trees=1)  # 53 of one segment would take four trees of 14
 @settings(max_examples=200, deadline=None)
 @given(
     runs=st.integers(1, 300),
@@ -368,8 +369,8 @@ def test_a_hundred_runs_are_a_hundred(store: Path, tmp_path: Path) -> None:
     words[-1] = str(tmp_path / "searched")
     assert main(["simulate", AGENT, "--runs", "20", "--branches", "4", *words]) == 0
     found = load_rollouts(tmp_path / "searched")
-    # 10 of each would be 20; three trees of four branches give 12.
-    assert [entry.rollouts for entry in (*found.entries, *found.failures)] == [12, 12]
+    # 10 of each would be 20, but three trees of four branches give 12: then rather few of many segments.
+    assert [entry.rollouts for entry in (*found.entries, *found.failures)] == [8, 8, 8]
 
 
 def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> None:

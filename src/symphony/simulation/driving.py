@@ -287,8 +287,8 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     """How many of the run segments give a number of runs together, and the configuration with as few rollouts of
     each as that takes: what is independent of each other are segments.
 
-    It is exactly that number where some number of rollouts divides it, else a few more. More rollouts than a tree has
-    branches come from several trees; with a tilt every branch stays a rollout.
+    It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
+    rollouts than a tree has branches come from as few trees as that takes; with a tilt every branch stays a rollout.
     """
     kind, least = search_kind(agent, config), -(-runs // segments)
     branches = config.branches or agent.search.test_branches
@@ -297,9 +297,14 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
         return -(-runs // each), dataclasses.replace(
             config, rollouts=each, trees=config.trees * each // config.rollouts
         )
-    dividing = next((each for each in range(least, runs + 1) if runs % each == 0 and each < 2 * least), least)
-    trees = max(config.trees, -(-dividing // branches)) if kind in ("tree", "oracle") else 1
-    each = -(-dividing // trees) * trees
+
+    def whole(each: int) -> tuple[int, int]:
+        """At least so many rollouts, as many of each tree, and how many trees that takes."""
+        trees = max(config.trees, -(-each // branches)) if kind in ("tree", "oracle") else 1
+        return -(-each // trees) * trees, trees
+
+    exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
+    each, trees = whole(next((each for each in exact if whole(each)[0] == each), least))
     return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
 
 
