@@ -138,11 +138,11 @@ def _by_channel(linears: Sequence[nn.Linear]) -> _Pool:
             # Written to the same memory for each block, which stays in the cache.
             memory[:] = [weight.new_empty(len(block), len(inner)) for inner, _ in before]
             memory.append(weight.new_empty(len(weight), len(block)))
+        *between, last = memory
         hidden = block
-        for (inner, shift), out in zip(before, memory, strict=False):
+        for (inner, shift), out in zip(before, between, strict=True):
             hidden = torch.addmm(shift[:, 0], hidden, inner.t(), out=out).relu_()
-        out = torch.addmm(bias, weight, hidden.t(), out=memory[-1])
-        encoded = out[:, : shape.numel()].unflatten(1, shape)
+        encoded = torch.addmm(bias, weight, hidden.t(), out=last)[:, : shape.numel()].unflatten(1, shape)
         where = torch.from_numpy(encoded.numpy().argmax(-1))
         return encoded.gather(2, where[..., None]).squeeze(2).t(), where.t()
 
@@ -182,12 +182,13 @@ def _in_blocks(
     place = torch.cat(winners) if winners else None
     if place is not None and plan.places is not None:
         place = plan.places[place]
-    if plan.order is None:
-        full = on_host(valid) and bool(valid.numpy().any())
-        return found if full else torch.where(valid.any(1, keepdim=True), found, 0.0), place
-    return found.new_zeros(n, found.shape[1]).index_copy(0, plan.order, found), (
-        None if place is None else place.new_zeros(n, place.shape[1]).index_copy(0, plan.order, place)
-    )
+    if plan.order is not None:
+        found = found.new_zeros(n, found.shape[1]).index_copy(0, plan.order, found)
+        if place is not None:
+            place = place.new_zeros(n, place.shape[1]).index_copy(0, plan.order, place)
+    elif not (on_host(valid) and valid.numpy().any()):  # on the CPU all sets are full then, or all are empty
+        found = torch.where(valid.any(1, keepdim=True), found, 0.0)
+    return found, place
 
 
 class _Plan(NamedTuple):
