@@ -174,6 +174,16 @@ def test_fewer_rows_are_multiplied_only_where_that_changes_nothing(monkeypatch) 
         assert rows.equal_rows(network, x, 2048) == (64, 1000, 2048)
 
 
+@pytest.mark.parametrize("widths", [(5, 64), (5, 64, 64)])
+def test_blocks_of_another_size_have_memory_of_their_own(widths) -> None:
+    """As many rows as channels come last."""
+    network, elements = mlp(widths), torch.randn(33, 64, 5)
+    mask = torch.ones(33, 64, dtype=torch.bool)
+    winner, dense = (results(network, elements, mask, mode) for mode in ("winner", "dense"))
+    for a, b in zip(winner, dense, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
 def test_only_valid_elements_are_encoded(monkeypatch) -> None:
     """Of a set with few of them few rows are, with a gradient and without."""
     network, elements, _ = make(n=100, count=16, dtype=torch.float32)

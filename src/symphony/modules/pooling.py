@@ -134,7 +134,7 @@ def _by_channel(linears: Sequence[nn.Linear]) -> _Pool:
     memory: list[Tensor] = []
 
     def pool(block: Float[Tensor, "rows F"], shape: torch.Size) -> tuple[Tensor, Tensor]:
-        if not memory or len(memory[0]) != len(block):
+        if not memory or memory[-1].shape[1] != len(block):
             # Written to the same memory for each block, which stays in the cache.
             memory[:] = [weight.new_empty(len(block), len(inner)) for inner, _ in before]
             memory.append(weight.new_empty(len(weight), len(block)))
