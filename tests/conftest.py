@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,16 @@ def pytest_collection_finish() -> None:
     """Nothing that was imported or collected is garbage: not to look at it again and again saves a twentieth."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def _started_quickly() -> Iterator[None]:
+    """TorchRL starts processes as the global setting says, each with imports of its own if there is none."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method(engine._START, force=True)
+    engine.get_ready([])
+    yield
+    multiprocessing.set_start_method(before, force=True)
 
 
 @pytest.fixture(scope="session")

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -
     """Start a function of a module with these arguments, which are pickled.
 
     On Linux its process is forked from one that has imported what this one has, and has no threads: it may fork, too.
+    So are workers that it starts, where a program would start a server of its own for them.
 
     Args:
         function: whose result is the exit status, ``None`` for 0.
@@ -35,6 +38,9 @@ def _run(function: Callable[..., Any], given: tuple[Any, ...], said: Path | None
         for stream, name in enumerate((str(said), f"{said}.err"), 1):
             os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), stream)
     status = 1
+    if engine._START == "forkserver":
+        forkserver._forkserver.ensure_running = forkserver.ensure_running = resource_tracker.ensure_running
+    engine._mask(signal.SIG_UNBLOCK)  # the server was started while interrupts were put off
     try:
         status = int(function(*given) or 0)
     except BaseException:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import sys
 from pathlib import Path
 
@@ -27,21 +26,10 @@ from helpers_collectors import (
     noise,
 )
 from symphony.collectors import BeamSearchCollector, KeyScore, Systematic, with_rows
-from symphony.data import engine
 
 ROWS, STEPS, WORKERS = 3, 8, 2
 FRAMES = ROWS * STEPS
 EXTRAS = {("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")}
-
-
-@pytest.fixture
-def _started_quickly():
-    """TorchRL starts processes as the global setting says, anew if there is none, which is what the example does."""
-    before = multiprocessing.get_start_method(allow_none=True)
-    multiprocessing.set_start_method(engine._START, force=True)
-    engine.get_ready([__name__])
-    yield
-    multiprocessing.set_start_method(before, force=True)
 
 
 def make_env():

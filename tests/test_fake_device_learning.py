@@ -13,44 +13,20 @@ from typing import Any
 import pytest
 import torch
 from jaxtyping import Bool, Float, Int, jaxtyped
-from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from helpers_device import NAME, PretendDevice, on, pretend
-from helpers_segments import crossing, straight_road
+from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
 from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
-from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
-from symphony.envs import DrivingEnv, collate, scene
+from symphony.envs import DrivingEnv
 from symphony.modules import SeededNoise
-from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
-from symphony.roadgraph import LaneGraph
 from symphony.simulation.rollouts import simulate, start_states
-from symphony.simulation.search import mean_then_sum, search
 
-LOGGED = 3  # a search of them prunes once
-SCENES = collate(
-    [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=LOGGED), crossing(6, steps=LOGGED))]
-)
-ROWS = 4
 FEW = 7  # constants that are made once, in however many steps
-
-
-def spec(space: Any) -> AgentSpec:
-    cells = 3 if space == "histogram" else 0
-    return AgentSpec(
-        action_space="displacement" if cells else space,
-        dt=0.2,
-        goals=True,
-        agent=AgentConfig(
-            num_objects=3, num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8, head=8
-        ),
-        discriminator=DiscriminatorConfig(features="foresight", hidden=8, head=8),
-        searches=True,
-    )
 
 
 @contextmanager
@@ -77,45 +53,17 @@ def test_simulations_stay_on_the_device(space: Any) -> None:
 
 @pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6), KeepAll(), ReplaceBad(0.0)], ids=repr)
 def test_searches_stay_on_the_device(rule: PruningRule) -> None:
-    with world() as (device, agent, env), torch.no_grad():
-        start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
-        how: Any = {"rule": rule, "prune_every": 1, "leaves": 3, "aggregate": mean_then_sum}
-        found = search(env, agent.policy, agent.discriminator, start, seed=0, **how)
+    with world() as (device, agent, env):
+        found = searched(agent, env, rule)
         assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
         assert found.totals.device.type == NAME
         assert device.waits == []
         assert device.constants < FEW
 
 
-def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
-    return {
-        "bc": BCLoss(agent.policy),
-        "distillation": DistillationLoss(agent.policy, survivors="best"),
-        "goal": GoalLoss(agent.goals),
-        "discriminator": DiscriminatorLoss(agent.discriminator, gradient_penalty=1.0),
-        "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=2),
-    }
-
-
-def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
-    """States with everything that any loss reads."""
-    batch = env.choices(env.with_goals(state))
-    valid = batch.get(keys.VALID)
-    action = torch.zeros_like(valid, dtype=torch.int64)
-    batch.set(
-        keys.ACTION, action if env.dynamics.discrete else action[..., None].expand(*valid.shape, 2) + 0.5
-    )
-    batch.set(keys.ROLLOUT, torch.zeros_like(valid))
-    batch.set(keys.SIMULATED, torch.zeros_like(valid))
-    batch.set(keys.RANK, torch.zeros_like(action))
-    batch.set(keys.GOAL_SET, batch.get(keys.ROUTES_MASK))
-    return batch
-
-
 @pytest.mark.parametrize(
     ("name", "space"),
-    [(name, "bicycle") for name in ("bc", "distillation", "goal", "discriminator")]
-    + [("mgail", "displacement"), ("mgail", "histogram")],
+    CASES,
 )
 def test_losses_and_their_gradients_stay_on_the_device(name: str, space: str) -> None:
     with world(space) as (device, agent, env):
@@ -142,17 +90,11 @@ def test_every_loss_is_among_them() -> None:
 
 def test_what_is_taken_and_returned_is_what_signatures_say() -> None:
     """All that runs for a step and a loss, with shapes and kinds of numbers checked."""
-    # In a process of its own, as the package must be instrumented when it is first imported; on a device without
-    # numbers, where nothing is computed.
-    hook = "--jaxtyping-packages=symphony,helpers_shapes.tensors_only"
-    # Without what tests share, which imports it.
-    given = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--noconftest", hook]
-    here = Path(__file__)
-    done = subprocess.run(
-        [*given, here.name, "-k", "losses_and"], cwd=here.parent, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout[-4000:]
-    assert "6 passed" in done.stdout
+    # In a process of its own, as the package must be instrumented when it is first imported.
+    command = [sys.executable, "-m", "helpers_losses"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert [tuple(line.split()) for line in done.stdout.splitlines()] == CASES
 
 
 @jaxtyped(typechecker=tensors_only)

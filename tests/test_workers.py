@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -17,8 +16,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_processes import apart
 from helpers_segments import crossing, straight_road
 from symphony import keys
+from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -232,36 +233,35 @@ def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
         EvaluateConfig(**bad)
 
 
+def of_command(started: Path, arguments: list[str]) -> int:
+    """Run a command whose workers leave a file each in a folder."""
+    os.environ["STARTED"] = str(started)
+    return main(arguments)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_workers_end_with_the_command(store: SegmentStore, tmp_path: Path, how: int, status: int) -> None:
     (tmp_path / "started").mkdir()
-    command = [sys.executable, "-m", "symphony.cli", "evaluate", "playback", "--data", str(store.path)]
-    options = ["--workers", "2", "--metric", "helpers_workers:waits", "--batch", "1"]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        "STARTED": str(tmp_path / "started"),
-    }
-    with subprocess.Popen(
-        [*command, *options], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
-        until = time.monotonic() + 400  # generously long, for a busy machine
-        while len(list((tmp_path / "started").iterdir())) < 2 and time.monotonic() < until:
-            assert process.poll() is None
-            time.sleep(0.1)
-        process.send_signal(how)
-        try:
-            _, errors = process.communicate(timeout=120)
-        except subprocess.TimeoutExpired:
-            process.kill()  # or leaving the block would wait for it
-            raise
+    command = ["evaluate", "playback", "--data", str(store.path), "--workers", "2", "--batch", "1"]
+    arguments = [*command, "--metric", "helpers_workers:waits"]
+    process = apart(of_command, tmp_path / "started", arguments, said=tmp_path / "said")
+    until = time.monotonic() + 400  # generously long, for a busy machine
+    while len(list((tmp_path / "started").iterdir())) < 2 and time.monotonic() < until:
+        assert process.is_alive()
+        time.sleep(0.1)
+    assert process.pid is not None
+    os.kill(process.pid, how)
+    process.join(90)  # before its workers end by themselves
+    process.kill()  # where it goes on
+    process.join()
     workers = [int(path.name) for path in (tmp_path / "started").iterdir()]
     assert len(workers) == 2
     assert process.pid not in workers
     assert gone(workers)
-    assert process.returncode == status
+    assert process.exitcode == status
+    errors = (tmp_path / "said.err").read_text()
     assert errors.strip().splitlines()[-1] == "symphony: error: " + (
         "interrupted" if how == signal.SIGINT else "terminated"
     )

@@ -1,0 +1,105 @@
+"""Every loss with all that it needs, tiny: for what is true of all of them.
+
+As a program it takes all of them once, after a search, with every tensor checked that a signature speaks of.
+"""
+
+from __future__ import annotations
+
+import jaxtyping
+
+if __name__ == "__main__":  # before the package is first imported
+    jaxtyping.install_import_hook(["symphony"], "helpers_shapes.tensors_only")
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from helpers_segments import crossing, straight_road
+from symphony import keys
+from symphony.agents import build_agent
+from symphony.collectors import Systematic
+from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
+from symphony.envs import DrivingEnv, collate, scene
+from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.rollouts import start_states
+from symphony.simulation.search import mean_then_sum, search
+
+LOGGED = 3  # a search of them prunes once
+SCENES = collate(
+    [scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(steps=LOGGED), crossing(6, steps=LOGGED))]
+)
+ROWS = 4
+CASES = [
+    *[(name, "bicycle") for name in ("bc", "distillation", "goal", "discriminator")],
+    *[("mgail", space) for space in ("displacement", "histogram")],
+]
+"""Names of losses, and the action spaces they are for."""
+
+
+def spec(space: Any) -> AgentSpec:
+    cells = 3 if space == "histogram" else 0
+    return AgentSpec(
+        action_space="displacement" if cells else space,
+        dt=0.2,
+        goals=True,
+        agent=AgentConfig(
+            num_objects=3, num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8, head=8
+        ),
+        discriminator=DiscriminatorConfig(features="foresight", hidden=8, head=8),
+        searches=True,
+    )
+
+
+def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
+    return {
+        "bc": BCLoss(agent.policy),
+        "distillation": DistillationLoss(agent.policy, survivors="best"),
+        "goal": GoalLoss(agent.goals),
+        "discriminator": DiscriminatorLoss(agent.discriminator, gradient_penalty=1.0),
+        "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=2),
+    }
+
+
+def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
+    """States with everything that any loss reads."""
+    batch = env.choices(env.with_goals(state))
+    valid = batch.get(keys.VALID)
+    action = torch.zeros_like(valid, dtype=torch.int64)
+    batch.set(
+        keys.ACTION, action if env.dynamics.discrete else action[..., None].expand(*valid.shape, 2) + 0.5
+    )
+    batch.set(keys.ROLLOUT, torch.zeros_like(valid))
+    batch.set(keys.SIMULATED, torch.zeros_like(valid))
+    batch.set(keys.RANK, torch.zeros_like(action))
+    batch.set(keys.GOAL_SET, batch.get(keys.ROUTES_MASK))
+    return batch
+
+
+def searched(agent: Any, env: DrivingEnv, rule: Any) -> Any:
+    """A search of both scenes."""
+    start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
+    how: Any = {"rule": rule, "prune_every": 1, "leaves": 3, "aggregate": mean_then_sum}
+    with torch.no_grad():
+        return search(env, agent.policy, agent.discriminator, start, seed=0, **how)
+
+
+def main() -> None:
+    """Tell of each loss that is a number and has a gradient."""
+    for name, space in CASES:
+        agent = build_agent("agent", spec(space))
+        env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+        searched(agent, env, Systematic(0.6))
+        row = torch.arange(ROWS) % 2
+        batch = batch_of(env, env.start(row, row))
+        out = losses(agent, env)[name](batch.exclude(keys.ACTION) if name == "mgail" else batch)
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        assert isinstance(total, torch.Tensor)
+        total.backward()
+        if total.isfinite():
+            print(name, space)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()
