@@ -36,6 +36,7 @@ GIVEN_TO_WORKERS = (
     "test_engine",
     "test_generate",
     "test_limits",
+    "test_overlaps",
     "test_workers",
     "test_wosac_evaluation",
     "test_wosac_files",

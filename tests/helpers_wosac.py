@@ -80,11 +80,12 @@ def record_rollouts(scenario: pb.Scenario, count: int = 32, seed: int = 0) -> Ro
     return RolloutArrays(ids, *np.moveaxis(states.astype(np.float32), -1, 0))
 
 
-def box(center: Reals, heading: float, length: float, width: float) -> Reals:
-    """Corners [4, 2]."""
+def box(center: Reals, heading: Reals | float, length: float, width: float) -> Reals:
+    """Corners [*b, 4, 2] of centres [*b, 2]."""
     corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * [length / 2, width / 2]
     cos, sin = np.cos(heading), np.sin(heading)
-    return center + corners @ np.array([[cos, sin], [-sin, cos]])
+    turn = np.moveaxis(np.array([[cos, sin], [-sin, cos]]), (0, 1), (-2, -1))
+    return np.asarray(center)[..., None, :] + corners @ turn
 
 
 def rounded_gap(a: tuple[Any, ...], b: tuple[Any, ...]) -> float:

@@ -109,34 +109,34 @@ def oracle_features(
 
 def nearest(name: int, me: Track, others: list[tuple[int, Track]]) -> Reals:
     found = np.full(91, 1e10)
-    for step in np.flatnonzero(me.valid):
-        for other, it in others:
-            if other != name and it.valid[step]:
-                found[step] = min(found[step], gap(me, it, step))
+    for other, it in others:
+        both = me.valid & it.valid
+        if other != name and both.any():
+            found[both] = np.minimum(found[both], gap(me, it, both))
     return found
 
 
-def gap(a: Track, b: Track, step: int) -> float:
-    """Signed distance of rounded boxes: by separating axes where cores overlap, else by their corners and sides."""
+def gap(a: Track, b: Track, steps: Bools) -> Reals:
+    """Signed distances [N] of rounded boxes at N of the steps: by separating axes where cores overlap, else by their
+    corners and sides."""
     radii = [0.7 * min(t.length, t.width) / 2 for t in (a, b)]
     p, q = (
-        box(np.array([t.x[step], t.y[step]]), t.heading[step], t.length - 2 * r, t.width - 2 * r)
+        box(np.stack([t.x, t.y], -1)[steps], t.heading[steps], t.length - 2 * r, t.width - 2 * r)
         for t, r in zip((a, b), radii, strict=True)
     )
-    sides = np.concatenate([np.roll(p, -1, 0) - p, np.roll(q, -1, 0) - q])
-    axes = np.stack([-sides[:, 1], sides[:, 0]], -1) / np.linalg.norm(sides, axis=1)[:, None]
-    one, two = p @ axes.T, q @ axes.T
-    apart = np.maximum(one.min(0) - two.max(0), two.min(0) - one.max(0)).max()
-    if apart > 0:
-        apart = min(to_sides(p, q), to_sides(q, p))
-    return float(apart - sum(radii))
+    sides = np.concatenate([np.roll(p, -1, -2) - p, np.roll(q, -1, -2) - q], -2)
+    axes = np.stack([-sides[..., 1], sides[..., 0]], -1) / np.linalg.norm(sides, axis=-1)[..., None]
+    one, two = p @ axes.swapaxes(-1, -2), q @ axes.swapaxes(-1, -2)
+    apart = np.maximum(one.min(-2) - two.max(-2), two.min(-2) - one.max(-2)).max(-1)
+    return np.where(apart > 0, np.minimum(to_sides(p, q), to_sides(q, p)), apart) - sum(radii)
 
 
-def to_sides(points: Reals, corners: Reals) -> float:
-    starts, sides = corners, np.roll(corners, -1, 0) - corners
-    away = points[:, None] - starts
+def to_sides(points: Reals, corners: Reals) -> Reals:
+    """Distances [N] between the nearest of points [N, 4, 2] and sides of boxes with corners [N, 4, 2]."""
+    starts, sides = corners[:, None], (np.roll(corners, -1, -2) - corners)[:, None]
+    away = points[:, :, None] - starts
     share = np.clip((away * sides).sum(-1) / (sides**2).sum(-1), 0, 1)
-    return float(np.linalg.norm(away - share[..., None] * sides, axis=-1).min())
+    return np.asarray(np.linalg.norm(away - share[..., None] * sides, axis=-1).min((-2, -1)))
 
 
 def collision_time(name: int, me: Track, others: list[tuple[int, Track]]) -> Reals:
@@ -170,13 +170,11 @@ def road_edge(record: pb.Scenario, me: Track) -> Reals:
     found = np.full(91, -1e10)
     # The first steps are dropped anyway.
     steps = np.flatnonzero(me.valid & (np.arange(91) > 10))
-    points = [
-        np.append(corner, me.z[step] - me.height / 2)
-        for step in steps
-        for corner in box(np.array([me.x[step], me.y[step]]), me.heading[step], me.length, me.width)
-    ]
-    if points:
-        found[steps] = edge_distances(np.array(points), lines).reshape(-1, 4).max(1)
+    corners = box(np.stack([me.x, me.y], -1)[steps], me.heading[steps], me.length, me.width)
+    bottom = np.broadcast_to((me.z[steps] - me.height / 2)[:, None, None], (*corners.shape[:2], 1))
+    if len(steps):
+        points = np.concatenate([corners, bottom], -1).reshape(-1, 3)
+        found[steps] = edge_distances(points, lines).reshape(-1, 4).max(1)
     return found
 
 
@@ -289,17 +287,14 @@ def oracle_scores(
             (np.float32(high) - np.float32(low)) / bins
         )
 
-        def bin_of(value: float, edges: Reals = edges, bins: int = bins) -> int:
-            inside = np.searchsorted(edges[1:-1], np.float32(value), side="right")
-            return bins - 1 if np.isnan(value) else int(inside)
+        def bins_of(values: Reals, edges: Any = edges, bins: int = bins) -> NDArray[np.int64]:
+            inside = np.searchsorted(edges[1:-1], values.astype(np.float32), side="right")
+            return np.where(np.isnan(values), bins - 1, inside)
 
         terms = []
         for k in range(len(scored)):
-            counts = np.full(bins, 0.1)
-            for value in simulated[name][:, k].flat:
-                counts[bin_of(value)] += 1
-            shares = counts / counts.sum()
-            terms += [np.log(shares[bin_of(v)]) for v in log[name][k][masks[name][k]]]
+            counts = 0.1 + np.bincount(bins_of(simulated[name][:, k].ravel()), minlength=bins)
+            terms += [*np.log((counts / counts.sum())[bins_of(log[name][k][masks[name][k]])])]
         found[name] = float(np.exp(np.mean(terms)))
     for name, flag in FLAGS.items():
         there = valid & (vehicle[:, None] | (name != "traffic_light_violation"))

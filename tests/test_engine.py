@@ -45,11 +45,6 @@ def die_at_three(number: int) -> int:
     return number
 
 
-def sleep_or_return(seconds: float) -> int:
-    time.sleep(seconds)
-    return os.getpid()
-
-
 def alive(pid: int) -> bool:
     try:
         return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
@@ -199,7 +194,7 @@ SCRIPT = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from symphony.data.engine import WorkerError, ordered_map
-from test_engine import sleep_or_return
+from helpers_tasks import sleep_or_return
 if __name__ == "__main__":
     for pid in ordered_map(sleep_or_return, [0.0, 0.0, 30.0, 30.0, 30.0, 30.0], workers=2):
         print(pid, flush=True)
