@@ -17,10 +17,7 @@ from symphony.evaluation import evaluate
 from symphony.recipes import train
 from symphony.training.logging import read_metrics
 
-CUDA = pytest.param(
-    "cuda",
-    marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")],
-)
+ON_CUDA = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 # Sampled actions, and with them all that follows, may differ once rounding tips one; the first losses do not.
 FIRST = ("loss_policy", "loss_goals", "loss_discriminator")
 
@@ -36,7 +33,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("method", "device"), [("mgail_ts_h", "cpu"), *((method, CUDA) for method in get_args(Method))]
+    ("method", "device"),
+    [("mgail_ts_h", "cpu"), *(pytest.param(method, "cuda", marks=ON_CUDA) for method in get_args(Method))],
 )
 def test_a_method_trains_and_is_evaluated_on_the_device_it_is_given(
     method: Any, device: str, store: Path, tmp_path: Path
