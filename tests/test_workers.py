@@ -16,7 +16,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers_processes import apart
+from helpers_processes import apart, share_the_server
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.cli import main
@@ -236,6 +236,7 @@ def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
 def of_command(started: Path, arguments: list[str]) -> int:
     """Run a command whose workers leave a file each in a folder."""
     os.environ["STARTED"] = str(started)
+    share_the_server()
     return main(arguments)
 
 
