@@ -6,12 +6,13 @@ import gc
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from helpers_processes import serve_from_here
 from symphony.data import engine
 
 # A busy machine must not fail a test.
@@ -27,38 +28,11 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-GIVEN_TO_WORKERS = (
-    "helpers_distributed",
-    "helpers_killed",
-    "helpers_workers",
-    "test_collectors_processes",
-    "test_convert_resume",
-    "test_engine",
-    "test_generate",
-    "test_limits",
-    "test_overlaps",
-    "test_workers",
-    "test_wosac_evaluation",
-    "test_wosac_files",
-)
-"""Modules of tests that other processes need; they import all others that are needed."""
-_get_ready = engine.get_ready
-
-
-def _get_ready_for_tests(imports: Sequence[str]) -> None:
-    """Have them imported before workers are forked: each worker by itself needs seconds for it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
-        _get_ready([*GIVEN_TO_WORKERS, *imports])
-
-
-engine.get_ready = _get_ready_for_tests
-
-
 def pytest_collection_finish() -> None:
     """Nothing that was imported or collected is garbage: not to look at it again and again saves a twentieth."""
     gc.collect()
     gc.freeze()
+    serve_from_here()
 
 
 @pytest.fixture
@@ -66,7 +40,6 @@ def _started_quickly() -> Iterator[None]:
     """TorchRL starts processes as the global setting says, each with imports of its own if there is none."""
     before = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method(engine._START, force=True)
-    engine.get_ready([])
     yield
     multiprocessing.set_start_method(before, force=True)
 

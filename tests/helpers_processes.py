@@ -5,10 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import traceback
+import warnings
 from collections.abc import Callable
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import connection, forkserver, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -16,17 +18,47 @@ from typing import Any
 from symphony.data import engine
 
 
+def serve_from_here() -> None:
+    """Have all processes that are asked for from now on forked from a copy of this one, as it is (Linux).
+
+    A server that began anew would need seconds to import what is imported here.
+    """
+    if engine._START != "forkserver":
+        return
+    server = forkserver._forkserver
+    with socket.socket(socket.AF_UNIX) as listener, warnings.catch_warnings():
+        address = connection.arbitrary_address("AF_UNIX")
+        listener.bind(address)
+        listener.listen()
+        alive, ended_with_us = os.pipe()
+        warnings.simplefilter("ignore", DeprecationWarning)  # a thread of xdist's stays behind
+        with engine._no_interrupts():  # as in the product
+            pid = os.fork()
+        if pid == 0:
+            try:
+                os.close(ended_with_us)
+                if "torch" in sys.modules:  # not imported here: what shall hold for it is not yet set
+                    sys.modules["torch"].set_num_threads(1)
+                engine._mask(signal.SIG_BLOCK)
+                forkserver.main(os.dup(listener.fileno()), alive, [])
+            finally:
+                os._exit(0)
+        os.close(alive)
+    server._forkserver_address, server._forkserver_alive_fd = address, ended_with_us
+    server._forkserver_pid = pid
+
+
 def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -> BaseProcess:
     """Start a function of a module with these arguments, which are pickled.
 
-    On Linux its process is forked from one that has imported what this one has, and has no threads: it may fork, too.
+    On Linux its process is forked from one that has imported what this one had when tests began, and has no threads:
+    it may fork, too.
 
     Args:
         function: whose result is the exit status, ``None`` for 0.
         given: its arguments.
         said: file for what it prints; errors come into a second, whose name ends on ``.err``.
     """
-    engine.get_ready([function.__module__])
     process = multiprocessing.get_context(engine._START).Process(target=_run, args=(function, given, said))
     process.start()
     return process

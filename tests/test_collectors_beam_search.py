@@ -30,7 +30,6 @@ from symphony.collectors import (
     with_rows,
 )
 from symphony.collectors.result import ranking
-from symphony.data import engine
 from symphony.errors import ConfigError
 
 
@@ -222,9 +221,6 @@ class Drawing(Walk):
     ],
 )
 def test_what_remembers_can_not_be_branched(env, why):
-    engine.get_ready(
-        [__name__]
-    )  # else the server that one of them starts would have nothing for all tests to come
     env, start = env(), starts(Walk(), 2, branches=4)
     start.set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
     refused = f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and ParallelEnv can't"
