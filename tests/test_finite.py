@@ -88,8 +88,13 @@ def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) 
     evaluate(agent(space, cells), store, config)
 
 
-@pytest.mark.parametrize(("search", "rule"), SEARCHES)
-@pytest.mark.parametrize(("space", "cells"), [("bicycle", 0), ("displacement", 0), ("displacement", 5)])
+@pytest.mark.parametrize(
+    ("space", "cells", "search", "rule"),
+    [
+        *(("bicycle", 0, *how) for how in SEARCHES),
+        *(("displacement", cells, *how) for cells in (0, 5) for how in (SEARCHES[0], ("tree", "systematic"))),
+    ],
+)
 @pytest.mark.parametrize("network", ["policy", "goals", "discriminator"])
 def test_weights_that_are_not_finite_are_found_at_once(
     store: SegmentStore, network: str, space: str, cells: int, search: Any, rule: str
