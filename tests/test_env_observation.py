@@ -105,3 +105,20 @@ def test_copies_simulate_the_same(copied: Any) -> None:
     kept = [made._kept() for made in (env, twin)]
     assert kept[0] is not kept[1]
     assert kept[1].scenes is twin.scenes
+
+
+def test_agents_see_their_size_their_speed_and_that_the_log_ends() -> None:
+    short, long = straight_road(steps=4), crossing(steps=6)
+    scenes = collate([scene(short, [0, 1]), scene(long, [0, 1])])
+    env = DrivingEnv(scenes, Bicycle(), ObservationConfig(num_objects=0, num_points=0))
+    state, told = env.start(torch.arange(2)), []
+    for _ in range(6):
+        own = state["agents", "observation", "own"]
+        told.append(own[:, 0, 3].tolist())
+        scales = env.observation.speed_scale, env.observation.size_scale
+        torch.testing.assert_close(own[..., 0] * scales[0], state[keys.STATE][..., 3])
+        torch.testing.assert_close(own[..., 1:3] * scales[1], scenes.box_size[:, :2])
+        state.set(keys.ACTION, torch.full((2, 2), env.dynamics.num_actions // 2))
+        state = env.step(state)["next"]
+    # With three and five steps to take; what goes on after its end is told so, too.
+    assert told == [[k >= 3, k >= 5] for k in range(6)]
