@@ -25,7 +25,6 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 from torch.utils.backend_registration import (
     _DummyBackendModule,
     _DummyPrivateUse1Hook,
@@ -60,6 +59,13 @@ class PretendDevice:
         return made
 
 
+def _tensors(value: Any) -> list[Tensor]:
+    """Those in what an operator takes or returns, which nests lists only."""
+    if isinstance(value, Tensor):
+        return [value]
+    return [found for part in value for found in _tensors(part)] if isinstance(value, list | tuple) else []
+
+
 class _Watch(TorchDispatchMode):
     def __init__(self, pretended: PretendDevice) -> None:
         super().__init__()
@@ -67,10 +73,10 @@ class _Watch(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
-        before = {v.device.type for v in tree_leaves((args, kwargs)) if isinstance(v, Tensor)}
-        after = {v.device.type for v in tree_leaves(out) if isinstance(v, Tensor)}
+        given = _tensors(args) + _tensors(tuple((kwargs or {}).values()))
+        before, after = ({v.device.type for v in each} for each in (given, _tensors(out)))
         if len(before | after) > 1 and before:
-            shapes = [tuple(v.shape) for v in tree_leaves((args, kwargs)) if isinstance(v, Tensor)]
+            shapes = [tuple(v.shape) for v in given]
             # A single number of the host may take part in anything: it travels with the call.
             if "copy" in str(func):
                 self.pretended.waits.append(f"{func} {sorted(before)} -> {sorted(after)} {shapes}")

@@ -23,6 +23,7 @@ from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
+from symphony.collectors.rules import group_members, prune
 from symphony.envs import DrivingEnv
 from symphony.modules import SeededNoise
 from symphony.simulation.rollouts import simulate, start_states
@@ -52,7 +53,7 @@ def test_simulations_stay_on_the_device(space: Any) -> None:
         assert device.constants < FEW
 
 
-@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6), KeepAll(), ReplaceBad(0.0)], ids=repr)
+@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6)], ids=repr)
 def test_searches_stay_on_the_device(rule: PruningRule) -> None:
     with world() as (device, agent, env):
         found = searched(agent, env, rule)
@@ -60,6 +61,18 @@ def test_searches_stay_on_the_device(rule: PruningRule) -> None:
         assert found.totals.device.type == NAME
         assert device.waits == []
         assert device.constants < FEW
+
+
+@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6), KeepAll(), ReplaceBad(0.0)], ids=repr)
+@pytest.mark.parametrize("grouped", [False, True])
+def test_rules_stay_on_the_device(rule: PruningRule, grouped: bool) -> None:
+    groups = torch.arange(8).expand(2, 3, 8) % 2
+    members = group_members(groups)  # looked at once before a search
+    with pretend() as device:
+        totals, noise = torch.zeros(2, 3, 8, device=device.device), torch.zeros(2, 3, device=device.device)
+        parents = prune(rule, totals, noise, on(device, members) if grouped else None, on(device, groups))
+        assert parents.device.type == NAME
+        assert device.waits == []
 
 
 @pytest.mark.parametrize(
