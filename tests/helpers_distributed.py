@@ -38,7 +38,7 @@ def config(method: Any, store: Path, out: Path) -> TrainConfig:
         method,
         store,
         out,
-        steps=6,
+        steps=4,
         validation=ValidationConfig(data=store, segments=1, rollouts=1),
         discriminator=DiscriminatorConfig(hidden=8, head=8, states=8, instance_noise=0.1),
         mgail=MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5),
@@ -127,7 +127,7 @@ def of_run(method: str, store: Path, out: Path, rank: int) -> dict[str, Any]:
     found = {"drawn": list(drawn), "weights": list(at_end)}
     if rank == 0:
         shutil.copytree(settings.out, out / f"{method}-part")
-        shutil.rmtree(choose(out / f"{method}-part", "6"))
+        shutil.rmtree(choose(out / f"{method}-part", "4"))
     resumed = replace(settings, out=out / f"{method}-part", resume=True)
     with processes(CPU) as world:
         world.wait()
@@ -161,7 +161,7 @@ def main(rank: int, store: Path, out: Path) -> None:
 def alone(store: Path, out: Path) -> None:
     """Take up what two processes began."""
     try:
-        train(replace(config("bc", store, out / "bc"), resume=True, steps=8))
+        train(replace(config("bc", store, out / "bc"), resume=True, steps=6))
     except ConfigError as error:
         (out / "alone.txt").write_text(str(error))
 

@@ -68,7 +68,7 @@ def test_losses_gradients_and_metrics_are_those_of_the_joint_batch(found: Found,
 @pytest.mark.parametrize("method", TRAINED)
 def test_processes_draw_apart_and_stay_together(found: Found, method: str) -> None:
     one, two = (report["runs"][method] for report in found[1])
-    assert len(one["drawn"]) == len(two["drawn"]) >= 6
+    assert len(one["drawn"]) == len(two["drawn"]) >= 4
     assert not set(one["drawn"]) & set(two["drawn"])
     assert one["weights"] == two["weights"]
     assert one["resumed"] == two["resumed"] == one["weights"]
@@ -77,9 +77,9 @@ def test_processes_draw_apart_and_stay_together(found: Found, method: str) -> No
 @pytest.mark.parametrize("method", TRAINED)
 def test_one_process_writes_and_a_run_resumes_to_the_last_bit(found: Found, method: str) -> None:
     whole, part = found[0] / method, found[0] / f"{method}-part"
-    assert [r["step"] for r in read_metrics(whole)] == [1, 2, 3, 4, 5, 6]
-    assert [int(path.name[-12:]) for path in checkpoints(whole / "checkpoints")] == [2, 4, 6]
-    assert [r["step"] for r in read_metrics(whole) if "validation_ade" in r] == [2, 4, 6]
+    assert [r["step"] for r in read_metrics(whole)] == [1, 2, 3, 4]
+    assert [int(path.name[-12:]) for path in checkpoints(whole / "checkpoints")] == [2, 4]
+    assert [r["step"] for r in read_metrics(whole) if "validation_ade" in r] == [2, 4]
     assert same_weights(weights(f"{whole}@last"), weights(f"{part}@last"))
     without = [[{**r, "updates_per_second": 0} for r in read_metrics(run)] for run in (whole, part)]
     assert without[0] == without[1]
