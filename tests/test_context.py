@@ -140,7 +140,7 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
         ego=order.index(0),
         agent_id=segment.agent_id[order],
         position=moved[order].astype(np.float32),
-        heading=(segment.heading + np.float32(angle))[order],
+        heading=np.angle(np.exp(1j * (segment.heading + angle))).astype(np.float32)[order],
         velocity=(segment.velocity @ turn).astype(np.float32)[order],
     )
     choice = interactive_choice(again, 2)

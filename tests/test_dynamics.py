@@ -186,3 +186,17 @@ def test_fit_starts_anew_where_an_agent_reappears(dynamics: Bicycle | Displaceme
     _, fitted = dynamics.fit(hidden[..., :2], hidden[..., 2], hidden[..., 3], valid, size, DT)
     torch.testing.assert_close(fitted[:, 30], path[:, 30])
     assert (fitted - path)[:, 30:, :2].norm(dim=-1).max() < 0.25
+
+
+@given(st.floats(3, 25), st.floats(-3, 3), st.integers(0, 146))
+def test_the_fit_finds_the_action_that_was_taken(speed: float, heading: float, action: int) -> None:
+    """Wherever that shows: no other action leads to the same position, heading and speed."""
+    dynamics = Bicycle()
+    state = torch.tensor([[5.0, -2.0, heading, speed]], dtype=torch.float64)
+    size = torch.tensor([[4.5, 2.0]], dtype=torch.float64)
+    after = dynamics.step(state, torch.tensor([action]), size, 0.2)
+    assert dynamics.towards(state, after, size, 0.2).tolist() == [action]
+    # Were its place the same, an action whose heading is farther off must not seem nearer.
+    elsewhere = after + torch.tensor([0.0, 0.0, 0.3, 0.0])
+    found = dynamics.step(state, dynamics.towards(state, elsewhere, size, 0.2), size, 0.2)
+    assert abs(wrap(found - elsewhere)[0, 2]) <= abs(wrap(after - elsewhere)[0, 2]) + 1e-9

@@ -21,6 +21,7 @@ from symphony.geometry.frames import rotate, wrap
 from symphony.keys import ACTION, NOISE, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, VALID
 from symphony.modules import BoundedDisplacement, ElementGroup, SeededNoise, displacement_policy
 from symphony.modules.bounded import INSIDE, SMOOTH
+from symphony.modules.displacement import _Parameters
 from symphony.objectives import BCLoss
 from symphony.streams import uniform
 from test_env import moved
@@ -349,3 +350,18 @@ def test_shapes_and_keys_are_free(batch):
 def test_bad_bounds_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
         policy(**{name: value})
+
+
+@given(st.floats(0, 40), st.floats(2, 12))
+def test_what_is_offered_turns_no_sharper_than_tyres_hold(speed: float, length: float) -> None:
+    slope, lateral, axle = 0.4, 6.0, 0.3
+    bounds = _Parameters(3, 0.2, 5.0, 0.1, slope, lateral, axle)
+    own, state = torch.tensor([[[0.0, length / 5.0, 0.4, 0.0]]]), torch.tensor([[[0.0, 0.0, 0.0, speed]]])
+    _, distance, tangent = bounds(torch.zeros(1, 1, 3), state, own, torch.ones(1, 1, dtype=torch.bool))
+    assert distance.item() == pytest.approx(0.2 * speed)
+    arm, most = axle * length, tangent.item()
+    assert most * speed**2 / arm <= lateral * (1 + 1e-5)
+    # Slowly what the wheels can, fast what holds.
+    expected = min(slope, lateral * arm / max(speed, 1e-6) ** 2)
+    assert expected / math.sqrt(2) - 1e-6 <= most <= expected + 1e-6
+    assert most == pytest.approx(slope, rel=1e-3) or speed > 0.5

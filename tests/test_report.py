@@ -122,6 +122,10 @@ def test_time_to_collision_is_gap_over_closing_speed(gap: float, closing: float)
     assert box_ttc(gap, closing) == pytest.approx(gap / closing, rel=1e-5)
 
 
+def test_who_overlaps_meets_now_however_fast_they_part() -> None:
+    assert box_ttc(-1.0, -6.0) == 0.0
+
+
 def test_time_to_collision_is_infinite_for_what_does_not_meet() -> None:
     assert box_ttc(10, 0) == math.inf
     assert box_ttc(10, -3) == math.inf

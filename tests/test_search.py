@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
 from symphony.agents import Agent, build_agent
-from symphony.collectors import Aggregate, BeamSearchResult, KeepAll, KeepBest
+from symphony.collectors import Aggregate, BeamSearchResult, KeepAll, KeepBest, beam_search
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
@@ -284,6 +284,28 @@ def test_longer_segments_beside_it_choose_no_leaves(
         periods = alone.search.slots.shape[-2]
         assert torch.equal(together.search.slots[item][:, :periods], alone.search.slots[0])
         assert torch.equal(together.search.scores[item][:, :, : steps - 1], alone.search.scores[0])
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_leaves_are_chosen_in_the_period_in_which_a_scene_ends(
+    dataset: SceneDataset, agent: Agent, every: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+
+    def spy(*given: Any, **named: Any) -> BeamSearchResult:
+        seen.append(named["last_period"])
+        return beam_search(*given, **named)
+
+    monkeypatch.setattr("symphony.simulation.search.beam_search", spy)
+    scenes = dataset.scenes(range(4))
+    simulation(searching(agent, prune_every=every), scenes, EvaluateConfig(rollouts=4, trees=2))
+    assert len(scenes.last_step.unique()) > 1
+    # Steps are taken from 0 to the last step, so many a period.
+    expected = [
+        range(0, last, every).index((last - 1) // every * every) for last in scenes.last_step.tolist()
+    ]
+    assert all(found.tolist() == [[each] * 2 for each in expected] for found in seen)
+    assert seen
 
 
 def test_the_best_is_the_best_up_to_the_end(dataset: SceneDataset, agent: Agent) -> None:

@@ -9,9 +9,10 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from symphony.geometry.stations import stations_along
+from symphony.geometry.stations import NEAR, earliest_pass, stations_along
 
 Reals = NDArray[np.float64]
 
@@ -100,3 +101,15 @@ def test_a_point_that_is_not_finite_is_refused_by_its_place() -> None:
     path[1, 3, 0] = np.nan
     with pytest.raises(ValueError, match="path 1, step 3"):
         stations_along(np.stack([bend(0.0)] * 2), path, np.ones((2, 5), bool))
+
+
+@given(
+    arrays(
+        np.float64, st.tuples(st.integers(1, 4), st.integers(1, 12)), elements=st.integers(0, 6).map(float)
+    )
+)
+def test_the_earliest_pass_is_a_dip_nearly_as_low_as_any(distance: NDArray[np.float64]) -> None:
+    for row, found in zip(distance, earliest_pass(distance), strict=True):
+        around = [np.inf, *row, np.inf]
+        dips = [k for k in range(len(row)) if around[k] >= row[k] <= around[k + 2]]
+        assert found == min(k for k in dips if row[k] <= min(row) + NEAR)
