@@ -148,6 +148,26 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
     assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
 
 
+@pytest.mark.parametrize("case", sorted(CASES))
+def test_headings_on_both_sides_of_the_turn_are_alike(case: str) -> None:
+    """Westward one heading is a little below 180 degrees and another a little above -180."""
+    context, paths = CASES[case]
+    segment = scene(paths)
+    segment = segment.replace(
+        heading=segment.heading + np.where(np.arange(len(paths)) % 2, 0.03, -0.03)[:, None]
+    )
+    turn = np.array([[0, 1], [-1, 0]], np.float32)
+    west = segment.replace(
+        position=np.concatenate([segment.position[..., :2] @ turn, segment.position[..., 2:]], -1),
+        heading=np.angle(np.exp(1j * (segment.heading + np.pi / 2))),
+        velocity=segment.velocity @ turn,
+    )
+    for each in (segment, west):
+        choice = interactive_choice(each, 2)
+        assert choice.context == context
+        assert choice.agents.tolist() == [0, 1]
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     st.floats(3, 25),
