@@ -163,7 +163,7 @@ def _function(value: Any) -> FunctionType | None:
 
 
 def noticed(module: ModuleType, number: int | None, test: str) -> bool:
-    """Whether the tests fail with a change, or as it is; not here, where they could leave threads that no fork has."""
+    """Whether the tests fail with a change, or as it is; not here, where they could leave threads that forks lack."""
     child = os.fork()
     if child == 0:
         status = 1
