@@ -23,9 +23,9 @@ def serve_from_here() -> None:
 
     A server that began anew would need seconds to import what is imported here.
     """
-    if engine._START != "forkserver":
-        return
     server = forkserver._forkserver
+    if engine._START != "forkserver" or hasattr(server, "_forkserver_authkey"):  # Python 3.14: as in the product
+        return
     with socket.socket(socket.AF_UNIX) as listener, warnings.catch_warnings():
         address = connection.arbitrary_address("AF_UNIX")
         listener.bind(address)
