@@ -24,7 +24,8 @@ def serve_from_here() -> None:
     A server that began anew would need seconds to import what is imported here.
     """
     server = forkserver._forkserver
-    if engine._START != "forkserver" or hasattr(server, "_forkserver_authkey"):  # Python 3.14: as in the product
+    # Python 3.14's servers want a key; there they begin as in the product.
+    if engine._START != "forkserver" or hasattr(server, "_forkserver_authkey"):
         return
     with socket.socket(socket.AF_UNIX) as listener, warnings.catch_warnings():
         address = connection.arbitrary_address("AF_UNIX")
