@@ -23,11 +23,9 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv, scene
-from symphony.envs.edge import leaving, map_edge
-from symphony.envs.objects import Objects
+from symphony.envs.edge import map_edge
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import SceneBatch, collate
-from symphony.envs.traffic import entering
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.pictures import search_tree
@@ -500,47 +498,3 @@ def test_padded_scenes_have_an_edge_of_their_own() -> None:
             )
         count = one.interactive.shape[1]
         assert torch.equal(states[0][keys.VALID][:, :count], states[1][keys.VALID])
-
-
-@pytest.mark.parametrize(
-    ("ahead", "aside", "speed", "its_speed", "enters"),
-    [
-        (5.6, 0.0, 0.0, 0.0, True),
-        (5.4, 0.0, 0.0, 0.0, False),  # 0.9 m between them
-        (9.0, 0.0, 10.0, 0.0, False),  # it would be there in half a second
-        (9.0, 0.0, 10.0, 10.0, True),
-        (-9.0, 0.0, 0.0, 9.0, False),  # who comes from behind
-        (-9.0, 4.0, 0.0, 9.0, True),
-        (13.0, 0.0, 9.0, 0.0, False),  # in a second
-        (15.0, 0.0, 9.0, 0.0, True),
-    ],
-)
-@pytest.mark.parametrize("angle", [0.0, 2.0])
-def test_who_enters_would_meet_nobody_within_a_second(
-    ahead: float, aside: float, speed: float, its_speed: float, enters: bool, angle: float
-) -> None:
-    forward, left = (
-        torch.tensor([np.cos(angle), np.sin(angle)]),
-        torch.tensor([-np.sin(angle), np.cos(angle)]),
-    )
-    rows = [
-        torch.cat([place, torch.tensor([angle]), v * forward])
-        for place, v in ((0 * forward, speed), (ahead * forward + aside * left, its_speed))
-    ]
-    objects = Objects(
-        torch.stack(rows)[None].float(),
-        torch.ones(1, 2, dtype=torch.bool),
-        torch.tensor([[[4.5, 2.0], [4.5, 2.0]]]),
-        torch.zeros(1, 2, dtype=torch.int64),
-    )
-    for index, slot in (([[0]], 0), ([[1, 0]], 1)):
-        ready = torch.zeros(1, len(index[0]), dtype=torch.bool)
-        ready[0, slot] = True
-        assert entering(objects, torch.tensor(index), ready)[0, slot].item() == enters
-
-
-def test_who_is_beyond_any_side_of_the_map_has_left() -> None:
-    hull = torch.tensor([[[1.0, 0, 10], [-1, 0, 10], [0, 1, 10], [0, -1, 10], [0, 0, 0]]])
-    after = torch.tensor([[[9.0, -9], [11, 0], [-11, 9], [0, 10.5], [3, -12]]])
-    none = torch.zeros(1, 2, 4)
-    assert leaving(torch.zeros_like(after), after, none, hull).tolist() == [[False, True, True, True, True]]

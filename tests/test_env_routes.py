@@ -154,12 +154,8 @@ def test_without_a_route_all_features_are_zero() -> None:
     # Of a single point there is no direction; two are enough.
     two = torch.tensor([[[[0.0, 0.0], [3.0, 0.0]]]])
     assert (route_ahead(state[:1, :1], two, torch.tensor([[1]]), SCALE) == 0).all()
-    assert route_ahead(torch.zeros(1, 1, 4), two, torch.tensor([[2]]), SCALE)[0, 0, :4].tolist() == [
-        1,
-        0,
-        1,
-        0,
-    ]
+    seen = route_ahead(torch.zeros(1, 1, 4), two, torch.tensor([[2]]), SCALE)
+    assert seen[0, 0, :4].tolist() == [1.0, 0.0, 1.0, 0.0]
     env = make_env(crossing())
     assert (env.start(torch.tensor([0]))[keys.ROUTE] == 0).all()
     route = env.with_goals(env.start(torch.tensor([0])))[keys.ROUTE]

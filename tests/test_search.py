@@ -300,10 +300,8 @@ def test_leaves_are_chosen_in_the_period_in_which_a_scene_ends(
     scenes = dataset.scenes(range(4))
     simulation(searching(agent, prune_every=every), scenes, EvaluateConfig(rollouts=4, trees=2))
     assert len(scenes.last_step.unique()) > 1
-    # Steps are taken from 0 to the last step, so many a period.
-    expected = [
-        range(0, last, every).index((last - 1) // every * every) for last in scenes.last_step.tolist()
-    ]
+    # A scene's last step begins at the one before it.
+    expected = [(last - 1) // every for last in scenes.last_step.tolist()]
     assert all(found.tolist() == [[each] * 2 for each in expected] for found in seen)
     assert seen
 
