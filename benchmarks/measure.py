@@ -90,6 +90,7 @@ HOW: dict[str, dict[str, Any]] = {
     "16 objects, 200 points": {"parts": SIMULATOR, "tuned": BOTH},
     "16 objects, 1000 points": {"parts": SIMULATOR, "tuned": BOTH},
     "smallest step": {"parts": SIMULATOR},
+    "smallest step, compiled": {},
     "actions of two": {},
     "search 16 x 16 x 50": {"parts": SEARCH, "tuned": BOTH, **LONG},
     "bc update": {"parts": UPDATE, "unit": "updates", "warm": 3, "tuned": BOTH},

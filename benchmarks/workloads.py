@@ -12,6 +12,7 @@ import argparse
 import itertools
 import json
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -98,9 +99,11 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
     return SceneBatch(**made, **rest, batch_size=[1])
 
 
-def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor) -> Work:
+def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor, *, compiled: bool = False) -> Work:
     """One step of the environment."""
     env = DrivingEnv(scenes, Bicycle(), config)
+    if compiled:
+        env.compile()
     start = env.start(rows)
     start.set(keys.ACTION, torch.full((*rows.shape, env.num_agents), env.dynamics.num_actions // 2))
     # A step writes what comes next into what it is given; in a rollout that is new each time.
@@ -123,6 +126,11 @@ def builtin(count: int, agents: int = 2) -> SceneBatch:
     """Scenes of the built-in segments."""
     store = SegmentStore(builtin_store("train"))
     return collate([scene(store[k], agents) for k in range(count)])
+
+
+def smallest_step(*, compiled: bool = False) -> Work:
+    """One of two agents of one scene."""
+    return step_of(builtin(1), ObservationConfig(16, 128), torch.arange(1), compiled=compiled)
 
 
 GROUPS = (
@@ -270,7 +278,8 @@ WORKLOADS: dict[str, Callable[[], Work]] = {
     "16 objects": lambda: rings(16, 1),
     "16 objects, 200 points": lambda: rings(16, 200),
     "16 objects, 1000 points": lambda: rings(16, 1000),
-    "smallest step": lambda: step_of(builtin(1), ObservationConfig(16, 128), torch.arange(1)),
+    "smallest step": smallest_step,
+    "smallest step, compiled": lambda: smallest_step(compiled=True),
     "actions of two": actions_of_few,
     "search 16 x 16 x 50": search,
     "bc update": lambda: update("bc"),
@@ -281,6 +290,8 @@ WORKLOADS: dict[str, Callable[[], Work]] = {
     "brute force": brute_force,
     "matmul": matmul,
 }
+if not any(map(shutil.which, ("c++", "g++", "clang++"))):
+    del WORKLOADS["smallest step, compiled"]
 
 
 class Measured:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import pytest
 import torch
+from tensordict import assert_close
 
 from helpers_segments import crossing, straight_road
 from symphony import keys
@@ -28,7 +30,8 @@ def test_a_compiled_step_is_the_step(dynamics: Any, config: ObservationConfig) -
         action = torch.tensor([[[1.0, 0.1], [2.0, 0.0]], [[0.5, 0.0], [1.0, -0.2]]])
     start.set(keys.ACTION, action)
     plain = env._step(start)
-    compiled = torch.compile(env._step, backend="eager", fullgraph=True)(start)
+    env.compile(backend="eager", fullgraph=True)
+    compiled = env._step(start)
     assert set(compiled.keys(True, True)) == set(plain.keys(True, True))
     for key in plain.keys(True, True):
         found, expected = compiled[key], plain[key]
@@ -36,3 +39,34 @@ def test_a_compiled_step_is_the_step(dynamics: Any, config: ObservationConfig) -
         if key[-1] in ("objects", "objects_mask", "points", "points_mask", "gap", "gap_ahead"):
             found, expected = found.double().sum(2), expected.double().sum(2)
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+@torch.no_grad()
+def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not() -> None:
+    torch.compiler.reset()
+    env = DrivingEnv(
+        collate([scene(straight_road(), [0, 1])]), observation=ObservationConfig.nothing(), seed=0
+    )
+    plain = env.rollout(4)
+    calls = []
+
+    def backend(graph: torch.fx.GraphModule, _: object) -> Any:
+        calls.append(graph)
+        return graph.forward
+
+    env.compile(backend=backend, fullgraph=True)
+    # Again is not twice; and a batch without dimensions, as rollouts have it, compiles, too.
+    env.compile(backend=backend, fullgraph=True)
+    env.set_seed(0)
+    torch.manual_seed(0)
+    compiled = env.rollout(4)
+    assert len(calls) == 1
+    assert plain.shape == compiled.shape
+    copy = pickle.loads(pickle.dumps(env))  # noqa: S301 - just pickled
+    for tried in (env, copy):
+        torch.manual_seed(0)
+        tried.set_seed(0)
+        assert_close(tried.rollout(4), compiled, rtol=0, atol=1e-5)
+    assert len(calls) == 1
+    assert copy._step.__func__ is DrivingEnv._step

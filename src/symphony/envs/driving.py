@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -160,6 +160,22 @@ class DrivingEnv(EnvBase):
             moved.scenes = moved.scenes.to(moved.device)
         return moved
 
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """Compile the step in place, as :meth:`torch.nn.Module.compile` compiles a forward pass.
+
+        For few agents a step is mostly calls of small operators, which is what this saves; of many it compares each
+        with every point of the map, and loses. Copies of the environment are not compiled.
+
+        Args:
+            args: of :func:`torch.compile`, whose default backend needs a C++ compiler.
+            kwargs: likewise.
+        """
+        step = torch.compile(type(self)._step.__get__(self), *args, **kwargs)
+        self._step = step  # type: ignore[method-assign]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in super().__getstate__().items() if name != "_step"}
+
     def start(self, scene: Int[Tensor, "*b"], rollout: Int[Tensor, "*b"] | int = 0) -> TensorDict:
         """State at the first logged step, as :meth:`reset` returns it.
 
@@ -242,7 +258,7 @@ class DrivingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         scene, step, stream, state, valid, goal, waiting, persona = self._read(tensordict)
-        index = self.scenes.interactive[scene]
+        index = _of(self.scenes.interactive, scene)
         size = _rows(self.scenes.box_size, scene, index)
         after = self._moved(tensordict, state, size)
         after = torch.where(valid[..., None], after, state)
@@ -374,7 +390,7 @@ class DrivingEnv(EnvBase):
                 "scene": scene[..., None],
                 "step": step[..., None],
                 "stream": stream[..., None],
-                "segment": self.scenes.segment[scene][..., None],
+                "segment": _of(self.scenes.segment, scene)[..., None],
                 # One without a device would be taken for a transfer, and waited for.
                 "agents": TensorDict(agents, batch_size=each, device=self.device),
                 "done": back(truncated | terminated)[..., None],
@@ -409,6 +425,11 @@ class DrivingEnv(EnvBase):
 
 def _rows_of(values: Float[Tensor, "*b A F"], index: Int[Tensor, "*b N"]) -> Float[Tensor, "*b N F"]:
     return values.gather(-2, index[..., None].expand(*index.shape, values.shape[-1]))
+
+
+def _of(table: Shaped[Tensor, B * e], scene: Int[Tensor, "*b"]) -> Shaped[Tensor, ...]:
+    """table[scene], which does not compile where a single scene is a number, that is, without dimensions."""
+    return table.index_select(0, scene.flatten()).reshape((*scene.shape, *table.shape[1:]))
 
 
 def _rows(
