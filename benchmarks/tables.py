@@ -57,7 +57,7 @@ def speeds(found: Mapping[str, list[Row]], before: Mapping[str, list[Row]]) -> I
                 spread(row),
                 f"{rate(row) / brute:.2f}" if comparable else "",
                 f"{100 * row['flops'] / row['seconds'] / row['matmul']:.0f} %" if row["flops"] else "",
-                f"{row['operators']:,}",
+                f"{row['operators']:,}" if row["operators"] else "",
                 f"{row['faults']:,.0f}",
                 f"{row['mebibytes']:,.0f}",
                 *([f"{per_product(row) / per_product(old[0]):.2f}" if old else ""] if before else []),
