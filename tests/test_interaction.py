@@ -15,7 +15,8 @@ from symphony.data.conformance import check_reader
 from symphony.data.segment import AgentType, RunSegment, SignalState, validate
 from symphony.data.sources import get_reader
 from symphony.data.sources.egos import busiest_first
-from symphony.data.sources.interaction_tracks import read_rows
+from symphony.data.sources.interaction_motion import headings
+from symphony.data.sources.interaction_tracks import read_rows, resolved
 from symphony.errors import ConfigError, DataError
 
 
@@ -116,6 +117,27 @@ def test_cases_are_not_put_on_the_map_of_another_place(tmp_path: Path) -> None:
     assert len(segments(newer(tmp_path, "DR_A", "DR_A", []))) == 1
     error = read_error("interaction", newer(tmp_path, "DR_B", "DR_A", []))
     assert "no maps/DR_B.osm" in error.message
+
+
+def test_speeds_from_positions_are_of_one_track(tmp_path: Path) -> None:
+    """The last of a track that is of the way to where the next one begins is none of it."""
+    rows = [
+        *track("P1", y=1, speed=1, steps=range(2), kind="pedestrian/bicycle"),
+        *track("P2", y=40, speed=1, steps=range(2), kind="pedestrian/bicycle"),
+        *track("P3", y=80, speed=4, steps=range(2), kind="pedestrian/bicycle"),
+    ]
+    found = resolved(read_rows(public(tmp_path, rows)), by_positions=True)
+    kinds = {int(track): AgentType(int(kind)) for track, kind in zip(found.track, found.kind, strict=True)}
+    assert kinds == {-2: AgentType.PEDESTRIAN, -3: AgentType.PEDESTRIAN, -4: AgentType.CYCLIST}
+
+
+def test_who_stands_faces_where_it_moves_at_the_nearest_step() -> None:
+    state = np.full((2, 10, 5), np.nan)
+    state[..., :4] = 0
+    state[0, :2, 2] = state[0, 8:, 3] = 2.0  # first along x, later along y
+    found = headings(state, np.ones((2, 10), bool))
+    np.testing.assert_allclose(found[0, :, 4], [0.0] * 5 + [np.pi / 2] * 5)
+    assert not found[1].any()
 
 
 @pytest.mark.parametrize("logged", [0.0, 0.56, 1.0])
@@ -238,6 +260,32 @@ def test_broken_tracks_are_refused_by_name(name: str, tmp_path: Path) -> None:
     error = read_error("interaction", path)
     assert message in error.message
     assert error.file == path
+
+
+@pytest.mark.parametrize("row", [2, 5, 9])
+@pytest.mark.parametrize(
+    ("here", "wrong"),
+    [
+        (",2.0000,", ",two,"),
+        (",2.0000,", ",inf,"),
+        (",car", ".5,car"),
+        (",car", ",cow"),
+        (",car", ",autó"),
+        ("\n", ""),
+    ],
+)
+def test_errors_name_the_line(
+    row: int, here: str, wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("symphony.data.sources.interaction_tracks.CHUNK", 4)
+    lines = [COLUMNS + "\n", *(line + "\n" for line in CARS)][: row if wrong == "" else None]
+    assert here in lines[row - 1]
+    lines[row - 1] = lines[row - 1].replace(here, wrong)
+    path = public(tmp_path)
+    path.write_text("".join(lines), encoding="utf-8")
+    field = read_error("interaction", path).field
+    assert field is not None
+    assert field.split(":")[0] == f"line {row}"
 
 
 def test_files_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.geodesy import mercator, utm
 from symphony.data.sources.lanelet2 import LaneletMap, read_lanelet2
 from symphony.data.sources.lanelet2_road import lane_lanelets, middle, road_map, stop_line
+from symphony.data.sources.lines import cut_ends, opened
 from symphony.errors import DataError
 
 FROM_ORIGIN = partial(mercator, origin=np.array(ORIGIN))
@@ -124,6 +125,17 @@ def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool
         assert found == ((right, left) if swap else (left, right))
 
 
+def test_a_map_is_cut_where_no_lane_goes_on() -> None:
+    """Across the very first and last points of lanes that nothing leads to or on from."""
+    lines = [np.array([(x, y) for x in (0, 6, 10)], float) for y in (0, -3)]
+    bounds = [tuple(lines), tuple(line + np.array([10, 0]) for line in lines)]
+    links = np.array([(0, 1)], np.int32)
+    np.testing.assert_array_equal(cut_ends(bounds, links), [[(20, 0), (20, -3)], [(0, 0), (0, -3)]])
+    ring = np.array([(0, -3), (20, -3), (20, 0), (0, 0), (0, -3)], float)
+    along = [np.unique(line[:, 1]).tolist() for line in opened([ring], cut_ends(bounds, links))]
+    assert sorted(along) == [[-3.0], [0.0]]
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -131,6 +143,7 @@ def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool
         ("50 km/h", 50 / 3.6),
         ("25 mph", 25 * 0.44704),
         ("8.5 m/s", 8.5),
+        ("8.5mps", 8.5),
         ("de274-60", 60 / 3.6),
         ("us_r2-1-25", 25 * 0.44704),
         ("none", np.nan),

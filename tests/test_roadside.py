@@ -98,6 +98,9 @@ def test_people_walk_beside_the_road(lined: list[tuple[RunSegment, RunSegment]])
         speeds += int((speed.mean(1) > 0.8).sum())
         way = (places[:, 2:] - places[:, :-2]) / (2 * after.dt)
         np.testing.assert_allclose(after.velocity[people, 1:-1], way, atol=1e-3)
+        turn = np.cos(after.heading[people, 1:-1] - np.arctan2(way[..., 1], way[..., 0]))
+        # But for a moment around the inside of a sharp corner.
+        assert (turn[np.linalg.norm(way, axis=-1) > 0.5] > 0.7).mean() > 0.98, "they look where they go"
     assert seen > 3 * len(lined)
     assert 0.5 * seen < speeds < seen, "some stand"
 

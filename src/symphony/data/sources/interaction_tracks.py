@@ -122,7 +122,8 @@ def _chunks(file: BinaryIO) -> Iterator[tuple[int, list[list[str]]]]:
     first = 2
     while lines := list(itertools.islice(file, CHUNK)):
         if not lines[-1].endswith(b"\n"):
-            raise DataError("the last line is not complete: the file was cut short", field=f"line {first}")
+            last = first + len(lines) - 1
+            raise DataError("the last line is not complete: the file was cut short", field=f"line {last}")
         yield first, [_text(line, first + k).split(",") for k, line in enumerate(lines)]
         first += len(lines)
 
