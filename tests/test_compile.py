@@ -12,18 +12,29 @@ from tensordict import assert_close
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.edge import map_edge
+from symphony.roadgraph import LaneGraph
 
 SEES = ObservationConfig(num_objects=3, num_points=60, clearance=True, foresight=(0.5,))
 
 
 @pytest.mark.parametrize(
-    ("dynamics", "config"), [(Bicycle(), SEES), (Displacement(), ObservationConfig.nothing())]
+    ("dynamics", "config", "edge"),
+    [
+        (Bicycle(), SEES, False),
+        (Displacement(), ObservationConfig.nothing(), False),
+        (Bicycle(), ObservationConfig.nothing(), True),
+    ],
 )
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
 @torch.no_grad()
-def test_a_compiled_step_is_the_step(dynamics: Any, config: ObservationConfig) -> None:
+def test_a_compiled_step_is_the_step(dynamics: Any, config: ObservationConfig, edge: bool) -> None:
     torch.compiler.reset()
-    env = DrivingEnv(collate([scene(s, [0, 1]) for s in (straight_road(), crossing(6))]), dynamics, config)
+    segments = [straight_road(), crossing(6)]
+    edges = [map_edge(LaneGraph(s.road)) if edge else None for s in segments]
+    scenes = [scene(s, [0, 1], edge=end) for s, end in zip(segments, edges, strict=True)]
+    env = DrivingEnv(collate(scenes), dynamics, config)
+    assert env.open_traffic == edge
     start = env.start(torch.tensor([0, 1]))
     action = torch.tensor([[80, 60], [75, 70]])
     if not dynamics.discrete:

@@ -12,6 +12,7 @@ from helpers_device import NAME, on, pretend
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.edge import map_edge
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import objects_at
 from symphony.envs.observation import observe
@@ -60,6 +61,20 @@ def test_steps_goals_and_observations_stay_on_the_device(
             out[keys.POINTS].sum().backward()
         assert device.waits == []
         assert device.constants < 7  # each is made once
+
+
+def test_steps_of_open_traffic_stay_on_the_device() -> None:
+    graphs = [(s, LaneGraph(s.road)) for s in (straight_road(), crossing(6))]
+    edges = [scene(s, [0, 1], graph, edge=map_edge(graph)) for s, graph in graphs]
+    env = DrivingEnv(collate(edges), observation=ObservationConfig.nothing())
+    assert env.open_traffic
+    with pretend() as device:
+        on(device, env)
+        number = torch.arange(2, device=device.device)
+        start = env.start(number, number)
+        out = env.step(act(env, start, gradient=False))["next"]
+        assert {v.device.type for v in out.values(True, True)} == {NAME}
+        assert device.waits == []
 
 
 def act(env: DrivingEnv, state: Any, gradient: bool) -> Any:

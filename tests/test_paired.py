@@ -38,6 +38,9 @@ def test_paired_differences_are_over_what_both_have_and_over_recordings() -> Non
         assert found.means[column.key] == pytest.approx(2.0)
         assert found.errors[column.key] == pytest.approx(0.0, abs=1e-9)
     assert "12 segments of 4 groups" in found.text()
+    fewer = entry("bc_h", 0, 2.5)
+    fewer.record["per_segment"].pop()
+    assert differences([entry("bc", 0, 0.0), fewer], "bc")[0].segments == 11
     wrong = entry("bc_h", 1, 0.0)
     wrong.record["per_segment"][3]["ade"] = "far"
     with pytest.raises(DataError, match="ade"):

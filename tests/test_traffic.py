@@ -48,6 +48,24 @@ def test_who_enters_would_meet_nobody_within_a_second(
         assert entering(objects, torch.tensor(index), ready)[0, slot].item() == enters
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There all are compared with all, as to look for those that are ready would wait for it."""
+    rng = torch.Generator().manual_seed(seed)
+    rows, agents, driven = 6, 9, 5
+    state = torch.rand(rows, agents, 5, generator=rng) * torch.tensor([40.0, 12, 6, 12, 4])
+    size = torch.tensor([4.5, 2.0]).expand(rows, agents, 2)
+    valid = torch.rand(rows, agents, generator=rng) < 0.9
+    objects = Objects(state, valid, size, torch.zeros(rows, agents, dtype=torch.int64))
+    index = torch.rand(rows, agents, generator=rng).argsort(-1)[:, :driven]
+    ready = (torch.rand(rows, driven, generator=rng) < 0.6) & valid.gather(1, index)
+    found = entering(objects, index, ready)
+    assert 0 < found.sum() < ready.sum()
+    monkeypatch.setattr("symphony.envs.traffic.on_host", lambda _: False)
+    assert torch.equal(entering(objects, index, ready), found)
+    assert not entering(objects, index, torch.zeros_like(ready)).any()
+
+
 def test_who_is_beyond_any_side_of_the_map_has_left() -> None:
     hull = torch.tensor([[[1.0, 0, 10], [-1, 0, 10], [0, 1, 10], [0, -1, 10], [0, 0, 0]]])
     after = torch.tensor([[[9.0, -9], [11, 0], [-11, 9], [0, 10.5], [3, -12]]])

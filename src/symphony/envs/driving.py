@@ -24,6 +24,7 @@ from symphony.envs.tables import Tables
 from symphony.envs.traffic import entering, without
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
+from symphony.geometry.nearest import on_host
 from symphony.streams import fold_in
 
 Event = Literal["collision", "offroad"]
@@ -285,8 +286,8 @@ class DrivingEnv(EnvBase):
         gone = leaving(old[..., :2], new[..., :2], self.scenes.exits[row], self.scenes.hull[row])
         there = there & ~gone
         ready = waits & (at[:, None] >= self.scenes.enter[row])
-        # Of what is there to enter, most steps have nothing.
-        if bool(ready.any()):
+        # Most steps have nobody who could enter; only a device would wait to tell.
+        if not on_host(ready) or bool(ready.any()):
             index = self.scenes.interactive[row]
             enters = entering(self.objects(row, at, new, there | ready), index, ready)
             there, waits = there | enters, waits & ~enters

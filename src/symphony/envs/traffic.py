@@ -1,6 +1,6 @@
 """Open traffic: who is there, and who can enter.
 
-Shapes: M rows (any flattened batch), N driven agents, A agents of the scene.
+Shapes: M rows (any flattened batch), N driven agents, n of them, A agents of the scene.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from symphony.envs.objects import Objects
 from symphony.geometry.boxes import box_gap
+from symphony.geometry.nearest import on_host
 
 CLEAR = 1.0
 """Metres that an agent which enters keeps from all others."""
@@ -26,6 +27,7 @@ def without(objects: Objects, index: Int[Tensor, "M N"], absent: Bool[Tensor, "M
     return objects._replace(valid=pad(objects.valid, (0, 1)).scatter(1, column, False)[:, :agents])
 
 
+@torch.no_grad()
 def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
     """Which agents that are ready can enter, far enough from all others.
 
@@ -37,26 +39,35 @@ def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M
         index: rows of A of the driven agents.
         ready: who wants to enter.
     """
-    row, slot = ready.nonzero(as_tuple=True)
-    agent = index[row, slot]
-    everyone = torch.arange(objects.valid.shape[1], device=index.device)
+    agents = objects.valid.shape[1]
+    slot = torch.arange(index.shape[1], device=index.device).expand(index.shape)
     # The place of an agent among those that are ready; all others are there already.
-    order = torch.full_like(objects.valid, -1, dtype=torch.int64)
-    order[row, agent] = slot
-    there = objects.valid[row] & (everyone != agent[:, None]) & (order[row] < slot[:, None])
-    own, size = objects.state[row, agent], objects.size[row, agent]
-    state, sizes = objects.state[row], objects.size[row]
+    order = torch.full_like(pad(objects.valid, (0, 1)), -1, dtype=torch.int64)
+    order = order.scatter(1, torch.where(ready, index, agents), slot)[:, :agents]
+    if not on_host(ready):
+        return ready & ~_blocked(objects, order, index, slot)
+    row, place = ready.nonzero(as_tuple=True)
+    one = place[:, None]
+    some = Objects(*(value[row] for value in objects))
+    found = torch.zeros_like(ready)
+    found[row, place] = ~_blocked(some, order[row], index[row].gather(1, one), one).squeeze(1)
+    return found
+
+
+def _blocked(
+    objects: Objects, order: Int[Tensor, "M A"], agent: Int[Tensor, "M n"], slot: Int[Tensor, "M n"]
+) -> Bool[Tensor, "M n"]:
+    """Whether anybody who is there, or goes first, is in the way of agents with these slots."""
+    everyone = torch.arange(objects.valid.shape[1], device=agent.device)
+    there = objects.valid[:, None] & (everyone != agent[..., None]) & (order[:, None] < slot[..., None])
+    own, size = (
+        value.gather(1, agent[..., None].expand(*agent.shape, value.shape[-1]))[:, :, None]
+        for value in (objects.state, objects.size)
+    )
+    state, sizes = objects.state[:, None], objects.size[:, None]
     blocked = torch.zeros_like(there)
     for seconds, least in ((0.0, CLEAR), *((t, 0.0) for t in FORESEEN)):
-        gap = box_gap(
-            (own[:, :2] + seconds * own[:, 3:])[:, None],
-            own[:, None, 2],
-            size[:, None],
-            state[..., :2] + seconds * state[..., 3:],
-            state[..., 2],
-            sizes,
-        )
+        here, others = (value[..., :2] + seconds * value[..., 3:] for value in (own, state))
+        gap = box_gap(here, own[..., 2], size, others, state[..., 2], sizes)
         blocked |= there & (gap < least)
-    found = torch.zeros_like(ready)
-    found[row, slot] = ~blocked.any(-1)
-    return found
+    return blocked.any(-1)
