@@ -24,8 +24,9 @@ from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
 from symphony.collectors.rules import group_members, prune
-from symphony.envs import DrivingEnv
+from symphony.envs import DrivingEnv, ObservationConfig
 from symphony.modules import SeededNoise
+from symphony.simulation.background import CarFollower
 from symphony.simulation.rollouts import simulate, start_states
 
 FEW = 7  # constants that are made once, in however many steps
@@ -49,6 +50,21 @@ def test_simulations_stay_on_the_device(space: Any) -> None:
         found = simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
         assert found.state.shape == (2, 2, 1, LOGGED, 2, 4)
         assert {part.device.type for part in found} == {NAME}
+        assert device.waits == []
+        assert device.constants < FEW
+
+
+def test_others_that_a_rule_drives_stay_on_the_device() -> None:
+    scenes = SCENES.clone()
+    scenes.background = scenes.interactive_valid.clone()
+    env = DrivingEnv(scenes, observation=ObservationConfig.nothing())
+    follow = CarFollower(env)  # looks at the maps once
+    with pretend() as device:
+        on(device, env)
+        follow.routes = type(follow.routes)(*(on(device, part) for part in follow.routes))
+        number = torch.arange(2, device=device.device)
+        state = env.start(number, number)
+        assert follow(state)[keys.BACKGROUND].device.type == NAME
         assert device.waits == []
         assert device.constants < FEW
 

@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from helpers_segments import crossing
+from symphony import keys
+from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.edge import leaving
 from symphony.envs.objects import Objects
 from symphony.envs.traffic import entering
+from symphony.roadgraph import LaneGraph
+from symphony.simulation.background import CarFollower
 
 
 @pytest.mark.parametrize(
@@ -64,6 +69,23 @@ def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("symphony.envs.traffic.on_host", lambda _: False)
     assert torch.equal(entering(objects, index, ready), found)
     assert not entering(objects, index, torch.zeros_like(ready)).any()
+
+
+def test_on_a_device_the_same_are_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There the rule moves everybody, and those it doesn't drive are put back."""
+    segments = [(s, LaneGraph(s.road)) for s in (crossing(6, seed=1), crossing(5, seed=5))]
+    ruled = np.arange(4) % 2 > 0
+    scenes = collate([scene(s, range(4), graph, background=ruled) for s, graph in segments])
+    env = DrivingEnv(scenes, observation=ObservationConfig.nothing())
+    start = env.start(torch.tensor([[0, 1], [1, 0], [0, 0]]))
+    follow = CarFollower(env)
+    found = follow(start.clone())[keys.BACKGROUND]
+    monkeypatch.setattr("symphony.simulation.background.on_host", lambda _: False)
+    there = follow(start.clone())[keys.BACKGROUND]
+    torch.testing.assert_close(there, found, rtol=0, atol=1e-5)
+    still = (there == start[keys.STATE]).all(-1)
+    assert still[..., ~ruled].all()
+    assert not still[..., ruled].any()
 
 
 def test_who_is_beyond_any_side_of_the_map_has_left() -> None:

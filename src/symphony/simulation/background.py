@@ -1,6 +1,6 @@
 """Background traffic: vehicles that nobody evaluates, driven by a rule, all rollouts at a time.
 
-Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout.
+Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout (on a device all agents).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from symphony.envs.objects import Objects
 from symphony.envs.routes import SPACING, pick_routes
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap
-from symphony.geometry.nearest import nearest
+from symphony.geometry.nearest import nearest, on_host
 from symphony.geometry.stations import NEAR
 from symphony.simulation.planner import MAX_BRAKING, MAX_STEERING
 from symphony.simulation.planners import (
@@ -86,7 +86,9 @@ class CarFollower(TensorDictModuleBase):
         scenes, lead = self.env.scenes, tensordict.ndim
         row, at = tensordict.get(keys.SCENE).flatten(), tensordict.get(keys.STEP).flatten()
         state, valid = (tensordict.get(key).flatten(0, lead - 1) for key in (keys.STATE, keys.VALID))
-        m, n = (scenes.background[row] & valid).nonzero(as_tuple=True)
+        drives = scenes.background[row] & valid
+        # A device would wait to tell whom to leave out: there all others are moved, too, and put back.
+        m, n = drives.nonzero(as_tuple=True) if on_host(drives) else _pairs(drives)
         everyone = self.env.objects(row, at, state, valid)
         size = scenes.box_size[row[m], scenes.interactive[row[m], n]]
         own, line = state[m, n], _Lines(*(part[row[m], n] for part in self.routes))
@@ -99,7 +101,7 @@ class CarFollower(TensorDictModuleBase):
         after = bicycle_step(
             own, pull, self._steering(line, own, size[:, 0], station), size[:, 0], self.env.dt
         )
-        moved = state.index_put((m, n), after)
+        moved = state.index_put((m, n), torch.where(drives[m, n, None], after, own))
         return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
 
     def _driven(self, row: Tensor, at: Tensor, n: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
@@ -334,6 +336,12 @@ def _at(line: _Lines, station: Float[Tensor, " P"]) -> Float[Tensor, "P 2"]:
         1e-6
     )
     return start + share[:, None] * (end - start)
+
+
+def _pairs(values: Tensor) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """Row and column of every element of a matrix."""
+    row, column = (torch.arange(size, device=values.device) for size in values.shape)
+    return row.repeat_interleave(len(column)), column.repeat(len(row))
 
 
 def _unit(vectors: Tensor) -> Tensor:
