@@ -1,6 +1,7 @@
 """Background traffic: vehicles that nobody evaluates, driven by a rule, all rollouts at a time.
 
-Legend: B scenes, N driven agents, K points of a route, P background agents that are there in any rollout (on a device all).
+Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout; on a
+device all agents.
 """
 
 from __future__ import annotations
