@@ -104,6 +104,18 @@ def test_agents_that_are_lost_and_odd_ids_stay_apart(tmp_path: Path) -> None:
     assert AgentType.CYCLIST in again.agent_type
 
 
+def test_json_says_who_is_the_ego_and_where_it_was_to_go() -> None:
+    segment = crossing(4, steps=11).replace(ego=2, origin=np.array([300.0, -20.0, 5.0]))
+    route = np.array([(0, 0, 0), (10, 5, 0)], np.float32)
+    routes = Polylines.of([route + 7, route])
+    saved = played(segment, [1, 2], goal=np.array([[-1, 1]]), routes=routes)
+    found = {agent["id"]: agent for agent in to_dict(saved, 0)["agents"]}
+    assert [found[int(number)]["ego"] for number in segment.agent_id] == [False, False, True, False]
+    assert found[int(segment.agent_id[1])]["route"] is None
+    assert found[int(segment.agent_id[2])]["route"] == [[300.0, -20.0], [310.0, -15.0]]
+    assert "route" not in found[int(segment.agent_id[0])]
+
+
 def test_a_run_that_failed_at_once_is_a_scenario_without_anybody() -> None:
     saved = played(straight_road(1), failed={0: "why"})
     saved.counted[:] = False

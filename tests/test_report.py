@@ -303,6 +303,17 @@ def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     assert totals["max_jerk"] == pytest.approx(0, abs=1e-3)
 
 
+def test_times_are_percent_of_what_was_driven() -> None:
+    saved = played(driving((0, 0, 0, 7), (40, 0, 0, 7)), [0, 1], 2)
+    saved.offroad[0, :5, 0] = True
+    saved.counted[0, 10:, 1] = False  # its steps: 20 and 10
+    first, second = rows(saved)
+    assert (first["steps"], second["steps"]) == (30, 40)
+    assert first["offroad_time"] == pytest.approx(100 * 5 / 30)
+    assert second["offroad_time"] == 0
+    assert total_numbers([first, second])["offroad_time"] == pytest.approx(100 * 5 / 70)
+
+
 def test_the_ego_alone_is_evaluated_on_request() -> None:
     segment = driving((-30, LANE_WIDTH, 0, 5), (0, 0, 0, 12), (10, 0, 0, 7))
     saved = played(segment, [0, 1])
