@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers_losses import CASES, ROWS, SCENES, batch_of, losses, searched, spec
 from helpers_segments import crossing, ring, straight_road
 from symphony import keys
+from symphony.agents import build_agent
+from symphony.collectors import KeepBest, PruningRule, Systematic
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
 from symphony.roadgraph import LaneGraph
 
@@ -24,6 +28,12 @@ EVERYTHING: dict[str, Any] = {
     "foresight": (0.5, 1.0),
 }
 GROUPS = {"points": (), "lights": (), "objects": ("gap", "gap_ahead", "along")}
+
+
+def as_on_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, module in list(sys.modules.items()):
+        if name.startswith("symphony.") and "on_host" in vars(module):
+            monkeypatch.setattr(module, "on_host", lambda _: False)
 
 
 def states(env: DrivingEnv, seed: int) -> Any:
@@ -64,9 +74,7 @@ def test_a_device_sees_and_flags_the_same(
     env = DrivingEnv(scenes, observation=ObservationConfig(*counts, **EVERYTHING))
     given = states(env, seed)
     found = env.at(given)
-    for name, module in list(sys.modules.items()):
-        if name.startswith("symphony.") and "on_host" in vars(module):
-            monkeypatch.setattr(module, "on_host", lambda _: False)
+    as_on_a_device(monkeypatch)
     there = env.at(given)
     for flag in (keys.COLLISION, keys.OFFROAD):
         assert torch.equal(there[flag], found[flag])
@@ -78,3 +86,48 @@ def test_a_device_sees_and_flags_the_same(
     grouped = {name for group, more in GROUPS.items() for name in (group, f"{group}_mask", *more)}
     for name in set(seen.keys()) - grouped:
         torch.testing.assert_close(seen[name], expected[name], atol=1e-4, rtol=0, msg=name)
+
+
+@pytest.mark.parametrize(("name", "space"), CASES)
+def test_a_device_learns_the_same(name: str, space: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    every = spec(space)
+    # All points, as of several at one distance a device may see others.
+    agent = build_agent("agent", replace(every, agent=replace(every.agent, num_points=2000)))
+    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    row = torch.arange(ROWS) % 2
+    loss, batch = losses(agent, env)[name], batch_of(env, env.start(row, row))
+    batch[keys.GOAL_SET] = batch[keys.ROUTES_MASK] & (torch.arange(batch[keys.ROUTES_MASK].shape[-1]) == 0)
+    given = batch.exclude(keys.ACTION) if name == "mgail" else batch
+    found = differentiated(loss, given)
+    as_on_a_device(monkeypatch)
+    largest = max(float(gradient.abs().max()) for gradient in found[1:])
+    assert largest > 1e-6
+    for there, here in zip(differentiated(loss, given), found, strict=True):
+        torch.testing.assert_close(there, here, atol=0.05 * largest, rtol=1e-4)
+
+
+def differentiated(loss: Any, given: Any) -> list[Tensor]:
+    """A loss, and its gradients."""
+    loss.zero_grad()
+    torch.manual_seed(0)
+    out = loss(given.copy())
+    total = sum(value for key, value in out.items() if key.startswith("loss"))
+    assert isinstance(total, Tensor)
+    total.backward()
+    gradients = [value.grad.clone() for value in loss.parameters() if value.grad is not None]
+    return [total.detach(), *gradients]
+
+
+@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6)], ids=repr)
+@torch.no_grad()
+def test_a_device_finds_the_same(rule: PruningRule, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    agent = build_agent("agent", spec("bicycle"))
+    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    found = searched(agent, env, rule)
+    as_on_a_device(monkeypatch)
+    there = searched(agent, env, rule)
+    for key in (keys.STATE, keys.ACTION, keys.VALID):
+        assert torch.equal(there.trajectories[key], found.trajectories[key])
+    torch.testing.assert_close(there.totals, found.totals, atol=1e-4, rtol=0)
