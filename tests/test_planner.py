@@ -23,6 +23,7 @@ from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
+from symphony.envs.dynamics import WHEELBASE
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
 from symphony.simulation.demonstrations import SceneDataset
@@ -217,6 +218,25 @@ def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
     assert scenario.steps == segment.num_steps - 1
     assert np.linalg.norm(scenario.route[0] - segment.position[segment.ego, 0, :2]) < 4
     assert len({one.seed for one in told}) == len(told)
+
+
+def test_it_steers_a_vehicle_of_its_own_length() -> None:
+    """Heading by the distance driven: with tan(slip) half of tan(steering), 2 sin(slip) over the wheelbase."""
+
+    class Turns:
+        def reset(self, scenario: Scenario) -> None:
+            self.size = scenario.size
+
+        def plan(self, traffic: Traffic) -> Control:
+            return Control(1.0, 0.2)
+
+    segment = dataset(load_agent(AGENT)).segment(0)
+    state = simulated(Turns, rollouts=1).rollouts.state[0, 0, :, 0].double()
+    driven = (0.5 * (state[1:, 3] + state[:-1, 3]) * segment.dt).sum()
+    turned = np.unwrap(state[:, 2].numpy())
+    slip = np.arctan(0.5 * np.tan(0.2))
+    expected = 2 * np.sin(slip) / (WHEELBASE * float(segment.size[segment.ego, 0]))
+    assert (turned[-1] - turned[0]) / float(driven) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(
