@@ -18,7 +18,7 @@ MAX_PLAYBACK_AGENTS = 256
 MAX_ROAD_POINTS = 10_000
 EXCLUSIONS = {
     "playback_agents": f"more than {MAX_PLAYBACK_AGENTS} playback agents",
-    "roadgraph_points": f"more than {MAX_ROAD_POINTS} roadgraph points",
+    "roadgraph_points": f"more than {MAX_ROAD_POINTS} roadgraph points (convert --radius keeps fewer)",
     "interactive_agents": "too few interactive agents",
     "overlaps": "boxes that overlap in the log",
 }
