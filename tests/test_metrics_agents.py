@@ -14,7 +14,9 @@ from symphony.metrics import AgentSteps, CollisionKind, CollisionKinds
 from symphony.metrics.agents import AgentResult, agent_rates, agent_results, speed_distance
 
 
-def steps_of(there: Any, logged: Any, kind: Any, speed: Any, speed_log: Any, playback: Any) -> AgentSteps:
+def steps_of(
+    there: Any, logged: Any, kind: Any, speed: Any, speed_log: Any, playback: Any, offroad: Any
+) -> AgentSteps:
     kind = torch.as_tensor(kind)
     none = torch.full_like(kind, -1)
     kinds = CollisionKinds(kind, none, none, torch.as_tensor(playback))
@@ -22,7 +24,7 @@ def steps_of(there: Any, logged: Any, kind: Any, speed: Any, speed_log: Any, pla
     return AgentSteps(
         there,
         torch.as_tensor(logged),
-        torch.zeros_like(there),
+        torch.as_tensor(offroad),
         kinds,
         torch.as_tensor(speed, dtype=torch.float32),
         torch.as_tensor(speed_log, dtype=torch.float32),
@@ -39,6 +41,7 @@ def made(seed: int, batch: int, agents: int = 3, steps: int = 5) -> AgentSteps:
         rng.uniform(0, 30, shape),
         rng.uniform(0, 30, (batch, agents, steps)),
         rng.random(shape[:3]) < 0.5,
+        rng.random(shape) < 0.2,
     )
 
 
@@ -54,10 +57,13 @@ def test_by_hand() -> None:
     kind = [[[int(CollisionKind.INTO_LEADER), int(CollisionKind.REAR_ENDED), -1]]]
     speed = [[[[4.0, 4.0, 4.0], [0.1, 0.3, 9.0], [9.0, 9.0, 9.0]]]]
     log = [[[5.0, 5.0, 5.0], [0.1, 0.3, 0.0], [7.0, 7.0, 0.0]]]
-    found = totals(agent_results(steps_of(there, logged, kind, speed, log, [[[False, True, False]]])))
+    off = [[[[False, True, True], [False, False, True], [True, True, True]]]]
+    steps = steps_of(there, logged, kind, speed, log, [[[False, True, False]]], off)
+    found = totals(agent_results(steps))
     assert found["agent_collision_rate"] == 100
     assert found["agent_collision_into_leader"] == found["agent_collision_rear_ended"] == 50
     assert found["agent_collision_with_playback"] == 50
+    assert found["agent_offroad_time"] == 40  # two of five steps that both have
     assert found["agent_progress"] == pytest.approx(100 * 12.4 / 15.4)
     assert found["agent_standing"] == found["agent_standing_log"] == 40
     assert found["agent_speed_log"] == pytest.approx(15.4 / 5)
@@ -69,7 +75,13 @@ def test_speeds_are_as_far_apart_as_they_are_shifted() -> None:
     for shift in (0.0, 1.0, 7.5):
         found = agent_results(
             steps_of(
-                there, there[0], [[[-1]]], speed[None, None, None] + shift, speed[None, None], [[[False]]]
+                there,
+                there[0],
+                [[[-1]]],
+                speed[None, None, None] + shift,
+                speed[None, None],
+                [[[False]]],
+                ~there,
             )
         )
         assert speed_distance(found) == pytest.approx(shift)

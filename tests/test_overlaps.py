@@ -36,11 +36,23 @@ def boxes(s: RunSegment, step: int) -> list[shapely.Polygon]:
     return found
 
 
+def crowded(seed: int) -> RunSegment:
+    """Agents so near to each other that some overlap; whoever is not there may be where others are."""
+    segment = random_segment(seed=seed, agents=7)
+    gone = np.random.default_rng(seed).random(segment.valid.shape) < 0.3
+    position = segment.position - np.float32(0.95) * segment.position[:, 2:3]
+    return segment.replace(position=position, valid=segment.valid & ~gone)
+
+
+def test_some_of_them_overlap() -> None:
+    found = [len(overlapping(crowded(seed))) for seed in range(20)]
+    assert min(found) == 0
+    assert sum(found) > 10
+
+
 @given(st.integers(0, 200))
 def test_agrees_with_shapely(seed: int) -> None:
-    segment = random_segment(seed=seed, agents=7)
-    # Nearer to each other than they come, so that some overlap.
-    segment = segment.replace(position=segment.position * np.float32(0.05))
+    segment = crowded(seed)
     drives = (segment.agent_type == AgentType.VEHICLE) & (travel(segment) > 2)
     sure, possible = set(), set()
     for step in range(segment.num_steps):
