@@ -36,11 +36,13 @@ def norms(**values: float) -> dict[str, Tensor]:
     return {f"gradient_norm_{name}": torch.tensor(value) for name, value in values.items()}
 
 
-@given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=60))
-def test_skips_are_counted_until_a_network_has_too_many_in_a_row(updates: list[tuple[bool, bool]]) -> None:
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(1, PATIENCE)), max_size=20))
+def test_skips_are_counted_until_a_network_has_too_many_in_a_row(
+    runs: list[tuple[bool, bool, int]],
+) -> None:
     skips, total = Skips(), 0
     row = {"policy": 0, "goals": 0}
-    for bad in updates:
+    for *bad, _ in (one for one in runs for _ in range(one[-1])):
         names = [name for name, is_bad in zip(row, bad, strict=True) if is_bad]
         row = {name: row[name] + 1 if name in names else 0 for name in row}
         total += len(names)
