@@ -367,7 +367,7 @@ class DrivingEnv(EnvBase):
             terminated = terminated | flags[key].any(-1)
         observation = {name: value for name, value in seen._asdict().items() if value is not None}
 
-        def back(value: Shaped[Tensor, M * e]) -> Shaped[Tensor, ... * e]:
+        def back(value: Shaped[Tensor, "M ..."]) -> Shaped[Tensor, "*_"]:
             return value.reshape((*shape, *value.shape[1:]))
 
         each = [*shape, self.num_agents]
@@ -428,7 +428,7 @@ def _rows_of(values: Float[Tensor, "*b A F"], index: Int[Tensor, "*b N"]) -> Flo
     return values.gather(-2, index[..., None].expand(*index.shape, values.shape[-1]))
 
 
-def _of(table: Shaped[Tensor, B * e], scene: Int[Tensor, "*b"]) -> Shaped[Tensor, ...]:
+def _of(table: Shaped[Tensor, "B ..."], scene: Int[Tensor, "*b"]) -> Shaped[Tensor, "*_"]:
     """table[scene], which does not compile where a single scene is a number, that is, without dimensions."""
     return table.index_select(0, scene.flatten()).reshape((*scene.shape, *table.shape[1:]))
 

@@ -97,9 +97,9 @@ class _Poses(NamedTuple):
     """Position [M, A, 2], heading [M, A], velocity [M, A, 2] and validity [M, A]."""
 
     position: Float[Tensor, "M *A 2"]
-    heading: Float[Tensor, M * A]
+    heading: Float[Tensor, "M ..."]
     velocity: Float[Tensor, "M *A 2"]
-    valid: Bool[Tensor, M * A]
+    valid: Bool[Tensor, "M ..."]
 
     def of(self, row: Int[Tensor, " M"]) -> _Poses:
         """Of one agent [M] each."""
