@@ -81,3 +81,19 @@ def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not() -> None
         assert_close(tried.rollout(4), compiled, rtol=0, atol=1e-5)
     assert len(calls) == 1
     assert copy._step.__func__ is DrivingEnv._step
+
+
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+@torch.no_grad()
+def test_a_compiled_environment_takes_other_scenes_and_their_time_step() -> None:
+    torch.compiler.reset()
+    given = [collate([scene(straight_road().replace(dt=dt), [0, 1])]) for dt in (0.2, 0.1, 0.2)]
+    plain, compiled = (DrivingEnv(given[0], observation=ObservationConfig.nothing()) for _ in range(2))
+    compiled.compile(backend="eager", fullgraph=True)
+    for env_scenes in given:
+        found = []
+        for env in (plain, compiled):
+            env.scenes = env_scenes
+            start = env.start(torch.tensor([0])).set(keys.ACTION, torch.tensor([[80, 60]]))
+            found.append(env.step(start)["next"])
+        assert_close(found[1], found[0], rtol=0, atol=1e-5)

@@ -200,3 +200,10 @@ def test_the_fit_finds_the_action_that_was_taken(speed: float, heading: float, a
     elsewhere = after + torch.tensor([0.0, 0.0, 0.3, 0.0])
     found = dynamics.step(state, dynamics.towards(state, elsewhere, size, 0.2), size, 0.2)
     assert abs(wrap(found - elsewhere)[0, 2]) <= abs(wrap(after - elsewhere)[0, 2]) + 1e-9
+
+
+@pytest.mark.parametrize("action", [-1, 147, 999])
+def test_an_action_that_is_none_is_refused(action: int) -> None:
+    state, size = torch.zeros(2, 3, 4), torch.full((2, 3, 2), 4.0)
+    with pytest.raises(IndexError):
+        Bicycle().step(state, torch.full((2, 3), action), size, 0.2)

@@ -197,9 +197,16 @@ class Bicycle:
         size: Float[Tensor, "*b 2"],
         dt: float,
     ) -> Float[Tensor, "*b 4"]:
-        """Apply joint action indices."""
-        acceleration, steering = self.grid(state)
-        return bicycle_step(state, acceleration[action], steering[action], size[..., 0], dt)
+        """Apply joint action indices.
+
+        Raises:
+            IndexError: one that is none.
+        """
+        # Not by brackets, for which -1 is the last one.
+        acceleration, steering = (
+            values.index_select(0, action.flatten()).reshape(action.shape) for values in self.grid(state)
+        )
+        return bicycle_step(state, acceleration, steering, size[..., 0], dt)
 
     @torch.no_grad()
     def fit(
