@@ -27,7 +27,7 @@ from symphony.envs.dynamics import WHEELBASE
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import _plan, simulation, spread_runs
+from symphony.simulation.driving import planned_trees, simulation, spread_runs
 from symphony.simulation.planned import EgoPlanners
 from symphony.simulation.planner import (
     MAX_ACCELERATION,
@@ -367,7 +367,7 @@ def test_runs_are_spread_over_as_many_segments_as_there_are(
     )  # type: ignore[arg-type]
     config = dataclasses.replace(config, branches=16 // trees if tilt else 0)
     count, how = spread_runs(agent, config, runs, segments)
-    trees_of, _, taken = _plan(agent, how)  # refuses what can't be simulated
+    trees_of, _, taken = planned_trees(agent, how)  # refuses what can't be simulated
     assert 1 <= count <= segments
     assert trees_of * taken == how.rollouts
     assert runs <= count * how.rollouts

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from helpers_processes import apart, share_the_server
 from helpers_segments import crossing, straight_road
 from symphony import keys
+from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
@@ -31,7 +32,7 @@ from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.saved_files import About, RolloutWriter
 from symphony.simulation.saving import save_simulation
-from symphony.simulation.workers import _done, batches, naming, shared
+from symphony.simulation.workers import _done, batches, naming, segments_together, shared
 from test_engine import gone
 from test_finite import Spoiled
 from test_finite import agent as make_agent
@@ -126,12 +127,48 @@ def test_the_division_into_batches_changes_nothing(alone: Seen, store: SegmentSt
     assert other.own[METRIC] == pytest.approx(alone.found.own[METRIC])  # its sums are longer by the padding
 
 
-@given(st.integers(0, 70), st.integers(1, 20), st.integers(1, 9))
+@given(st.integers(0, 300), st.integers(0, 20), st.integers(1, 9))
 def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int, workers: int) -> None:
-    found = batches(range(items), EvaluateConfig(batch=batch, workers=workers))
+    config = EvaluateConfig(batch=batch, workers=workers)
+    found = batches(range(items), load_agent("playback"), config, 2)
     assert [i for part in found for i in part] == list(range(items))
-    assert all(1 <= len(part) <= batch for part in found)
-    assert found == batches(range(items), EvaluateConfig(batch=batch))
+    assert all(1 <= len(part) <= (batch or 64) for part in found)
+    assert len({len(part) for part in found[:-1]}) <= 1
+    if batch:
+        assert all(len(part) == batch for part in found[:-1])
+    elif workers > 1 and items >= 2 * workers:
+        assert len(found) > workers  # nobody is left without one
+
+
+@pytest.mark.parametrize(
+    ("settings", "together"),
+    [
+        ({}, 64),
+        ({"batch": 3}, 3),
+        ({"batch": 300}, 300),
+        ({"rollouts": 1, "search": "none"}, 64),
+        ({"rollouts": 1024, "branches": 1024}, 21),
+        ({"rollouts": 1024, "search": "none"}, 21),
+        ({"rollouts": 64, "search": "best"}, 21),
+        ({"rollouts": 4, "trees": 2, "branches": 512}, 21),
+        ({"branches": 512, "interactive": "all"}, 5),
+        ({"branches": 512, "others": "idm"}, 5),
+        ({"branches": 512, "open_traffic": True}, 5),
+        ({"rollouts": 10**6, "branches": 10**6}, 1),
+    ],
+)
+def test_as_many_segments_together_as_see_a_bounded_number_of_points(
+    settings: dict[str, Any], together: int
+) -> None:
+    agent = make_agent()
+    assert agent.observation.num_points == 12  # 2 agents x 1 024 branches x 12 points x 21 are 2^19
+    config = EvaluateConfig(**{"search": "tree", "branches": 16} | settings)
+    assert segments_together(agent, config, 2) == together
+
+
+def test_who_sees_nothing_is_simulated_in_full_batches() -> None:
+    assert segments_together(load_agent("constant_velocity"), EvaluateConfig(rollouts=10**4), 2) == 26
+    assert segments_together(load_agent("playback"), EvaluateConfig(), 2) == 64
 
 
 def spoiled() -> Any:

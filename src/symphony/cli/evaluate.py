@@ -174,7 +174,7 @@ class Evaluate:
             routes=agent.goals is not None,
             duration=config.duration or agent.duration,
         )
-        threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch), 3)
+        threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch or 16), 3)
         sys.stderr.write(f"threshold {threshold:g}: quantile {self.quantile:g} of the logs in {folder}\n")
         return replace(config, threshold=threshold)
 

@@ -15,6 +15,8 @@ Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 MOST = 128
 """Agents of a run segment that are driven, at most."""
+TOGETHER = 64
+"""Run segments simulated at a time, at most, unless more are asked for: with more, each costs no less."""
 Engine = Literal["local", "ray"]
 Setting = Literal["main", "long", "many"]
 """Of the paper's tables: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
@@ -129,8 +131,9 @@ class EvaluateConfig:
     log) or the agent itself (`learned`). Nobody evaluates them; traffic is open for all but the log."""
     metric: tuple[str, ...] = ()
     """Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout."""
-    batch: int = 16
-    """Run segments simulated at a time (changes memory and speed, not results)."""
+    batch: int = 0
+    """Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, fewer where their agents
+    see many points."""
     device: str = "cpu"
     """`cpu`, `cuda` or `cuda:N`."""
     workers: int = 1
@@ -143,7 +146,7 @@ class EvaluateConfig:
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         one_of(self, "engine", get_args(Engine))
-        positive(self, "rollouts", "batch", "trees", "workers", "action_temperature")
+        positive(self, "rollouts", "trees", "workers", "action_temperature")
         if self.engine == "ray" and self.device != "cpu":
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
@@ -156,7 +159,7 @@ class EvaluateConfig:
                 "a tilt needs a search that resamples: no retries, and neither search none nor best"
             )
         one_of(self, "others", get_args(Others))
-        not_negative(self, "radius", "branches", "duration", "prune_every", "temperature", "retries")
+        not_negative(self, "radius", "batch", "branches", "duration", "prune_every", "temperature", "retries")
         if self.interactive != "all" and not 0 <= self.interactive <= MOST:
             raise ConfigError(f"interactive is 'all' or a number up to {MOST}, is {self.interactive}")
         for path in self.metric:

@@ -194,7 +194,8 @@ def evaluate_dataset(
         load_object(path)  # or complain before anything is simulated
     seconds = [0.0] * len(everyone)
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
-    with closing(shared(evaluator, batches(range(len(dataset)), config), config, dataset)) as results:
+    tasks = batches(range(len(dataset)), agent, config, dataset.interactive)
+    with closing(shared(evaluator, tasks, config, dataset)) as results:
         for batch in results:
             for k, part in enumerate(batch.parts):
                 found[k].metrics.merge(part.metrics)
@@ -242,7 +243,7 @@ class _BatchEvaluator:
         """Evaluate some items."""
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(self.blank[0].config.device))
-            parts, seen = [], None
+            regions, parts, seen = _logged_curvatures(self.dataset, items, scenes), [], None
             for agent, blank in zip(self.agents, self.blank, strict=True):
                 began = time.process_time()
                 try:
@@ -252,7 +253,7 @@ class _BatchEvaluator:
                 seconds = time.process_time() - began
                 part = dataclasses.replace(blank, metrics=RolloutMetrics(), own={}, seconds=seconds)
                 own = {path: load_object(path) for path in blank.config.metric}
-                _add(part, self.dataset, items, scenes, found, own)
+                _add(part, self.dataset, items, scenes, found, own, regions)
                 parts.append(part)
                 if self.seen and seen is None:
                     seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
@@ -266,6 +267,7 @@ def _add(
     scenes: SceneBatch,
     found: Simulation,
     own: dict[str, Metric],
+    regions_log: list[NDArray[np.float64]],
 ) -> None:
     """Add the rollouts of some run segments to what was found."""
     rollouts, (log, log_valid) = found.rollouts, logged(scenes)
@@ -291,16 +293,13 @@ def _add(
         rollouts.state[..., 1:, :, 3].transpose(2, 3),
         log[:, 1:, :, 3].transpose(1, 2),
     )
-    evaluated_log = log_valid & ~scenes.background[:, None]
     there = (exists & ~scenes.background[:, None, :, None]).transpose(2, 3)
-    driven, counted, there, log, evaluated_log, log_valid = (
-        t.cpu() for t in (rollouts.state, evaluated.counted, there, log, evaluated_log, log_valid)
+    driven, counted, there, log_valid = (
+        t.cpu() for t in (rollouts.state, evaluated.counted, there, log_valid)
     )
-    regions, regions_log = [], []
-    for b, item in enumerate(items):
-        graph = dataset.graph(item)
-        regions.append(_curvatures(graph, driven[b], there[b]))
-        regions_log.append(_curvatures(graph, log[b], evaluated_log[b]))
+    regions = [
+        _curvatures(dataset.graph(i), *states) for i, *states in zip(items, driven, there, strict=True)
+    ]
     segments = [dataset.segment(i) for i in items]
     evaluation.metrics.update(
         [segment.segment_id for segment in segments],
@@ -359,6 +358,15 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T
         scenes.box_size[:, None],
         scenes.agent_type[:, None],
     )
+
+
+def _logged_curvatures(
+    dataset: SceneDataset, items: list[int], scenes: SceneBatch
+) -> list[NDArray[np.float64]]:
+    """Of every segment those that the evaluated agents visit in its log."""
+    log, valid = logged(scenes)
+    states = zip(items, log.cpu(), (valid & ~scenes.background[:, None]).cpu(), strict=True)
+    return [_curvatures(dataset.graph(item), *one) for item, *one in states]
 
 
 def _curvatures(

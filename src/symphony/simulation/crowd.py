@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
-from symphony.config.evaluation import MOST
+from symphony.config.evaluation import MOST, TOGETHER
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, interactive_choice, travel
 from symphony.data.store import SegmentStore
@@ -195,7 +195,7 @@ def crowd_dataset(
         indices,
         routes=agent.routed or routes,
         duration=config.duration or agent.duration,
-        keep=config.batch,
+        keep=config.batch or TOGETHER,
     )
 
 

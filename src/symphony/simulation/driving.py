@@ -105,7 +105,7 @@ def simulation(
         policy = ConstantVelocity(Bicycle())
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    trees, branches, taken = _plan(agent, config)
+    trees, branches, taken = planned_trees(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
@@ -260,7 +260,7 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
     return config.search
 
 
-def _plan(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
+def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
     if kind in ("none", "log"):

@@ -79,7 +79,8 @@ def save_simulation(
         todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
     drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
-    with closing(shared(drive, batches(todo, config), config, dataset)) as results:
+    tasks = batches(todo, agent, config, dataset.interactive)
+    with closing(shared(drive, tasks, config, dataset)) as results:
         for saved in results:
             for one in saved:
                 writer.add(one)

@@ -9,10 +9,18 @@ from functools import lru_cache
 from typing import Any, TypeVar, cast
 
 from symphony import allocator
+from symphony.agents import Agent
 from symphony.config import EvaluateConfig
+from symphony.config.evaluation import TOGETHER
 from symphony.data.engine import WorkerError, ordered_map
 from symphony.errors import ConfigError, SymphonyError
 from symphony.simulation.demonstrations import SceneDataset
+from symphony.simulation.driving import planned_trees
+
+POINTS = 1 << 19
+"""Map points that all agents of a batch see together, at most: some 50 MB of features."""
+IN_TRAFFIC = 16
+"""Agents that a run segment is taken to have where everyone is driven."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -20,9 +28,31 @@ Work = Callable[[T], R]
 """What is done with a task, such as a batch of items; a picklable object, with the dataset and the agent inside."""
 
 
-def batches(items: Sequence[int], config: EvaluateConfig) -> list[list[int]]:
-    """Items in their order, ``config.batch`` at a time, however many workers there are."""
-    return [list(items[first : first + config.batch]) for first in range(0, len(items), config.batch)]
+def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
+    """Run segments to simulate at a time: as many as the configuration says. Where it leaves that open, up to
+    ``TOGETHER``, as a step of few agents costs little less than one of many; fewer if they see more than ``POINTS``.
+
+    Args:
+        agent: that drives.
+        config: in how many rollouts and branches.
+        interactive: agents per segment, where not everyone is driven.
+    """
+    if config.batch:
+        return config.batch
+    everyone = config.interactive == "all" or config.open_traffic or config.others != "log"
+    trees, branches, _ = planned_trees(agent, config)
+    agents = trees * branches * (IN_TRAFFIC if everyone else interactive)
+    return min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
+
+
+def batches(items: Sequence[int], agent: Agent, config: EvaluateConfig, interactive: int) -> list[list[int]]:
+    """Items in their order, :func:`segments_together` at a time; where the configuration leaves that open, so few
+    that each of several workers gets two batches.
+    """
+    size = segments_together(agent, config, interactive)
+    if config.workers > 1 and not config.batch:
+        size = max(1, min(size, -(-len(items) // (2 * config.workers))))
+    return [list(items[first : first + size]) for first in range(0, len(items), size)]
 
 
 def shared(
