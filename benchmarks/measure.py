@@ -27,6 +27,7 @@ from dataclasses import dataclass, field
 from functools import partial, reduce, wraps
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -34,6 +35,7 @@ from torch.utils.flop_counter import flop_registry
 
 from symphony import __version__, allocator
 from symphony.files import write_json
+from symphony.modules import pool_elements
 from workloads import WORKLOADS, Work, matmul, rings, search
 
 SIMULATOR = {
@@ -73,6 +75,8 @@ class Row:
         unit: of what a round does many of.
         tuned: with the allocator as it comes, and as the ``symphony`` command sets it; else only the latter.
         counted: whether its operators are; what is compiled has none where it is, and runs as it was where they are.
+        pooled: whether the operations are told, too, that it would take to encode and differentiate every element of
+            a set instead of those that win a max-pool, with the same gradients.
     """
 
     work: Callable[[], Work]
@@ -82,6 +86,7 @@ class Row:
     unit: str = "agent-steps"
     tuned: tuple[bool, ...] = (True,)
     counted: bool = True
+    pooled: bool = False
 
 
 BOTH = (False, True)
@@ -95,8 +100,8 @@ HOW: dict[str, dict[str, Any]] = {
     "smallest step, compiled": {"counted": False},
     "actions of two": {},
     "search 16 x 16 x 50": {"parts": SEARCH, "tuned": BOTH, **LONG},
-    "bc update": {"parts": UPDATE, "unit": "updates", "warm": 3, "tuned": BOTH},
-    "bc update, paper size": {"parts": UPDATE, "unit": "updates", "tuned": BOTH, **LONG},
+    "bc update": {"parts": UPDATE, "unit": "updates", "tuned": BOTH, "pooled": True},
+    "bc update, paper size": {"parts": UPDATE, "unit": "updates", "tuned": BOTH, "pooled": True, **LONG},
     "bc_ts_h update": {"parts": UPDATE, "unit": "updates", **LONG},
     "segment prepared": {"parts": PREPARATION, "unit": "segments", **LONG},
     "segment evaluated": {"parts": SEARCH, "unit": "segments", **LONG},
@@ -191,6 +196,11 @@ class Calls(TorchDispatchMode):
         return found
 
 
+def densely(pool: Callable[..., Any], *sets: Any, mode: str = "") -> Any:
+    """Pool with all elements encoded and differentiated, whatever the mode is."""
+    return pool(*sets, mode="dense")
+
+
 def timed(work: Callable[[], Any]) -> dict[str, float]:
     """CPU seconds and page faults of a round."""
     faults, began = resource.getrusage(resource.RUSAGE_SELF).ru_minflt, time.process_time()
@@ -215,6 +225,10 @@ def measured(row: Row, rounds: int, *, tuned: bool) -> dict[str, Any]:
     with Calls() as calls:
         if row.counted:
             work()
+    dense = Calls()
+    if row.pooled:
+        with dense, mock.patch("symphony.modules.encoder.pool_elements", partial(densely, pool_elements)):
+            work()
     shares: dict[str, float] = {}
     if row.parts:
         parts = Parts(row.parts)
@@ -232,6 +246,7 @@ def measured(row: Row, rounds: int, *, tuned: bool) -> dict[str, Any]:
         "mebibytes": (top - prepared) / 1024,
         "operators": calls.count,
         "flops": calls.flops,
+        "dense": dense.flops,
         "matmul": operations / statistics.median(peak),
         "parts": shares,
     }

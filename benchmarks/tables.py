@@ -35,6 +35,12 @@ def spread(row: Row) -> str:
     return f"{50 * (high - low) / row['seconds']:.0f} %"
 
 
+def share(row: Row, operations: str) -> str:
+    """Of the speed of the matrix product."""
+    found = row.get(operations, 0)  # reports of before have fewer
+    return f"{100 * found / row['seconds'] / row['matmul']:.0f} %" if found else ""
+
+
 def per_product(row: Row) -> float:
     """Units in the time of 10^9 operations of the matrix product."""
     return rate(row) / row["matmul"] * 1e9
@@ -56,7 +62,8 @@ def speeds(found: Mapping[str, list[Row]], before: Mapping[str, list[Row]]) -> I
                 f"{1e3 / rate(row) if row['unit'] != 'agent-steps' else 1e3 * row['seconds']:,.4g}",
                 spread(row),
                 f"{rate(row) / brute:.2f}" if comparable else "",
-                f"{100 * row['flops'] / row['seconds'] / row['matmul']:.0f} %" if row["flops"] else "",
+                share(row, "flops"),
+                share(row, "dense"),
                 f"{row['operators']:,}" if row["operators"] else "",
                 f"{row['faults']:,.0f}",
                 f"{row['mebibytes']:,.0f}",
@@ -72,6 +79,7 @@ HEAD = (
     "spread",
     "of brute force",
     "of the matrix product",
+    "dense count",
     "operators",
     "page faults",
     "peak MiB",
@@ -115,6 +123,7 @@ CPU time, medians. `make bench` measures again, in {minutes}. A product of matri
 - *ms*: of a round of all agents; of one update or segment where those are counted.
 - *spread*: half the distance of the quartiles.
 - *of the matrix product*: operations in products of matrices a second, in those of the product beside.
+- *dense count*: the same, of the operations that encoding and differentiating every element would take.
 - *operators*, *page faults*: of a round; *peak MiB*: of memory above what was prepared.
 """
     head = [*HEAD, *(["before: 1"] if old else [])]

@@ -233,9 +233,9 @@ def preparation(segments: int = 64) -> Work:
     return once, segments
 
 
-def evaluation(segments: int = 16, rollouts: int = 16) -> Work:
-    """An agent that comes with the package on built-in test segments, with its search."""
-    agent, store = load_agent("pretrained:bc_ts_h"), SegmentStore(builtin_store("test"))
+def evaluation(segments: int = 64, rollouts: int = 16) -> Work:
+    """An agent that comes with the package on built-in segments, with its search."""
+    agent, store = load_agent("pretrained:bc_ts_h"), SegmentStore(builtin_store("train"))
     config = EvaluateConfig(rollouts=rollouts)
     return lambda: evaluate(agent, store, config, items=range(segments)), segments
 

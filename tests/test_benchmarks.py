@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+
+from symphony.modules import mlp, pool_elements
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 
@@ -43,7 +47,7 @@ def row(seconds: float, **changes: Any) -> dict[str, Any]:
 def test_tables_hold_the_ratios(program: Any) -> None:
     rows = {
         "simulator": [row(0.5, tuned=False), row(0.25, parts={"dynamics": 0.75, "the rest": 0.25})],
-        "update": [row(2.0, units=1, unit="updates", flops=10**9)],
+        "update": [row(2.0, units=1, unit="updates", flops=10**9, dense=3 * 10**9)],
         "brute force": [row(1.0)],
         "points P = 16": [row(0.001)],
         "points P = 64": [row(0.002)],
@@ -65,7 +69,23 @@ def test_tables_hold_the_ratios(program: Any) -> None:
     # Twice the speed of the plain simulator as it comes, four times with memory kept: eight times what it was.
     assert [found["simulator", how][5] for how in ("as it comes", "kept")] == ["2.00", "4.00"]
     assert found["simulator", "kept"][-1] == "8.00"
-    assert found["update", "kept"][3:7] == ["2,000", "50 %", "", "25 %"]
+    assert found["update", "kept"][3:8] == ["2,000", "50 %", "", "25 %", "75 %"]
     assert ["simulator", "dynamics 75 %, the rest 25 %"] in cells
     assert ["points P", "16: 1 ms, 6 MiB; 64: 2 ms, 6 MiB"] in cells
     assert ["b", "3.0", "1.50"] in cells
+
+
+def test_dense_counts_the_operations_of_every_element(program: Any) -> None:
+    measure, encoder = program("measure"), mlp((3, 4, 5))
+    sets, mask, found = torch.rand(2, 100, 3), torch.ones(2, 100).bool(), {}
+    for how, pool in {"auto": pool_elements, "dense": partial(measure.densely, pool_elements)}.items():
+        with measure.Calls() as calls:
+            pooled = pool(encoder, sets, mask, mode="auto")
+        with measure.Calls() as back:
+            gradients = torch.autograd.grad(pooled.sum(), encoder.parameters())
+        found[how] = calls.flops, back.flops, gradients
+    forward = 2 * 200 * (3 * 4 + 4 * 5)
+    # Backwards once more for the weights, and once for what the second layer is given.
+    assert found["dense"][:2] == (forward, forward + 2 * 200 * 4 * 5)
+    assert found["auto"][1] < found["dense"][1] / 10
+    torch.testing.assert_close(found["auto"][2], found["dense"][2])

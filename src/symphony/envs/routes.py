@@ -123,7 +123,9 @@ def route_ahead(
     position, heading = state[..., :2], state[..., 2]
     exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
     with torch.no_grad():
-        squared = (points - position[..., None, :]).square().sum(-1)
+        # Component by component: sums over a last dimension of 2 are slow.
+        x, y = (points - position[..., None, :]).square().unbind(-1)
+        squared = x + y
         # The last point has nothing ahead of it, so the one before gives the direction.
         nearest = first_smallest(squared.masked_fill(~exists, torch.inf))
         nearest = nearest.minimum((count - 2).clamp_min(0))

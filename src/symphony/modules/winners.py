@@ -70,7 +70,9 @@ def _gradients(
     """Of the elements, and of each weight and bias, block by block."""
     channels, features = chosen.shape[1:]
     *before, (last, _) = layers
-    total = [(torch.zeros_like(weight), torch.zeros_like(bias)) for weight, bias in layers]
+    # [in, out] but for the last layer: a product whose result has few columns takes twice as long.
+    weights = [*(weight.new_zeros(weight.shape[::-1]) for weight, _ in before), torch.zeros_like(last)]
+    biases = [torch.zeros_like(bias) for _, bias in layers]
     of_chosen = torch.empty_like(chosen) if needed[0] else None
     sets = max(1, ROWS // channels)
     for a in range(0, len(chosen), sets):
@@ -81,16 +83,17 @@ def _gradients(
         above = (part[..., None] * last).view(len(known[-1]), -1)
         if before:
             above = torch.ops.aten.threshold_backward(above, known[-1], 0.0)
-        total[-1][0].add_((known[-1].view(*part.shape, -1) * part[..., None]).sum(0))
-        total[-1][1].add_(part.sum(0))
+        weights[-1].add_((known[-1].view(*part.shape, -1) * part[..., None]).sum(0))
+        biases[-1].add_(part.sum(0))
         for k in reversed(range(len(before))):
-            total[k][0].addmm_(above.t(), known[k])
-            total[k][1].add_(above.sum(0))
+            weights[k].addmm_(known[k].t(), above)
+            biases[k].add_(above.sum(0))
             if k:
                 above = torch.ops.aten.threshold_backward(above @ before[k][0], known[k], 0.0)
             elif of_chosen is not None:
                 above = above @ before[0][0]
         if of_chosen is not None:
             of_chosen[a : a + sets] = above.view(-1, channels, features)
-    each = [of_chosen, *(tensor for pair in total for tensor in pair)]
+    weights[:-1] = (weight.t().contiguous() for weight in weights[:-1])
+    each = [of_chosen, *(tensor for pair in zip(weights, biases, strict=True) for tensor in pair)]
     return [tensor if need else None for tensor, need in zip(each, needed, strict=True)]
