@@ -80,15 +80,17 @@ class Crowd:
         there = segment.valid
         if self.open_traffic:
             there = there & ~beyond(segment.position[..., :2], map_edge(graph))
-        moves = (segment.agent_type == AgentType.VEHICLE) & there.any(1) & (travel(segment) > MOVING)
-        stands = (segment.agent_type == AgentType.VEHICLE) & there.any(1) & ~moves & _in_lane(segment, graph)
-        first = there.argmax(1)
-        away = _distance_at(segment, first)
         early = interactive_choice(segment, segment.num_agents, fewer=True).agents
         if not there[segment.ego].any():
             raise DataError("the ego is never within the map", segment=segment.segment_id, field="ego")
         early = early[there[early].any(1)]
         order = [*early[:PAIR], *early[PAIR:][self._near(segment, early[PAIR:])]]
+        if len(order) >= self.count and not self.background:
+            return np.array(order[: self.count], np.int64), np.zeros(0, np.int64)
+        moves = (segment.agent_type == AgentType.VEHICLE) & there.any(1) & (travel(segment) > MOVING)
+        stands = (segment.agent_type == AgentType.VEHICLE) & there.any(1) & ~moves & _in_lane(segment, graph)
+        first = there.argmax(1)
+        away = _distance_at(segment, first)
         rest = np.setdiff1d(np.flatnonzero(moves | stands), early)
         rest = rest[np.lexsort((away[rest], stands[rest], first[rest]))]
         if not self.open_traffic:
