@@ -151,9 +151,9 @@ def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int
         ({"rollouts": 1024, "search": "none"}, 21),
         ({"rollouts": 64, "search": "best"}, 21),
         ({"rollouts": 4, "trees": 2, "branches": 512}, 21),
-        ({"branches": 512, "interactive": "all"}, 5),
-        ({"branches": 512, "others": "idm"}, 5),
-        ({"branches": 512, "open_traffic": True}, 5),
+        ({"branches": 512, "interactive": "all"}, 2),
+        ({"branches": 512, "others": "idm"}, 2),
+        ({"branches": 512, "open_traffic": True}, 2),
         ({"rollouts": 10**6, "branches": 10**6}, 1),
     ],
 )

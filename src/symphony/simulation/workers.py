@@ -19,8 +19,9 @@ from symphony.simulation.driving import planned_trees
 
 POINTS = 1 << 19
 """Map points that all agents of a batch see together, at most: some 50 MB of features."""
-IN_TRAFFIC = 16
-"""Agents that a run segment is taken to have where everyone is driven."""
+IN_TRAFFIC = 32
+"""Agents that a run segment is taken to have where everyone is driven: all of a batch have room for as many as the
+fullest."""
 
 T = TypeVar("T")
 R = TypeVar("R")
