@@ -28,7 +28,7 @@ from symphony.simulation.demonstrations import evenly_spaced
 from symphony.simulation.driving import simulation
 from symphony.simulation.personas import styles
 from symphony.simulation.saved import SavedRollouts, saved_rollouts
-from symphony.simulation.workers import batches
+from symphony.simulation.workers import batches, segments_together
 from symphony.simulation.world import world_of
 
 QUANTILES = (0.2, 0.5, 0.8)
@@ -60,7 +60,7 @@ def measured(saved: SavedRollouts, graph: LaneGraph) -> NDArray[np.float64]:
 def simulated(run: str, dataset: CrowdDataset, config: EvaluateConfig) -> NDArray[np.float64]:
     """Means [segments, 5]."""
     agent, rows = load_agent(run), []
-    for items in batches(range(len(dataset)), agent, config, dataset.interactive):
+    for items in batches(range(len(dataset)), segments_together(agent, config, dataset.interactive), config):
         scenes = dataset.scenes(items)
         rollouts = simulation(agent, scenes, config).rollouts
         for b, i in enumerate(items):

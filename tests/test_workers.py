@@ -7,6 +7,7 @@ import pickle
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from symphony.envs import Bicycle
 from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import EvaluatedBatch, Evaluation, evaluate
 from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
+from symphony.simulation import saving
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.saved_files import About, RolloutWriter
@@ -130,7 +132,7 @@ def test_the_division_into_batches_changes_nothing(alone: Seen, store: SegmentSt
 @given(st.integers(0, 300), st.integers(0, 20), st.integers(1, 9))
 def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int, workers: int) -> None:
     config = EvaluateConfig(batch=batch, workers=workers)
-    found = batches(range(items), load_agent("playback"), config, 2)
+    found = batches(range(items), batch or 64, config)
     assert [i for part in found for i in part] == list(range(items))
     assert all(1 <= len(part) <= (batch or 64) for part in found)
     assert len({len(part) for part in found[:-1]}) <= 1
@@ -169,6 +171,28 @@ def test_as_many_segments_together_as_see_a_bounded_number_of_points(
 def test_who_sees_nothing_is_simulated_in_full_batches() -> None:
     assert segments_together(load_agent("constant_velocity"), EvaluateConfig(rollouts=10**4), 2) == 26
     assert segments_together(load_agent("playback"), EvaluateConfig(), 2) == 64
+
+
+@pytest.mark.parametrize(
+    ("planner", "batch", "sizes"), [("idm", 0, [16, 4]), ("idm", 30, [20]), ("", 0, [20])]
+)
+def test_with_planners_fewer_segments_are_simulated_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planner: str, batch: int, sizes: list[int]
+) -> None:
+    with StoreWriter(tmp_path / "store") as writer:
+        for seed in range(20):
+            writer.append(straight_road(3, seed=seed, steps=4))
+    data = SceneDataset(SegmentStore(tmp_path / "store"), 2, Bicycle(), routes=True)
+    given: list[list[int]] = []
+
+    def nothing(_: Any, tasks: list[list[int]], *__: Any) -> Iterator[Any]:
+        given.extend(tasks)
+        yield from ()
+
+    monkeypatch.setattr(saving, "shared", nothing)
+    config = EvaluateConfig(rollouts=2, branches=2, batch=batch)
+    save_simulation(tmp_path / "out", make_agent(), data, config, planner=planner)
+    assert [len(items) for items in given] == sizes
 
 
 def spoiled() -> Any:

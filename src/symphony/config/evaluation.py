@@ -132,8 +132,8 @@ class EvaluateConfig:
     metric: tuple[str, ...] = ()
     """Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout."""
     batch: int = 0
-    """Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, fewer where their agents
-    see many points."""
+    """Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a
+    planner, fewer where their agents see many points."""
     device: str = "cpu"
     """`cpu`, `cuda` or `cuda:N`."""
     workers: int = 1

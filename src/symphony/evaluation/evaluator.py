@@ -41,7 +41,7 @@ from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.logged import logged
 from symphony.simulation.rollouts import Rollouts
-from symphony.simulation.workers import batches, naming, shared
+from symphony.simulation.workers import batches, naming, segments_together, shared
 
 BASELINES = ("playback", "constant_velocity")
 """Evaluated beside every agent, on the agents it drives and for as long."""
@@ -194,7 +194,7 @@ def evaluate_dataset(
         load_object(path)  # or complain before anything is simulated
     seconds = [0.0] * len(everyone)
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
-    tasks = batches(range(len(dataset)), agent, config, dataset.interactive)
+    tasks = batches(range(len(dataset)), segments_together(agent, config, dataset.interactive), config)
     with closing(shared(evaluator, tasks, config, dataset)) as results:
         for batch in results:
             for k, part in enumerate(batch.parts):

@@ -24,10 +24,12 @@ from symphony.simulation.planner import planner_maker, planner_name
 from symphony.simulation.planner_calls import SECONDS
 from symphony.simulation.saved import PLAYBACK, SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import About, RolloutFolder, RolloutWriter
-from symphony.simulation.workers import batches, naming, shared
+from symphony.simulation.workers import batches, naming, segments_together, shared
 
 _MEMORY = ("batch", "device", "metric", "workers", "engine")
 """Settings that change no rollout."""
+PLANNED = 16
+"""Run segments simulated at a time with a planner, of which each rollout has a copy, unless more are asked for."""
 
 
 def save_simulation(
@@ -79,7 +81,10 @@ def save_simulation(
         todo = _with_ego(writer, dataset, todo, config.rollouts)
     done = len(names) - len(todo)
     drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
-    tasks = batches(todo, agent, config, dataset.interactive)
+    together = segments_together(agent, config, dataset.interactive)
+    if planner and not config.batch:
+        together = min(together, PLANNED)
+    tasks = batches(todo, together, config)
     with closing(shared(drive, tasks, config, dataset)) as results:
         for saved in results:
             for one in saved:

@@ -46,11 +46,10 @@ def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) ->
     return min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
 
 
-def batches(items: Sequence[int], agent: Agent, config: EvaluateConfig, interactive: int) -> list[list[int]]:
-    """Items in their order, :func:`segments_together` at a time; where the configuration leaves that open, so few
-    that each of several workers gets two batches.
+def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:
+    """Items in their order, so many at a time; where the configuration leaves that open, so few that each of several
+    workers gets two batches.
     """
-    size = segments_together(agent, config, interactive)
     if config.workers > 1 and not config.batch:
         size = max(1, min(size, -(-len(items) // (2 * config.workers))))
     return [list(items[first : first + size]) for first in range(0, len(items), size)]
