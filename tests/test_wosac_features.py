@@ -115,6 +115,17 @@ def points_near(rng: np.random.Generator, lines: list[NDArray[Any]], count: int)
     return np.concatenate([near, rng.uniform(-300, 300, (10, 3))]).astype(np.float32)
 
 
+def not_tied(point: NDArray[Any], lines: list[NDArray[Any]]) -> bool:
+    """Whether all segments that are nearest in float32, heights counted three times, are equally far from above."""
+    start = np.concatenate([line[:-1] for line in lines])
+    along = np.concatenate([np.diff(line, axis=0) for line in lines])
+    away, squared = point - start, (along[:, :2] ** 2).sum(1)
+    share = ((away * along)[:, :2].sum(1) / np.where(squared == 0, 1, squared)).clip(0, 1)
+    offset = (away - share[:, None] * along) * [1, 1, 3]
+    square = (offset**2).sum(1)
+    return bool(np.ptp(np.hypot(*offset[square <= square.min() * (1 + 1e-6), :2].T)) < 1e-3)
+
+
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_road_edges_agree_with_looking_at_every_segment(seed: int, closed: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -127,9 +138,12 @@ def test_road_edges_agree_with_looking_at_every_segment(seed: int, closed: bool)
     found = signed_distance_to_edges(torch.from_numpy(points), Edges.of(Lines.of(lines)))
     wide = [line.astype(np.float64) for line in lines]
     expected = np.array([edge_distance(point, wide) for point in points.astype(np.float64)])
-    np.testing.assert_allclose(found.abs().numpy(), np.abs(expected), atol=2e-3, rtol=1e-4)
+    # Where two segments are equally near, rounding may choose either; their distances seen from above may differ.
+    one = np.array([not_tied(point, wide) for point in points.astype(np.float64)])
+    assert one.mean() > 0.9
+    np.testing.assert_allclose(found.abs().numpy()[one], np.abs(expected)[one], atol=2e-3, rtol=1e-4)
     clear = np.abs(expected) > 1e-2
-    # Where two segments are equally near, rounding may choose either; their sides may differ.
+    # Their sides may differ likewise.
     agree = np.sign(found.numpy()[clear]) == np.sign(expected[clear])
     assert agree.mean() > 0.97
 
