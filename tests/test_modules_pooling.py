@@ -200,14 +200,26 @@ def test_only_valid_elements_are_encoded(monkeypatch) -> None:
     assert encoded[1] < 300  # at most the next size
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 63, 64, 65, 200])
-def test_blocks_of_rows_do_not_depend_on_the_batch(n):
+@pytest.mark.parametrize("n", [1, 2, 3, 63, 64, 65, 200, 511, 512, 513, 1100])
+def test_blocks_of_rows_do_not_depend_on_the_batch(monkeypatch, n):
     torch.manual_seed(0)
-    network, x = mlp((150, 128, 128, 147)), torch.randn(200, 150)
+    network, x = mlp((150, 128, 128, 147)), torch.randn(1200, 150)
     with torch.no_grad():
         whole = in_blocks(network, x)
         assert torch.equal(in_blocks(network, x[:n]), whole[:n])
         assert torch.equal(in_blocks(network, x[-n:]), whole[-n:])
+        multiplied = []
+        monkeypatch.setattr(
+            rows, "reusing", lambda function: lambda block: multiplied.append(len(block)) or function(block)
+        )
+        many = [rows.MANY] * (n // rows.MANY) if rows.BLOCK in rows.equal_rows(network, x, rows.MANY) else []
+        assert torch.equal(in_blocks(network, x[:n]), whole[:n])
+        assert multiplied == many + [rows.BLOCK] * -(-(n - sum(many)) // rows.BLOCK)
+        multiplied.clear()
+        monkeypatch.setattr(rows, "_alike", lambda *_: False)
+        assert torch.equal(in_blocks(network, x[:n]), whole[:n])
+        assert set(multiplied) == {rows.BLOCK}
+    x = x[:200]
     torch.testing.assert_close(in_blocks(network, x.view(2, 100, 150)), network(x).view(2, 100, 147))
     assert in_blocks(network, x[:0]).shape == (0, 147)
 

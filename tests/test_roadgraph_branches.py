@@ -128,6 +128,42 @@ def test_a_valid_state_that_is_not_finite_is_refused(part):
         visited_regions(LaneGraph(road), *path, np.ones(5, bool))
 
 
+def test_trajectories_that_share_a_history_or_stand_equal_each_alone(monkeypatch):
+    road, name = crossing()
+    graph = LaneGraph(road)
+    position, heading, valid = random_batch(graph, name, shape=(4,))
+    history = (p[[0, 0, 0, 1, 2, 3, 3]].copy() for p in (position, heading, valid))
+    position, heading, valid = history
+    position[1, 30:], heading[1, 30:] = position[3, 30:], heading[3, 30:]
+    heading[2, 30:] += np.pi  # in the same places, the other way
+    position[4, 20:], heading[4, 20:] = position[4, 20], heading[4, 20]
+    position[5] = position[6, ::-1]
+    looked, near = [], type(graph.region_index).near
+    monkeypatch.setattr(
+        type(graph.region_index),
+        "near",
+        lambda index, points, reach: looked.append(points) or near(index, points, reach),
+    )
+    together = visited_regions(graph, position, heading, valid)
+    assert together.any()
+    assert len(looked[0]) == len(np.unique(position[valid], axis=0)) < valid.sum()
+    for i in range(len(valid)):
+        np.testing.assert_array_equal(together[i], visited_regions(graph, position[i], heading[i], valid[i]))
+
+
+def test_who_stops_at_any_state_hides_no_choice_of_who_goes_on():
+    road, name = crossing()
+    graph = LaneGraph(road)
+    position, heading = movement(graph, name, "left", 0, step=7.0)  # comes to no entry itself
+    steps = np.arange(len(position))
+    until = np.minimum(steps, steps[:, None])  # the last goes on to its end
+    found = visited_regions(graph, position[until], heading[until], np.ones(until.shape, bool))
+    assert found[-1].sum() == 1
+    for k, one in enumerate(until):
+        alone = visited_regions(graph, position[one], heading[one], np.ones(len(one), bool))
+        np.testing.assert_array_equal(found[k], alone)
+
+
 def test_batch_equals_one_at_a_time():
     road, name = crossing()
     graph = LaneGraph(road)

@@ -13,7 +13,9 @@ from torch import Tensor, nn
 from symphony.geometry.nearest import on_host, transformed
 
 BLOCK = 64
-"""Rows per block: large enough that the cost of the calls vanishes, small enough that padding stays cheap."""
+"""Rows per block: large enough that the cost of the calls is small, small enough that padding stays cheap."""
+MANY = 512
+"""Rows of a block where there are so many, if that gives a row the same bits."""
 
 
 def mlp(sizes: Sequence[int]) -> nn.Sequential:
@@ -47,16 +49,18 @@ def in_blocks(
     if torch.is_grad_enabled() or x.device.type != "cpu" or flat.shape[0] == 0 or transformed():
         out = function(flat)
     else:
-        missing = -flat.shape[0] % rows
+        count, missing = flat.shape[0], -flat.shape[0] % rows
         padded = torch.cat([flat, flat.new_zeros(missing, flat.shape[1])]) if missing else flat
-        apply = reusing(function)
-        first, *others = padded.split(rows)
-        begun = apply(first)
-        out = begun.new_empty(len(padded), begun.shape[1])
-        out[:rows] = begun
-        for k, block in enumerate(others, 1):
-            out[k * rows : (k + 1) * rows] = apply(block)
-        out = out[: flat.shape[0]]
+        wide = MANY if count >= MANY and rows in equal_rows(function, flat, MANY) else rows
+        whole, apply = count - count % wide, reusing(function)
+        blocks = [(a, wide) for a in range(0, whole, wide)]
+        blocks += [(a, rows) for a in range(whole, len(padded), rows)]
+        out = flat.new_empty(0)
+        for a, size in blocks:
+            found = apply(padded[a : a + size])
+            out = out if a else found.new_empty(len(padded), found.shape[1])
+            out[a : a + size] = found
+        out = out[:count]
     return out.reshape(*x.shape[:-1], out.shape[-1])
 
 
@@ -96,7 +100,7 @@ def _alike(outputs: int, inputs: int, few: int, rows: int, threads: int) -> bool
         for shape in ((rows, inputs), (outputs, inputs), (outputs,))
     )
     together = torch.addmm(bias, x, weight.t())
-    parts = slice(0, few), slice(rows - few, rows)
+    parts = [slice(a, a + few) for a in (*range(0, rows - few, few), rows - few)]
     return all(torch.equal(torch.addmm(bias, x[part], weight.t()), together[part]) for part in parts)
 
 

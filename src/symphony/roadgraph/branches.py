@@ -58,8 +58,10 @@ def visited_regions(
         return np.zeros((*lead, shape[1]), dtype=bool)
     # From here on all trajectories are one list of valid states; later states have higher numbers.
     begins = np.concatenate(([True], row[1:] != row[:-1]))
-    clear, region, starts = _states_on(graph, begins, points, headings)
-    events = np.concatenate((starts, _passes(graph, row, points, headings)))
+    # Rollouts that share a history, and whoever stands, come to a place many times: it is looked up once.
+    _, first, place = np.unique(points.view(np.complex128).ravel(), return_index=True, return_inverse=True)
+    clear, region, starts = _states_on(graph, begins, points, headings, first, place)
+    events = np.concatenate((starts, _passes(graph, row, points, headings, place)))
     parent, begin = _new_passes(events, begins)
     # Number states within each choice, so that one sorted search finds the pass that a state belongs to.
     key = parent * len(row) + begin
@@ -88,13 +90,23 @@ def visited_curvatures(
 
 
 def _states_on(
-    graph: LaneGraph, begins: Bools, points: Reals, headings: Reals
+    graph: LaneGraph, begins: Bools, points: Reals, headings: Reals, first: Indices, place: Indices
 ) -> tuple[Indices, Indices, Indices]:
-    """States clearly on a region, ascending, those regions, and pairs [K, 2] (choice, first state on it)."""
-    near = graph.region_index.near(points, REACH + APART)
+    """States clearly on a region, ascending, those regions, and pairs [K, 2] (choice, first state on it).
+
+    Args:
+        graph: the lane graph.
+        begins: [n] whether a trajectory begins with the state.
+        points: [n, 2] metres.
+        headings: [n] radians.
+        first: [places] a state at each of the distinct places.
+        place: [n] number of the place of each state.
+    """
+    near = graph.region_index.near(points[first], REACH + APART)
     order = np.lexsort((near.line, near.distance, graph.regions.parent[near.line], near.point))
-    point, region, distance = near.point[order], near.line[order], near.distance[order]
-    on = (turn_between(near.heading[order], headings[point]) <= TURN) & (distance < REACH)
+    point, pair = _repeated(near.point, place, len(first))
+    region, distance, direction = (part[order[pair]] for part in (near.line, near.distance, near.heading))
+    on = (turn_between(direction, headings[point]) <= TURN) & (distance < REACH)
     # Sorted by state, choice and distance, each region's nearest alternative comes right after it.
     parent = graph.regions.parent[region]
     same = (point[1:] == point[:-1]) & (parent[1:] == parent[:-1])
@@ -105,12 +117,16 @@ def _states_on(
     return point[clear], region[clear], np.stack((parent[inside], point[inside]), axis=1)
 
 
-def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals) -> Indices:
+def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals, place: Indices) -> Indices:
     """Pairs [K, 2] of a choice and the last state before the entry point of one of its regions is passed."""
     here = np.flatnonzero(row[1:] == row[:-1])
     start, end = points[here], points[here + 1]
-    paths = shapely.linestrings(np.stack((start, end), axis=1))
+    steps = place[here] * len(points) + place[here + 1]
+    _, first, step = np.unique(steps, return_index=True, return_inverse=True)
+    paths = shapely.linestrings(np.stack((start[first], end[first]), axis=1))
     path, region = graph.entry_tree.query(paths, predicate="dwithin", distance=REACH)
+    path, pair = _repeated(path, step, len(first))
+    region = region[pair]
     step = end[path] - start[path]
     away = graph.regions.entry[region] - start[path]
     # The heading is that of the end of the piece nearer to the entry point.
@@ -118,6 +134,23 @@ def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals) -> I
     facing = headings[here[path] + late]
     passed = turn_between(graph.regions.entry_heading[region], facing) <= TURN
     return np.stack((graph.regions.parent[region[passed]], here[path[passed]]), axis=1)
+
+
+def _repeated(found: Indices, place: Indices, count: int) -> tuple[Indices, Indices]:
+    """What was found at distinct places, for all states at them.
+
+    Args:
+        found: [K] numbers of places, ascending.
+        place: [n] of each state.
+        count: places.
+
+    Returns:
+        States, ascending, and the numbers in ``found`` of what was found where they are, ascending for each.
+    """
+    each = np.bincount(found, minlength=count)
+    number, first = each[place], (each.cumsum() - each)[place]
+    state = np.repeat(np.arange(len(place)), number)
+    return state, np.arange(len(state)) + np.repeat(first - (number.cumsum() - number), number)
 
 
 def _new_passes(events: Indices, begins: Bools) -> tuple[Indices, Indices]:
