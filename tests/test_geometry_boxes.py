@@ -60,19 +60,22 @@ def test_corner_order():
 @settings(max_examples=200, deadline=None)
 @given(box, box)
 @example((0.0, 0.0, 0.0, 4.0, 2.0), (4.0, 1.0, math.pi / 2, 2.0, 4.0))  # they touch
+@example(
+    (0.0, 2.00001, 0.7061143561163341, 1.25, 1.25),
+    (0.0, 2.00001, 0.7061143561163341, 5.193947124195385, 1.25),
+)
 def test_agrees_with_shapely(first, second):
+    """Not with its areas of intersections: in the second example that is 0 or 1.56, by which box comes first."""
     args = tensors(first, second)
     a, b = polygons(*args[:3]), polygons(*args[3:])
-    area, distance = shapely.area(shapely.intersection(a, b)), shapely.distance(a, b)
+    distance, depth = shapely.distance(a, b), minkowski_depth(a, b)
     gap = float(box_gap(*args))
     if distance > 1e-9:
         assert not boxes_overlap(*args)
         assert gap == pytest.approx(distance, abs=1e-9)
-    elif area > 1e-9:
-        assert boxes_overlap(*args)
-        assert gap == pytest.approx(-minkowski_depth(a, b), abs=1e-9)
     else:
-        assert abs(gap) < 1e-4
+        assert gap == pytest.approx(-depth, abs=1e-8)
+        assert boxes_overlap(*args) or depth < 1e-8
 
 
 def test_agrees_with_shapely_on_many_float32_pairs():
