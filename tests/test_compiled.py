@@ -24,6 +24,13 @@ from symphony.envs.tables import POINT_FEATURES
 HAS_NUMBA = importlib.util.find_spec("numba") is not None
 
 
+@pytest.fixture
+def found_anew() -> Iterator[None]:
+    point_writer.cache_clear()
+    yield
+    point_writer.cache_clear()
+
+
 def both(agents: int, count: int, rows: int, seed: int, write: Writer) -> list[NDArray[np.float32]]:
     """What the blocks write, and what ``write`` does."""
     rng = np.random.default_rng(seed)
@@ -43,7 +50,9 @@ def test_one_pass_writes_the_bits_of_many(agents: int, count: int, rows: int, se
 
 
 @pytest.mark.skipif(not HAS_NUMBA, reason="needs the extra 'compiled'")
-def test_compiled_it_writes_the_same_bits() -> None:
+@pytest.mark.usefixtures("found_anew")
+def test_compiled_it_writes_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SYMPHONY_COMPILED", raising=False)
     write = point_writer()
     assert write is not None
     blocks, compiled = both(300, 200, 2000, 0, write)
@@ -69,13 +78,6 @@ def test_an_environment_observes_what_the_writer_writes(monkeypatch: pytest.Monk
     monkeypatch.setattr(points, "point_writer", lambda: write)
     assert torch.equal(observed(count), blocks)
     assert calls == [9]
-
-
-@pytest.fixture
-def found_anew() -> Iterator[None]:
-    point_writer.cache_clear()
-    yield
-    point_writer.cache_clear()
 
 
 @pytest.mark.usefixtures("found_anew")

@@ -153,7 +153,7 @@ class Evaluate:
     def _calibrated(self, agent: Agent, folder: Path) -> EvaluateConfig:
         """With the threshold that the logs of a store give."""
         from symphony.data.store import SegmentStore
-        from symphony.simulation.calibration import calibrated_threshold
+        from symphony.simulation.calibration import BATCH, calibrated_threshold
         from symphony.simulation.demonstrations import SceneDataset
 
         config, search = self.config, self.config.pruning(agent.search)
@@ -174,7 +174,7 @@ class Evaluate:
             routes=agent.goals is not None,
             duration=config.duration or agent.duration,
         )
-        threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch or 16), 3)
+        threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch or BATCH), 3)
         sys.stderr.write(f"threshold {threshold:g}: quantile {self.quantile:g} of the logs in {folder}\n")
         return replace(config, threshold=threshold)
 

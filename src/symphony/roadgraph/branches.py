@@ -105,8 +105,9 @@ def _states_on(
     near = graph.region_index.near(points[first], REACH + APART)
     order = np.lexsort((near.line, near.distance, graph.regions.parent[near.line], near.point))
     point, pair = _repeated(near.point, place, len(first))
-    region, distance, direction = (part[order[pair]] for part in (near.line, near.distance, near.heading))
-    on = (turn_between(direction, headings[point]) <= TURN) & (distance < REACH)
+    order = order[pair]
+    region, distance = near.line[order], near.distance[order]
+    on = (turn_between(near.heading[order], headings[point]) <= TURN) & (distance < REACH)
     # Sorted by state, choice and distance, each region's nearest alternative comes right after it.
     parent = graph.regions.parent[region]
     same = (point[1:] == point[:-1]) & (parent[1:] == parent[:-1])

@@ -15,10 +15,13 @@ from symphony.errors import ConfigError, DataError
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.search import aggregate_of, realism_score
 
+BATCH = 16
+"""Run segments at a time, unless something else is asked for."""
+
 
 @torch.no_grad()
 def logged_totals(
-    agent: Agent, dataset: SceneDataset, search: SearchConfig, batch: int = 16
+    agent: Agent, dataset: SceneDataset, search: SearchConfig, batch: int = BATCH
 ) -> Float[Tensor, " M"]:
     """Totals that the log would get in a search, one for each of its periods in which all interactive agents exist.
 
@@ -71,7 +74,7 @@ def logged_totals(
 
 
 def calibrated_threshold(
-    agent: Agent, dataset: SceneDataset, search: SearchConfig, quantile: float, batch: int = 16
+    agent: Agent, dataset: SceneDataset, search: SearchConfig, quantile: float, batch: int = BATCH
 ) -> float:
     """The total that this share of the logged periods stays below: the threshold of rule ``replace``.
 

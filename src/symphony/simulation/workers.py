@@ -22,6 +22,8 @@ POINTS = 1 << 19
 IN_TRAFFIC = 32
 """Agents that a run segment is taken to have where everyone is driven: all of a batch have room for as many as the
 fullest."""
+NAMED = 8
+"""Run segments of a batch that an error names, at most."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -105,7 +107,9 @@ def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
 
 
 def _names(dataset: SceneDataset, items: Sequence[int]) -> str:
-    return ", ".join(dataset.store.ids[dataset.indices[i]] for i in items)
+    names = ", ".join(dataset.store.ids[dataset.indices[i]] for i in items[:NAMED])
+    more = len(items) - NAMED
+    return f"{names} and {more} more (batches of 1 tell which)" if more > 0 else names
 
 
 @lru_cache(1)
