@@ -91,7 +91,8 @@ def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) 
 @pytest.mark.parametrize(
     ("space", "cells", "search", "rule"),
     [
-        *(("bicycle", 0, *how) for how in SEARCHES),
+        # Rules are asked after the first period, which no bad weight lets anybody reach.
+        *(("bicycle", 0, *how) for how in SEARCHES if how[1] == "best"),
         *(("displacement", cells, *how) for cells in (0, 5) for how in (SEARCHES[0], ("tree", "systematic"))),
     ],
 )
