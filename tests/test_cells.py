@@ -24,7 +24,7 @@ from symphony.envs.tables import Tables
 from symphony.geometry import NO_BOUNDARY, segments_of
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.edges import Edges
-from symphony.geometry.nearest import nearest, smallest
+from symphony.geometry.nearest import kth_smallest, nearest, smallest
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
 
@@ -267,6 +267,41 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
     known = np.isfinite(values[np.arange(rows)[:, None], expected])
     np.testing.assert_array_equal(finite[:, : expected.shape[1]], known)
     assert not finite[:, expected.shape[1] :].any()
+
+
+@settings(max_examples=60)
+@given(
+    st.integers(1, 5),
+    st.integers(1024, 1400),
+    st.integers(1, 200),
+    st.integers(0, 10**6),
+    st.sampled_from(["even", "equal", "ascending", "descending", "where looked", "where not looked"]),
+    st.floats(0, 0.99),
+    st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_in_long_rows_they_are_the_same(
+    rows: int, width: int, count: int, seed: int, kind: str, padded: float, spoiled: float
+) -> None:
+    """However uneven the share is that gives a bound."""
+    rng = np.random.default_rng(seed)
+    values = rng.exponential(10.0, (rows, width)).astype(np.float32)
+    place = np.arange(width) % 4
+    values = {
+        "even": values,
+        "equal": values.round(-1),
+        "ascending": np.sort(values),
+        "descending": -np.sort(-values),
+        "where looked": values + 100 * (place != 0),
+        "where not looked": values + 100 * (place == 0),
+    }[kind].astype(np.float32)
+    values[0, rng.random(width) < spoiled] = np.nan
+    values[-1, rng.random(width) < padded] = np.inf
+    np.testing.assert_array_equal(kth_smallest(values.copy(), count), np.sort(values)[:, count - 1 : count])
+    expected = np.sort(np.argsort(values, axis=-1, kind="stable")[:, :count], axis=-1)
+    before = values.copy()
+    found = smallest(values, count).reshape(rows, -1) - np.arange(rows)[:, None] * width
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(values, before)
 
 
 @pytest.mark.parametrize("shift", [0.0, 3e4])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
-from symphony.geometry.nearest import smallest
+from symphony.geometry.nearest import kth_smallest, smallest
 
 POINT_CELL = 8.0
 """Metres of a cell's side, for points."""
@@ -101,11 +101,12 @@ class Cells(ABC):
         for a in range(0, len(scene), step):
             rows = slice(a, a + step)
             squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
-            last = np.partition(squared, self.wanted - 1, axis=-1)[:, self.wanted - 1 : self.wanted]
+            last = kth_smallest(squared, self.wanted)
             near = squared <= np.square(np.sqrt(last) + reach[rows])
-            row, element = near.nonzero()
-            counts.append(near.sum(1))
-            items.append(scene[rows][row] * self.total + element)
+            counts.append(np.count_nonzero(near, axis=1))
+            # From places in the block to numbers among all elements.
+            shift = (scene[rows] - np.arange(len(near))) * self.total
+            items.append(np.flatnonzero(near) + np.repeat(shift, counts[-1]))
         count = np.concatenate(counts)
         return Lists(count, np.concatenate(items), np.zeros(len(count), np.int8))
 
@@ -173,8 +174,12 @@ class PointCells(Cells):
         self.points = x, y
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
-        away_x, away_y = (v.take(scene, 0) - c for v, c in zip(self.points, (x, y), strict=True))
-        return np.square(away_x) + np.square(away_y)
+        squared, across = (v.take(scene, 0) for v in self.points)
+        squared -= x
+        across -= y
+        np.square(squared, out=squared)
+        squared += np.square(across, out=across)
+        return squared
 
     def nearest_points(self, cell: Indices, x: Reals, y: Reals) -> Indices:
         """Numbers [R, K] of the points nearest to positions [R] in cells that have lists, ascending."""
