@@ -122,11 +122,12 @@ def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals, plac
     """Pairs [K, 2] of a choice and the last state before the entry point of one of its regions is passed."""
     here = np.flatnonzero(row[1:] == row[:-1])
     start, end = points[here], points[here + 1]
-    steps = place[here] * len(points) + place[here + 1]
-    _, first, step = np.unique(steps, return_index=True, return_inverse=True)
+    # From place to place, each way once.
+    ways = place[here] * len(points) + place[here + 1]
+    _, first, way = np.unique(ways, return_index=True, return_inverse=True)
     paths = shapely.linestrings(np.stack((start[first], end[first]), axis=1))
     path, region = graph.entry_tree.query(paths, predicate="dwithin", distance=REACH)
-    path, pair = _repeated(path, step, len(first))
+    path, pair = _repeated(path, way, len(first))
     region = region[pair]
     step = end[path] - start[path]
     away = graph.regions.entry[region] - start[path]
