@@ -95,6 +95,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
             )
     most = max(row["rollouts"] for row in rows)
     driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
+    if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has those that there are
+        driven = f"up to {driven}"
     console.print(
         f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
         f"± standard error over recordings; seed {first['seed']}",
