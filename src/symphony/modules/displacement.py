@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from tensordict import NestedKey
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from symphony.keys import ACTION, NOISE, OWN, STATE, VALID
@@ -16,6 +16,7 @@ from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram,
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.policy import NoiseSampler
 from symphony.modules.pooling import PoolMode
+from symphony.modules.tensors import TensorModule
 
 
 class _Parameters(nn.Module):
@@ -130,7 +131,7 @@ def displacement_policy(
         scene_module(
             network, groups, ("agents", "head"), own_keys=own_keys, road_keys=road_keys, valid_key=valid_key
         ),
-        TensorDictModule(
+        TensorModule(
             _Parameters(cells, dt, size_scale, min_scale, max_slope, max_lateral, axle),
             in_keys=[("agents", "head"), state_key, own_keys[0], valid_key],
             out_keys=parameters,

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from tensordict import NestedKey
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from symphony.geometry.nearest import on_host
 from symphony.keys import OWN, VALID
 from symphony.modules.pooling import PoolMode, pool_elements
 from symphony.modules.rows import in_blocks, mlp
+from symphony.modules.tensors import TensorModule
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def scene_module(
     road_keys: Sequence[NestedKey] = (),
     valid_key: NestedKey = VALID,
     more_keys: Sequence[NestedKey] = (),
-) -> TensorDictModule:
+) -> TensorModule:
     """Wrap a network over scenes so that it reads its inputs, in order, from a TensorDict.
 
     Args:
@@ -165,4 +165,4 @@ def scene_module(
     apart = len(own_keys) + len(road_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
     joined = _Join(network, len(own_keys), len(road_keys), groups) if apart else network
     own = [*own_keys, *road_keys]
-    return TensorDictModule(joined, in_keys=[*own, valid_key, *read, *more_keys], out_keys=[out_key])
+    return TensorModule(joined, in_keys=[*own, valid_key, *read, *more_keys], out_keys=[out_key])

@@ -66,9 +66,11 @@ def in_blocks(
 
 def plain_layers(function: Callable[[Tensor], Tensor]) -> list[nn.Linear]:
     """The linear layers of an :func:`mlp`; of anything else none, such as one with a normalisation of its weights."""
-    if type(function) is not nn.Sequential or any(map(_hooked, (function, *function))):
+    if type(function) is not nn.Sequential:
         return []
     layers = list(function)
+    if any(map(_hooked, (function, *layers))):
+        return []
     linears = [layer for layer in layers if type(layer) is nn.Linear and layer.bias is not None]
     plain = bool(linears) and layers[::2] == linears and layers[-1] is linears[-1]
     return linears if plain and all(type(layer) is nn.ReLU for layer in layers[1::2]) else []
@@ -106,8 +108,9 @@ def _alike(outputs: int, inputs: int, few: int, rows: int, threads: int) -> bool
 
 def _hooked(module: nn.Module) -> bool:
     """Whether a module does more, when it is called or differentiated, than its weights tell."""
-    names = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-    return any(getattr(module, name) for name in names)
+    # One by one, as this is asked at every call of a network.
+    before, after = module._forward_pre_hooks, module._forward_hooks
+    return bool(before or after or module._backward_pre_hooks or module._backward_hooks)
 
 
 def reusing(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
