@@ -231,20 +231,25 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
     if bool((steps != steps[0]).any()):
         lengths = ", ".join(f"{dt:g} s" for dt in sorted(set(steps.tolist())))
         raise DataError(f"segments of different time steps in one batch: {lengths}", field="dt")
-    fields = {}
+    parts, fields = [dict(item.items()) for item in scenes], {}
     for name in SceneBatch.__annotations__:
-        values = [getattr(item, name) for item in scenes]
-        shape = [max(sizes) for sizes in zip(*(v.shape[1:] for v in values), strict=True)]
+        values = [part[name] for part in parts]
+        shapes = {value.shape[1:] for value in values}
+        if len(shapes) == 1 and name not in _AGENT_FIELDS:
+            fields[name] = torch.cat(values)
+            continue
+        shape = [max(sizes) for sizes in zip(*shapes, strict=True)]
         if name in _AGENT_FIELDS:
             shape[0] = max(shape[0], agents)
         fill = -1 if name in _INDEX_FIELDS else 0
-        out = values[0].new_full((sum(len(v) for v in values), *shape), fill)
-        row = 0
+        fields[name] = out = values[0].new_full((sum(v.shape[0] for v in values), *shape), fill)
+        # Written by NumPy where it can be: some thousand small copies, of which each costs torch a few microseconds.
+        host = out.device.type == "cpu"
+        into, row = out.numpy() if host else out, 0
         for value in values:
-            block = out[row : row + len(value)]
-            block[tuple(slice(0, size) for size in value.shape)] = value
-            row += len(value)
-        fields[name] = out
+            block = into[row : row + value.shape[0]]
+            block[tuple(map(slice, value.shape))] = value.numpy() if host else value
+            row += value.shape[0]
     return SceneBatch(**fields, batch_size=[len(fields["stream"])])
 
 
