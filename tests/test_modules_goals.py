@@ -23,6 +23,7 @@ from symphony.keys import (
     VALID,
 )
 from symphony.modules import ElementGroup, drawn_goals, goal_policy
+from symphony.modules.goals import NO_ROUTE
 from symphony.objectives import GoalLoss
 from symphony.streams import fold_in, uniform
 
@@ -133,6 +134,14 @@ def test_an_agent_without_a_route_gets_none_and_no_other_one_that_does_not_exist
 
 
 @torch.no_grad()
+def test_an_agent_that_is_padding_has_no_route_whatever_is_said_of_it():
+    td = scene(2)
+    td[VALID][:, 0] = False
+    logits = policy()(td)[GOAL_LOGITS]
+    assert (logits[:, 0] == NO_ROUTE).all()
+    assert (logits[:, 1] > NO_ROUTE).any()
+
+
 def test_a_scene_without_any_route_is_no_error():
     td, network = scene(3, routes=0), policy()
     td[GOAL_NOISE] = torch.rand(3, 3)

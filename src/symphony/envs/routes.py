@@ -16,7 +16,7 @@ from torch import Tensor
 from symphony.data.segment import RunSegment
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
-from symphony.geometry.nearest import first_smallest
+from symphony.geometry.nearest import first_smallest, on_host
 from symphony.roadgraph import (
     LaneGraph,
     ground_truth_routes,
@@ -234,9 +234,30 @@ def route_choices(
     the route begins, resolved to decimetres near the agent, and the sine of the turn at every point: a route jumps
     where it changes lanes, which points 12 m apart hardly show.
     """
+    state = state[..., None, :].expand(*count.shape, state.shape[-1])
+    there = (count > 0).flatten().nonzero().squeeze(-1) if on_host(count) else None
+    if there is None:
+        return _shape_of_routes(state, points, count, distance_scale, turns=turns), count > 1
+    # Some agents have ten times as many routes as most.
+    lead = count.ndim - 1
+    chosen, line, number = (part.flatten(0, lead)[there] for part in (state, points, count))
+    found = _shape_of_routes(chosen, line, number, distance_scale, turns=turns)
+    features = found.new_zeros(count.numel(), found.shape[-1]).index_copy(0, there, found)
+    return features.unflatten(0, count.shape), count > 1
+
+
+def _shape_of_routes(
+    state: Float[Tensor, "*b 4"],
+    points: Float[Tensor, "*b K 2"],
+    count: Int[Tensor, "*b"],
+    distance_scale: float,
+    *,
+    turns: bool,
+) -> Float[Tensor, "*b F"]:
+    """Features of routes, each in the frame of its agent."""
     kept = points[..., ::STRIDE, :]
-    angle = -state[..., None, None, 2]
-    local = rotate(kept - state[..., None, None, :2], angle)
+    angle = -state[..., None, 2]
+    local = rotate(kept - state[..., None, :2], angle)
     following = points[..., 1::STRIDE, :] - kept
     direction = rotate(following / following.norm(dim=-1, keepdim=True).clamp_min(1e-3), angle)
     order = torch.arange(0, points.shape[-2], STRIDE, device=points.device)
@@ -251,7 +272,7 @@ def route_choices(
         inner = torch.arange(2, points.shape[-2], device=points.device) < exists
         begin = (local[..., 0, :] / 3.0).tanh()
         features = torch.cat([features, begin * (exists > 0), torch.where(inner, turn, 0.0)], -1)
-    return features, count > 1
+    return features
 
 
 def pick_routes(

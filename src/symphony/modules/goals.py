@@ -10,6 +10,7 @@ from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
+from symphony.geometry.nearest import on_host
 from symphony.keys import GOAL, GOAL_LOGITS, GOAL_NOISE, OWN, ROUTES, ROUTES_MASK, VALID
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, scene_module
 from symphony.modules.policy import NoiseSampler
@@ -44,11 +45,19 @@ class RouteScores(nn.Module):
         """Inputs as for :class:`SceneEncoder`, then routes `[..., N, G, F]` and their mask `[..., N, G]`."""
         *elements, routes, mask = inputs
         around = in_blocks(self.scene, self.encoder(own, valid, *elements))
-        # Nothing of a route that is padding gets through, whatever its features hold.
-        routes = torch.where(mask[..., None], routes, 0.0)
-        met = torch.relu(in_blocks(self.route, routes) + around[..., None, :])
-        logits = in_blocks(self.head, met).squeeze(-1)
-        return torch.where(mask & valid[..., None], logits, NO_ROUTE)
+        if not on_host(mask):
+            # Nothing of a route that is padding gets through, whatever its features hold.
+            routes = torch.where(mask[..., None], routes, 0.0)
+            return torch.where(mask & valid[..., None], self._scores(routes, around[..., None, :]), NO_ROUTE)
+        # Most are padding, as some agents have ten times as many routes as others.
+        place = (mask & valid[..., None]).flatten().nonzero().squeeze(-1)
+        met = around.reshape(-1, around.shape[-1]).index_select(0, place // mask.shape[-1])
+        found = self._scores(routes.reshape(-1, routes.shape[-1]).index_select(0, place), met)
+        return found.new_full((mask.numel(),), NO_ROUTE).index_copy(0, place, found).view(mask.shape)
+
+    def _scores(self, routes: Float[Tensor, "*b F"], around: Float[Tensor, "*#b H"]) -> Float[Tensor, "*b"]:
+        met = torch.relu(in_blocks(self.route, routes) + around)
+        return in_blocks(self.head, met).squeeze(-1)
 
 
 def goal_policy(
