@@ -142,6 +142,7 @@ def test_an_agent_that_is_padding_has_no_route_whatever_is_said_of_it():
     assert (logits[:, 1] > NO_ROUTE).any()
 
 
+@torch.no_grad()
 def test_a_scene_without_any_route_is_no_error():
     td, network = scene(3, routes=0), policy()
     td[GOAL_NOISE] = torch.rand(3, 3)
