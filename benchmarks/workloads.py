@@ -222,11 +222,11 @@ def update(method: str, *, states: int = 1024, points: int = 200, count: int = 1
 
 
 def preparation(segments: int = 64) -> Work:
-    """Scenes, routes and experts of built-in segments, from the store on; none is kept with that store."""
+    """Scenes, routes, lists and experts of built-in segments, from the store on; none is kept with that store."""
     store = SegmentStore(builtin_store("train"))
 
     def once() -> None:
-        data, items = SceneDataset(store, 2, routes=True), list(range(segments))
+        data, items = SceneDataset(store, 2, routes=True, num_points=200), list(range(segments))
         data.scenes(items)
         data.experts.many(items)
 

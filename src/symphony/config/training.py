@@ -292,6 +292,7 @@ class TrainConfig(RunConfig):
             "sampling": self.sampling,
             "most": self.most_interactive,
             "persona": self.agent.persona,
+            "num_points": self.agent.num_points,
         }
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.geometry.cell_lists import Frame, JoinedLists, Whole, packed, spans
 from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
 from symphony.geometry.nearest import kth_smallest, smallest
 
@@ -59,7 +60,7 @@ class Lists(NamedTuple):
 
 
 class Cells(ABC):
-    """The cells of B maps, and lists for those that somebody has been in.
+    """The cells of B maps, and lists for those that somebody has been in, where they weren't kept.
 
     Args:
         low: [B, 2] metres of the lower left corner of what is on each map.
@@ -68,10 +69,19 @@ class Cells(ABC):
         size: least side of a cell, metres.
         total: elements per map, padding included.
         wanted: how many are looked for.
+        kept: lists that were made before; their maps have the cells that they had then.
     """
 
     def __init__(
-        self, low: Reals, high: Reals, some: Bools, size: float, *, total: int, wanted: int = 1
+        self,
+        low: Reals,
+        high: Reals,
+        some: Bools,
+        size: float,
+        *,
+        total: int,
+        wanted: int = 1,
+        kept: JoinedLists | None = None,
     ) -> None:
         self.total, self.wanted = total, wanted
         low, high = (np.where(some[:, None], value, 0.0).astype(np.float64) for value in (low, high))
@@ -79,16 +89,23 @@ class Cells(ABC):
         extent, side = high + _MARGIN - low, np.full(len(low), size)
         while (large := np.ceil(extent / side[:, None]).prod(1) > _CELLS).any():
             side[large] *= 2.0
-        self.x, self.y = np.ascontiguousarray(low.T)
+        columns, rows = np.where(some, np.ceil(extent / side[:, None]).T, 0.0)
+        own = Frame(low[:, 0], low[:, 1], side, columns, rows)
+        if kept is not None:
+            own = Frame(*(np.where(kept.some, *two) for two in zip(kept.frame, own, strict=True)))
+        self.x, self.y, self.side, self.columns, self.rows = map(np.ascontiguousarray, own)
         # Sides are powers of two, so to multiply is to divide.
-        self.side, self.per_metre = side, 1.0 / side
-        self.columns, self.rows = np.where(some, np.ceil(extent / side[:, None]).T, 0.0)
+        self.per_metre = 1.0 / self.side
         ends = (self.columns * self.rows).cumsum().astype(np.int64)
         self.first, cells = np.concatenate([[0], ends[:-1]]), int(ends[-1]) if len(ends) else 0
         # Where a cell's list begins; -1 while it has none.
         self.begin, self.count = np.full(cells, -1), np.zeros(cells, np.int64)
         self.sign, self._asked = np.zeros(cells, np.int8), np.zeros(cells, np.int64)
         self.items, self._used = np.zeros(1 << 12, np.int32), 0
+        # Place of a cell's list among the kept ones; -1 where it has none.
+        self._kept, self._place = kept, np.full(cells, -1)
+        if kept is not None:
+            self._place[self.first[kept.scene] + kept.cell] = np.arange(len(kept.cell))
 
     @abstractmethod
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
@@ -132,16 +149,23 @@ class Cells(ABC):
         with _FILLING:
             number, place, times = np.unique(cell[new], return_index=True, return_counts=True)
             self._asked[number] += times
-            due = (self._asked[number] >= repaid) & (self.begin[number] < 0)
+            kept, missing = self._place[number], self.begin[number] < 0
+            there = missing & (kept >= 0)
+            if self._kept is not None and there.any():
+                count, items = self._kept.lists(kept[there])
+                self._write(number[there], Lists(count, items, self._kept.sign[kept[there]]))
+            due = missing & ~there & (self._asked[number] >= repaid)
             if due.any():
-                self._fill(scene[new[place[due]]], number[due])
+                self._write(number[due], self._made(scene[new[place[due]]], number[due]))
         return self.begin.take(cell) >= 0
 
-    def _fill(self, scene: Indices, number: Indices) -> None:
+    def _made(self, scene: Indices, number: Indices) -> Lists:
         column, row = (f(number - self.first[scene], self.columns[scene]) for f in (np.mod, np.floor_divide))
         side = self.side[scene]
         x, y = self.x[scene] + (column + 0.5) * side, self.y[scene] + (row + 0.5) * side
-        lists = self._lists(scene, x, y, side)
+        return self._lists(scene, x, y, side)
+
+    def _write(self, number: Indices, lists: Lists) -> None:
         end = self._used + len(lists.items)
         if end > len(self.items):
             # Never shorter than what somebody may be reading.
@@ -152,6 +176,23 @@ class Cells(ABC):
         self.begin[number] = self._used + lists.length.cumsum() - lists.length
         self._used = end
 
+    def packed(self, x: Reals, y: Reals, number: int) -> Whole:
+        """Lists of the cells around positions [R] of the only map, which has so many elements, as whole numbers."""
+        half = 0.5 * self.side[0]
+        around = [
+            self.locate(np.zeros(1, np.int64), x + right, y + up)
+            for right in (-half, 0.0, half)
+            for up in (-half, 0.0, half)
+        ]
+        cell = np.unique(np.concatenate(around))
+        cell = cell[cell >= 0]
+        frame = Frame(self.x, self.y, self.side, self.columns, self.rows)
+        none = np.zeros(0, np.int64)
+        lists = (
+            self._made(np.zeros_like(cell), cell) if len(cell) else Lists(none, none, none.astype(np.int8))
+        )
+        return packed(frame, cell, *lists, total=number, wanted=self.wanted)
+
 
 class PointCells(Cells):
     """Cells for the nearest points.
@@ -160,9 +201,10 @@ class PointCells(Cells):
         x: [B, P] of the points; infinity where there is none.
         y: [B, P].
         count: K, how many are looked for. A map with few more has no cells.
+        kept: lists that were made before.
     """
 
-    def __init__(self, x: Reals, y: Reals, count: int) -> None:
+    def __init__(self, x: Reals, y: Reals, count: int, kept: JoinedLists | None = None) -> None:
         exists = np.isfinite(x)
         low, high = (
             np.stack([bound(v, 1, where=exists, initial=start) for v in (x, y)], -1)
@@ -170,7 +212,7 @@ class PointCells(Cells):
         )
         some = exists.sum(1) >= max(_WORTH * count, 1)
         size = POINT_CELL if count <= _MANY else 2 * POINT_CELL
-        super().__init__(low, high, some, size, total=x.shape[1], wanted=count)
+        super().__init__(low, high, some, size, total=x.shape[1], wanted=count, kept=kept)
         self.points = x, y
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
@@ -206,9 +248,10 @@ class EdgeCells(Cells):
     Args:
         edges: of all maps.
         exists: [B, E] which of them there are.
+        kept: lists that were made before.
     """
 
-    def __init__(self, edges: Edges, exists: Bools) -> None:
+    def __init__(self, edges: Edges, exists: Bools, kept: JoinedLists | None = None) -> None:
         shape = exists.shape
         ends = [
             (v, v + 2 * edges.half * unit) for v, unit in ((edges.x, edges.unit_x), (edges.y, edges.unit_y))
@@ -220,7 +263,7 @@ class EdgeCells(Cells):
             )
             for bound, of_two, start in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
         )
-        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1])
+        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1], kept=kept)
         self.edges, self.exists = edges, exists
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
@@ -264,8 +307,7 @@ class EdgeCells(Cells):
         held = self.count.take(cell)
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
-        place = np.arange(held.sum()) + np.repeat(self.begin.take(cell) - first, held)
-        candidate = self.items.take(place)
+        candidate = self.items.take(spans(self.begin.take(cell), held))
         squared = squared_to(self.edges.rows.take(candidate, axis=0), np.repeat(x, held), np.repeat(y, held))
         hit = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), held))[::-1]
         nearest = candidate[first]

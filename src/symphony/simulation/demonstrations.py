@@ -27,7 +27,7 @@ from symphony.errors import DataError
 from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.experts import Experts, fit_experts
-from symphony.simulation.kept import KeptExperts
+from symphony.simulation.kept import KeptExperts, KeptLists
 from symphony.simulation.logged import expert_batch, logged, logged_routes
 from symphony.simulation.memory import ItemCache
 from symphony.simulation.personas import PersonaScale, styles
@@ -58,11 +58,13 @@ class SceneDataset:
         routes: whether scenes and experts come with their routes.
         duration: seconds of each segment that are used; 0 for all.
         keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
-            machine's memory; 170 kB each in the built-in data, with routes).
+            machine's memory; 170 kB each in the built-in data, with routes, 220 with lists).
         sampling: what is drawn more often than the rest; nothing by default.
         most: where it is more than ``interactive``, the number that act is drawn for every segment, once and for all,
             between the two; a segment with fewer has those that there are.
         persona: whether the driving style of all agents is measured.
+        num_points: how many of the nearest map points agents will see: lists of what these can be are made for each
+            map and kept with the store. 0: what is near is found when it is asked for; the same, in more time.
 
     Raises:
         ConfigError, DataError: if its record is of another store or can't be read.
@@ -82,17 +84,20 @@ class SceneDataset:
         sampling: SamplingConfig | None = None,
         most: int = 0,
         persona: bool = False,
+        num_points: int = 0,
     ) -> None:
         self.store = store
         self.least, self.interactive = interactive, max(interactive, most)
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.persona = routes, duration, keep, persona
+        self.num_points = num_points
         self.sampling = SamplingConfig() if sampling is None else sampling
         self._weights = segment_weights(self.sampling, store, self.indices)
         self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
+        self.lists = KeptLists(store.path, num_points) if num_points else None
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
         # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
         # Of a drawn number of agents the rest is padding, so that N stays what it is.
@@ -108,6 +113,7 @@ class SceneDataset:
             sampling=self.sampling,
             most=self.interactive,
             persona=self.persona,
+            num_points=self.num_points,
         )
         return build, (self.store, self.least, self.dynamics, self.indices)
 
@@ -193,7 +199,10 @@ class SceneDataset:
         return chosen if len(chosen) >= self.least else self.least
 
     def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
-        return [self._scene(i) for i in items]
+        prepared = [self._scene(i) for i in items]
+        if self.lists is None:
+            return prepared
+        return [self.lists.of(one).beside(one) for one in prepared]
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""

@@ -1,10 +1,11 @@
-"""Demonstrations kept with their store, so that a segment is fitted once and not once a run."""
+"""What is made once for a store and kept in its folder: demonstrations by segment, lists of near points by map."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,31 +15,35 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import symphony
+from symphony.envs.map_lists import MapLists, map_parts
 from symphony.envs.routes import POINTS, RouteTable
+from symphony.envs.scene import SceneBatch
 from symphony.files import replacing
 from symphony.simulation.experts import Experts
 
 VERSION = 2
 """Of the fit: raised when it gives something else for the same segment, or other routes (a test says when)."""
+LISTS_VERSION = 1
+"""Of the lists: raised when the same points and edges give others (likewise)."""
 PACKAGE = Path(symphony.__file__).parent
-FOLDER = "experts"
-"""Of a store's."""
 
 
-class KeptExperts:
-    """Files of demonstrations in a store's folder, one a segment, named after all that they depend on.
+class KeptFiles:
+    """Files of arrays in a folder of a store's, named after all that they depend on.
 
     They are a cache: a file that is missing or damaged is made anew, and where the folder can't be written or belongs
     to the package, nothing is kept. Arrays only, nothing pickled.
 
     Args:
         store: the store's folder.
-        settings: what the fit depends on beside the segment's content.
+        name: of the folder in it.
+        version: of what makes the arrays.
+        settings: what the arrays depend on beside the content they belong to.
     """
 
-    def __init__(self, store: Path, settings: str) -> None:
-        self.settings = settings
-        self.folder: Path | None = None if PACKAGE in store.resolve().parents else store / FOLDER
+    def __init__(self, store: Path, name: str, version: int, settings: str) -> None:
+        self.version, self.settings = version, settings
+        self.folder: Path | None = None if PACKAGE in store.resolve().parents else store / name
         try:
             if self.folder is not None:
                 self.folder.mkdir(exist_ok=True)
@@ -46,31 +51,82 @@ class KeptExperts:
             self.folder = None
 
     def _path(self, content: str) -> Path | None:
-        key = hashlib.sha256(f"{VERSION} {content} {self.settings}".encode()).hexdigest()
+        key = hashlib.sha256(f"{self.version} {content} {self.settings}".encode()).hexdigest()
         return None if self.folder is None else self.folder / f"{key[:32]}.npz"
 
-    def load(self, content: str) -> Experts | None:
-        """Those of the segment with this hash; None where there are none that can be read."""
+    def _load(self, content: str) -> dict[str, NDArray[Any]] | None:
         path = self._path(content)
         if path is None or not path.is_file():
             return None
         try:
             # Opened here: NumPy leaves a damaged file open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                return _from_arrays({name: file[name] for name in file.files})
+                return {name: file[name] for name in file.files}
         except (OSError, ValueError, KeyError, EOFError, IndexError, RuntimeError, zipfile.BadZipFile):
             return None
 
-    def save(self, content: str, experts: Experts) -> None:
-        """Keep those of a segment, if the folder can be written and the disk has room."""
+    def _save(self, content: str, arrays: Mapping[str, NDArray[Any]], *, small: bool = False) -> None:
         path = self._path(content)
         if path is None or not os.access(path.parent, os.W_OK):
             return
         try:
+            write: Any = np.savez_compressed if small else np.savez
             with replacing(path) as draft, draft.open("wb") as file:
-                np.savez(file, **_to_arrays(experts))
+                write(file, **arrays)
         except OSError:
             self.folder = None
+
+
+class KeptExperts(KeptFiles):
+    """Demonstrations kept with their store, so that a segment is fitted once and not once a run.
+
+    Args:
+        store: the store's folder.
+        settings: what the fit depends on beside the segment's content.
+    """
+
+    def __init__(self, store: Path, settings: str) -> None:
+        super().__init__(store, "experts", VERSION, settings)
+
+    def load(self, content: str) -> Experts | None:
+        """Those of the segment with this hash; None where there are none that can be read."""
+        arrays = self._load(content)
+        try:
+            return None if arrays is None else _from_arrays(arrays)
+        except (ValueError, KeyError, IndexError):
+            return None
+
+    def save(self, content: str, experts: Experts) -> None:
+        """Keep those of a segment, if the folder can be written and the disk has room."""
+        self._save(content, _to_arrays(experts))
+
+
+class KeptLists(KeptFiles):
+    """Lists of near points and edges kept with their store, so that they are made once for each map.
+
+    Args:
+        store: the store's folder.
+        num_points: nearest points that are looked for.
+    """
+
+    def __init__(self, store: Path, num_points: int) -> None:
+        super().__init__(store, "lists", LISTS_VERSION, str(num_points))
+        self.num_points = num_points
+
+    def of(self, scene: SceneBatch) -> MapLists:
+        """Those of the map on which a scene lies, named after its points and edges."""
+        digest = hashlib.sha256()
+        for part in map_parts(scene):
+            digest.update(str(part.shape).encode() + np.ascontiguousarray(part).tobytes())
+        content = digest.hexdigest()
+        arrays = self._load(content)
+        if arrays is not None and set(arrays) == set(MapLists._fields):
+            kept = MapLists(**arrays)
+            if kept.fit(scene):
+                return kept
+        made = MapLists.of(scene, self.num_points)
+        self._save(content, made._asdict(), small=True)
+        return made
 
 
 def _to_arrays(experts: Experts) -> dict[str, Any]:
