@@ -13,16 +13,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from helpers_agents import make_agent
 from helpers_runs import build, tiny
 from helpers_segments import crossing, straight_road
 from symphony import keys
-from symphony.agents import Agent, build_agent
 from symphony.config import (
-    AgentConfig,
-    AgentSpec,
-    DiscriminatorConfig,
     EvaluateConfig,
-    SearchConfig,
     ValidationConfig,
 )
 from symphony.data.store import SegmentStore
@@ -50,20 +46,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
     return SegmentStore(path)
 
 
-def agent(space: Any = "bicycle", cells: int = 0) -> Agent:
-    torch.manual_seed(0)
-    spec = AgentSpec(
-        action_space=space,
-        dt=0.2,
-        goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8, cells=cells),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
-        searches=True,
-        search=SearchConfig(test_branches=2, prune_every=3),
-    )
-    return build_agent("tiny", spec)
-
-
 class Spoiled(TensorDictModuleBase):
     """A network that, in one scene from one step on, puts out a bad number for one branch's first agent."""
 
@@ -85,7 +67,7 @@ class Spoiled(TensorDictModuleBase):
 @cache
 def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) -> None:
     """That nothing is wrong with an agent whose networks nobody has broken."""
-    evaluate(agent(space, cells), store, config)
+    evaluate(make_agent(space, cells), store, config)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +84,7 @@ def test_weights_that_are_not_finite_are_found_at_once(
 ) -> None:
     config = EvaluateConfig(rollouts=2, search=search, rule=rule)
     drives(store, space, cells, config)
-    broken = agent(space, cells)
+    broken = make_agent(space, cells)
     with torch.no_grad():
         for parameter in broken.modules[network].parameters():
             parameter.fill_(math.nan)
@@ -125,7 +107,7 @@ def test_weights_that_are_not_finite_are_found_at_once(
 def test_segment_and_step_are_those_where_it_began(
     store: SegmentStore, search: Any, rule: str, value: float, batch: int
 ) -> None:
-    good = agent()
+    good = make_agent()
     config = EvaluateConfig(rollouts=2, search=search, rule=rule, batch=batch)
     # Items of a batch of one are all its scene 0: the first segment is the bad one there.
     scene, segment = (0, "straight-0") if batch == 1 else (2, "crossing-2")
@@ -140,7 +122,7 @@ def test_segment_and_step_are_those_where_it_began(
 
 def test_what_comes_after_the_end_of_a_segment_is_none_of_its_business(store: SegmentStore) -> None:
     """Else a short segment could be refused beside a longer one, and be fine alone."""
-    good, config = agent(), EvaluateConfig(rollouts=2, search="tree")
+    good, config = make_agent(), EvaluateConfig(rollouts=2, search="tree")
     usual = evaluate(good, store, config).metrics.rows()
     last = LENGTHS[1] - 1
     broken = replace(

@@ -16,11 +16,11 @@ from safetensors.numpy import save
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from helpers_agents import small
 from helpers_collectors import STREAM, Policy, Walk, X, starts
 from helpers_saved import played
 from helpers_segments import crossing
 from symphony import keys
-from symphony.agents import load_agent
 from symphony.collectors import BeamSearchResult, KeepBest, Systematic, beam_search
 from symphony.collectors.beam_search import _tilted
 from symphony.config import EvaluateConfig
@@ -252,7 +252,7 @@ def test_weights_are_kept_with_rollouts_and_the_report_makes_up_for_the_tilt(tmp
 
 
 def test_simulations_are_tilted_by_the_same_random_numbers(tmp_path: Path) -> None:
-    agent, store = load_agent("pretrained:bc_ts_h"), SegmentStore(builtin_store("test"))
+    agent, store = small(), SegmentStore(builtin_store("test"))
     config = EvaluateConfig(rollouts=4, branches=4, rule="systematic")
     dataset = crowd_dataset(store, agent, config, [0])
     runs = {

@@ -16,6 +16,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from helpers_agents import small
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import Agent, load_agent
@@ -104,7 +105,7 @@ def dataset(agent: Any, count: int = 2, duration: int = 4, interactive: int = 2)
 
 
 def simulated(make: Any, count: int = 2, **settings: Any) -> Any:
-    agent = load_agent(AGENT)
+    agent = small()
     data = dataset(agent, count)
     egos = EgoPlanners("mine", make, [data.segment(i) for i in range(count)])
     config = EvaluateConfig(**{"rollouts": 4, "search": "none", **settings})
@@ -194,8 +195,7 @@ def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
             seen.append(traffic)
             return Control(99.0 if traffic.step < 3 else -99.0, 0.0)
 
-    agent = load_agent(AGENT)
-    data = dataset(agent)
+    data = dataset(small())
     segment = data.segment(0)
     found = simulated(Pushes, count=2, rollouts=1)
     state = found.rollouts.state[0, 0].numpy()
@@ -230,7 +230,7 @@ def test_it_steers_a_vehicle_of_its_own_length() -> None:
         def plan(self, traffic: Traffic) -> Control:
             return Control(1.0, 0.2)
 
-    segment = dataset(load_agent(AGENT)).segment(0)
+    segment = dataset(small()).segment(0)
     state = simulated(Turns, rollouts=1).rollouts.state[0, 0, :, 0].double()
     driven = (0.5 * (state[1:, 3] + state[:-1, 3]) * segment.dt).sum()
     turned = np.unwrap(state[:, 2].numpy())
@@ -290,7 +290,7 @@ def store(tmp_path: Path) -> Path:
 
 
 def run(store: Path, out: Path, planner: str, batch: int = 2, **settings: Any) -> RolloutFolder:
-    agent = load_agent(AGENT)
+    agent = small()
     data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=4)
     config = EvaluateConfig(rollouts=2, branches=4, batch=batch, **settings)
     return save_simulation(out, agent, data, config, planner=planner)
@@ -309,10 +309,10 @@ def test_a_segment_without_its_ego_is_on_record(store: Path, tmp_path: Path) -> 
     folder = run(store, tmp_path / "sim", "log", search="none")
     assert [(entry.segment, entry.rollouts) for entry in folder.failures] == [("straight-5", 2)]
     assert "ego" in str(folder.failures[0].failed)
-    assert folder.about.drivers == {"ego": "log", "interactive": AGENT, "others": "playback"}
+    assert folder.about.drivers == {"ego": "log", "interactive": "tiny", "others": "playback"}
     for saved in folder:
         assert saved.agents[0] == saved.segment.ego
-        assert saved.drivers == ("log", AGENT)
+        assert saved.drivers == ("log", "tiny")
         assert saved.goal[0, 0] >= 0
     with pytest.raises(DataError, match="another simulation"):
         run(store, tmp_path / "sim", "idm", search="none")
@@ -448,7 +448,7 @@ def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
 
 def test_without_a_planner_nothing_changes() -> None:
     """A search scores the first agent, too."""
-    agent = load_agent(AGENT)
+    agent = small()
     data = dataset(agent, 1)
     config = EvaluateConfig(rollouts=2, branches=4)
     found = simulation(agent, data.scenes([0]), config)

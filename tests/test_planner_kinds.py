@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers_agents import small
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
@@ -80,8 +81,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def run(store: Path, out: Path, planner: Any, agent: str = AGENT, **settings: Any) -> RolloutFolder:
-    known = load_agent(agent)
+def run(store: Path, out: Path, planner: Any, agent: str = "", **settings: Any) -> RolloutFolder:
+    known = load_agent(agent) if agent else small()
     count = 1 if known.policy is None else 2
     data = SceneDataset(SegmentStore(store), count, known.dynamics, routes=True, duration=3)
     seconds = settings.pop("planner_seconds", 60.0)

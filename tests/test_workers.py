@@ -17,6 +17,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_agents import make_agent
 from helpers_processes import apart, share_the_server
 from helpers_segments import crossing, straight_road
 from symphony import keys
@@ -37,7 +38,6 @@ from symphony.simulation.saving import save_simulation
 from symphony.simulation.workers import _done, batches, naming, segments_together, shared
 from test_engine import gone
 from test_finite import Spoiled
-from test_finite import agent as make_agent
 
 METRIC = "helpers_workers:travelled"
 CONFIG = EvaluateConfig(rollouts=4, trees=2, batch=1, search="tree", metric=(METRIC,), seed=3)

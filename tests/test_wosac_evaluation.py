@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers_agents import small
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
@@ -82,7 +83,7 @@ def test_goals_of_the_log_are_those_that_were_taken(monkeypatch: pytest.MonkeyPa
 
 
 def test_goals_of_the_log_change_rollouts_and_are_not_submitted(capsys: pytest.CaptureFixture[str]) -> None:
-    segment, agent = wosac_window(crossing(num_agents=3, seed=2)), load_agent(AGENT)
+    segment, agent = wosac_window(crossing(num_agents=3, seed=2)), small()
     logged = wosac_rollouts(agent, segment, replace(PLAIN, logged_goals=True))
     assert not same(logged, wosac_rollouts(agent, segment, PLAIN))
     meta = ("--account-name", "a@example.org", "--unique-method-name", "m", "--num-model-parameters", "1")
@@ -132,11 +133,11 @@ def test_there_is_a_thinned_playback_where_the_store_is_finer_than_the_agent(tmp
     fill(tmp_path / "fine", [resample(segment, 0.1)])
     fill(tmp_path / "coarse", [segment])
     fine, coarse = (SegmentStore(tmp_path / name) for name in ("fine", "coarse"))
-    agent = load_agent(AGENT)
+    agent = small()
     assert (_thinned(agent, fine, [0]), _thinned(agent, coarse, [0])) == (2, 1)
     assert _thinned(load_agent(RANDOM), fine, [0]) == 1
     found = evaluate_wosac(agent, fine, [0], PLAIN)
-    assert list(found.results) == ["playback", THINNED, "constant_velocity", "random", AGENT]
+    assert list(found.results) == ["playback", THINNED, "constant_velocity", "random", "tiny"]
 
 
 # --- who goes first ---

@@ -14,6 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_agents import small
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from helpers_wosac import womd_record
@@ -35,13 +36,10 @@ from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wos
 from symphony.evaluation.wosac_table import read_wosac, wosac_grid
 from symphony.metrics.wosac import SimulatedRollouts, StepFeatures, WosacScenario, compute_features, score
 from symphony.simulation.wosac import between_decisions, constant_velocity, history_only, wosac_rollouts
-from test_finite import agent as make_agent
 
 AGENT = "pretrained:bc_ts_h"
 PLAIN = WosacSettings(search="none")
 SEARCH = WosacSettings(search="tree", branches=2)
-small = cache(make_agent)
-"""An agent with goals and a discriminator, quicker than the one that comes with the package."""
 META = (
     *("--account-name", "somebody@example.org", "--unique-method-name", "made"),
     *(
