@@ -468,7 +468,8 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:
 
 
 def test_a_cold_draw_is_the_likeliest_action() -> None:
-    scenes = scene(straight_road(4), 3, LaneGraph(straight_road(4).road))
+    segment = straight_road(4, steps=21)
+    scenes = scene(segment, 3, LaneGraph(segment.road))
 
     def rollouts(temperature: float) -> Tensor:
         config = EvaluateConfig(rollouts=3, search="none", action_temperature=temperature, logged_goals=True)

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from helpers_runs import tiny, weights
+from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import AgentConfig, MGAILConfig, PerturbConfig
@@ -143,7 +145,8 @@ def test_a_recipe_learns_with_all_of_it(
     )
     mgail = MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.1, react=True)
     perturb = PerturbConfig(share=0.5, begin=1)
-    config = tiny(method, builtin_store("train"), tmp_path / "run", agent=agent, mgail=mgail, perturb=perturb)
+    fill(tmp_path / "store", [straight_road(4, steps=11), crossing(4, steps=11)])
+    config = tiny(method, tmp_path / "store", tmp_path / "run", agent=agent, mgail=mgail, perturb=perturb)
     train(config)
     agent_of = load_agent(str(tmp_path / "run"))
     assert agent_of.spec is not None

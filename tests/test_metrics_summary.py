@@ -172,7 +172,7 @@ def test_standard_errors_match_the_bootstrap():
     rng = np.random.default_rng(0)
     segments = list(metrics.segments.values())
     draws = []
-    for _ in range(150):
+    for _ in range(80):
         again = RolloutMetrics()
         again.segments = {str(k): segments[i] for k, i in enumerate(rng.integers(0, 150, 150))}
         draws.append(again.compute())

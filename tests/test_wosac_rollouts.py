@@ -345,7 +345,7 @@ def test_a_short_horizon_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = [straight_road(seed=k, group=f"recording {k // 2}") for k in range(3)]
+    found = [straight_road(2, seed=k, group=f"recording {k // 2}") for k in range(3)]
     store, out = tmp_path / "store", tmp_path / "scores.json"
     fill(store, found)
     command = ["wosac", "evaluate", AGENT, "--data", str(store), "--search", "none", "--json", str(out)]
