@@ -190,6 +190,20 @@ def test_damaged_lists_are_made_anew(store: Path, damage: str) -> None:
         assert all(np.array_equal(opened[name], value) for name, value in arrays.items())
 
 
+def test_a_changed_bit_is_noticed(store: Path) -> None:
+    one = SceneDataset(SegmentStore(store)).scene(0)
+    kept = KeptLists(store, 60)
+    right = kept.of(one)
+    (file,) = files(store)
+    whole = file.read_bytes()
+    for place in range(0, len(whole), len(whole) // 250):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << place % 8
+        file.write_bytes(bytes(damaged))
+        for found, expected in zip(kept.of(one), right, strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
 def test_into_the_package_nothing_is_written() -> None:
     assert SceneDataset(SegmentStore(builtin_store("test")), num_points=60).scene(0).point_lists.shape[1] > 0
     assert not (builtin_store("test") / "lists").exists()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,11 @@ VERSION = 2
 LISTS_VERSION = 1
 """Of the lists: raised when the same points and edges give others (likewise)."""
 PACKAGE = Path(symphony.__file__).parent
+_DAMAGED = (
+    *(OSError, ValueError, KeyError, EOFError, IndexError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+"""What is raised for files that are not what was written."""
 
 
 class KeptFiles:
@@ -59,10 +67,11 @@ class KeptFiles:
         if path is None or not path.is_file():
             return None
         try:
-            # Opened here: NumPy leaves a damaged file open.
-            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-        except (OSError, ValueError, KeyError, EOFError, IndexError, RuntimeError, zipfile.BadZipFile):
+            with zipfile.ZipFile(path) as file:
+                # Read as a whole first, so that the checksum is compared before NumPy looks at anything.
+                parts = {name.removesuffix(".npy"): io.BytesIO(file.read(name)) for name in file.namelist()}
+            return {name: np.load(part, allow_pickle=False) for name, part in parts.items()}
+        except _DAMAGED:
             return None
 
     def _save(self, content: str, arrays: Mapping[str, NDArray[Any]], *, small: bool = False) -> None:
