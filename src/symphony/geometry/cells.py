@@ -178,14 +178,13 @@ class Cells(ABC):
 
     def packed(self, x: Reals, y: Reals, number: int) -> Whole:
         """Lists of the cells around positions [R] of the only map, which has so many elements, as whole numbers."""
-        half = 0.5 * self.side[0]
-        around = [
-            self.locate(np.zeros(1, np.int64), x + right, y + up)
-            for right in (-half, 0.0, half)
-            for up in (-half, 0.0, half)
-        ]
-        cell = np.unique(np.concatenate(around))
-        cell = cell[cell >= 0]
+        here = np.stack([x - self.x[0], y - self.y[0]]) * self.per_metre[0]
+        # Those that a square of a cell's side around a position meets.
+        columns, rows = (np.floor(v + np.array([[-0.5], [0.5]])).astype(np.int64) for v in here)
+        wide, high = int(self.columns[0]), int(self.rows[0])
+        met = np.zeros((high + 2, wide + 2), np.bool_)  # with one around for what is beyond
+        met[rows[:, None].clip(-1, high) + 1, columns.clip(-1, wide) + 1] = True
+        cell = np.flatnonzero(met[1:-1, 1:-1])
         frame = Frame(self.x, self.y, self.side, self.columns, self.rows)
         none = np.zeros(0, np.int64)
         lists = (
@@ -267,7 +266,13 @@ class EdgeCells(Cells):
         self.edges, self.exists = edges, exists
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
-        squared = squared_to(self.edges.rows.reshape(-1, self.total, 5).take(scene, 0), x, y)
+        edges = self.edges
+        # Column by column, so that each lies in one piece.
+        columns = [
+            column.reshape(-1, self.total).take(scene, 0)
+            for column in (edges.x, edges.y, edges.unit_x, edges.unit_y, edges.half)
+        ]
+        squared = squared_to(columns, x, y)
         squared[~self.exists[scene]] = np.inf
         return squared
 
@@ -308,7 +313,8 @@ class EdgeCells(Cells):
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
         candidate = self.items.take(spans(self.begin.take(cell), held))
-        squared = squared_to(self.edges.rows.take(candidate, axis=0), np.repeat(x, held), np.repeat(y, held))
+        rows = self.edges.rows.take(candidate, axis=0)
+        squared = squared_to(np.moveaxis(rows, -1, 0), np.repeat(x, held), np.repeat(y, held))
         hit = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), held))[::-1]
         nearest = candidate[first]
         # Written from the last to the first, so the first of equally near ones stays.

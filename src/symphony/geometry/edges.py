@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,9 +72,9 @@ class Edges(NamedTuple):
         return cls(np.stack([x, y, unit_x, unit_y, half], -1), x, y, unit_x, unit_y, half, before, after)
 
 
-def squared_to(rows: Reals, x: Reals, y: Reals) -> Reals:
-    """Squared metres from positions to edges [..., 5], see :class:`Edges`."""
-    start_x, start_y, unit_x, unit_y, half = np.moveaxis(rows, -1, 0)
+def squared_to(edges: Sequence[Reals] | Reals, x: Reals, y: Reals) -> Reals:
+    """Squared metres from positions to edges [5, ...]: the columns of :attr:`Edges.rows`."""
+    start_x, start_y, unit_x, unit_y, half = edges
     away_x, away_y = x - start_x, y - start_y
     beyond = away_x * unit_x
     beyond += away_y * unit_y

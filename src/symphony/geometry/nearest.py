@@ -39,6 +39,8 @@ LONG = 1024
 def kth_smallest(values: NDArray[Any], count: int) -> NDArray[Any]:
     """The ``count``-th smallest of the real numbers in each row [R, W], as [R, 1]. NaN comes last."""
     width = values.shape[1]
+    if count == 1:
+        return np.fmin.reduce(values, axis=1, keepdims=True)
     if width < max(LONG, 2 * SHARE * count):
         return _partitioned(values.copy(), count)
     # Some more than the share of what is looked for, as a share is not quite even.
