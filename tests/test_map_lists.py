@@ -13,10 +13,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
-from symphony.envs import ObservationConfig, SceneBatch, collate, scene
+from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
 from symphony.envs.map_lists import MapLists
 from symphony.envs.points import nearest_points
 from symphony.envs.road import road_distance
@@ -25,6 +26,7 @@ from symphony.envs.tables import Tables
 from symphony.geometry.cell_lists import Frame, JoinedLists, is_packed, packed, spans
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.edges import Edges
+from symphony.recipes import train
 from symphony.simulation import SceneDataset
 from symphony.simulation.kept import LISTS_VERSION, KeptLists
 
@@ -117,10 +119,13 @@ def test_on_lanes_nothing_is_left_to_list(monkeypatch: pytest.MonkeyPatch) -> No
     ]
     for kind in (PointCells, EdgeCells):
         monkeypatch.setattr(kind, "_made", None)
+    others: list[int] = []
+    monkeypatch.setattr(points, "_among_all", lambda flat, rest, *_: others.append(len(rest)))
     tables = Tables(listed, CONFIG)
     again = [nearest_points(tables, row, where), road_distance(listed, row, where, tables)]
     assert torch.equal(again[0][0], found[0][0])
     assert torch.equal(again[1], found[1])
+    assert others == [0]
     # So many points that nobody listed them.
     more = Tables(listed, ObservationConfig(num_points=61))
     with pytest.raises(TypeError, match="not callable"):
@@ -142,6 +147,26 @@ def test_lights_are_found_beside_the_points_of_a_map() -> None:
 
 
 _POINTS = ("point", "point_direction", "point_type", "point_speed", "point_light", "point_valid")
+
+
+def test_a_light_may_stand_beyond_the_map() -> None:
+    """There a scene's own cells would lie elsewhere than those that were kept."""
+    plain = scene(crossing(6))
+    lights = plain.point_type[0] == PointType.LIGHT
+    plain.point[0, lights] -= torch.tensor([300.0, 200.0])
+    listed = with_lists(plain)
+    row, where = lanes(plain)
+    row, where = torch.cat([row, row]), torch.cat([where, where - torch.tensor([290.0, 200.0])])
+    tables = [Tables(one, CONFIG) for one in (plain, listed)]
+    assert tables[0].point_cells.x != tables[1].point_cells.x
+    found = [nearest_points(one, row, where)[0] for one in tables]
+    assert torch.equal(*found)
+    assert lights[found[0]].any()
+
+
+def test_a_training_keeps_them_with_its_store(store: Path, tmp_path: Path) -> None:
+    train(tiny("bc", store, tmp_path / "run", steps=2, segments=4))
+    assert files(store)
 
 
 def test_lists_are_made_once_for_each_map(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
