@@ -184,6 +184,21 @@ def test_lists_are_made_once_for_each_map(store: Path, monkeypatch: pytest.Monke
     assert SceneDataset(opened).scenes(items).point_lists.shape[1] == 0
 
 
+def test_scenes_on_one_map_share_its_lists(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = SceneDataset(SegmentStore(store)), KeptLists(builtin_store("train"), 60)
+    maps = one.store.map_index
+    pair = np.flatnonzero(maps == maps[5])[:2].tolist()
+    assert len(pair) == 2
+    first, second, third = (other.of(one.scene(i)) for i in (*pair, 0))
+    assert first is second
+    assert third is not first
+    monkeypatch.setattr("symphony.simulation.kept.RECENT", 2)
+    for i in range(12):
+        other.of(one.scene(i))
+    assert len(other._recent) == 2
+    assert other.of(one.scene(pair[0])) is not first
+
+
 def test_of_another_number_of_points_they_are_kept_apart(store: Path) -> None:
     for count in (60, 61):
         SceneDataset(SegmentStore(store), num_points=count).scene(0)
@@ -225,7 +240,7 @@ def test_a_changed_bit_is_noticed(store: Path) -> None:
         damaged = bytearray(whole)
         damaged[place] ^= 1 << place % 8
         file.write_bytes(bytes(damaged))
-        for found, expected in zip(kept.of(one), right, strict=True):
+        for found, expected in zip(KeptLists(store, 60).of(one), right, strict=True):
             np.testing.assert_array_equal(found, expected)
 
 

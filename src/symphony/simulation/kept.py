@@ -8,6 +8,7 @@ import os
 import struct
 import zipfile
 import zlib
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ VERSION = 2
 """Of the fit: raised when it gives something else for the same segment, or other routes (a test says when)."""
 LISTS_VERSION = 1
 """Of the lists: raised when the same points and edges give others (likewise)."""
+RECENT = 64
+"""Maps whose lists are held in memory for the next scene on one of them."""
 PACKAGE = Path(symphony.__file__).parent
 _DAMAGED = (
     *(OSError, ValueError, KeyError, EOFError, IndexError, RuntimeError),
@@ -127,18 +130,28 @@ class KeptLists(KeptFiles):
     def __init__(self, store: Path, num_points: int) -> None:
         super().__init__(store, "lists", LISTS_VERSION, str(num_points))
         self.num_points = num_points
+        self._recent: OrderedDict[str, MapLists] = OrderedDict()
 
     def of(self, scene: SceneBatch) -> MapLists:
-        """Those of the map on which a scene lies, named after its points and edges."""
+        """Those of the map on which a scene lies, named after its points and edges; scenes on one map share them."""
         digest = hashlib.sha256()
         for part in map_parts(scene):
             digest.update(str(part.shape).encode() + np.ascontiguousarray(part).tobytes())
         content = digest.hexdigest()
+        if content not in self._recent:
+            self._recent[content] = self._read(content, scene) or self._make(content, scene)
+            if len(self._recent) > RECENT:
+                self._recent.popitem(last=False)
+        return self._recent[content]
+
+    def _read(self, content: str, scene: SceneBatch) -> MapLists | None:
         arrays = self._load(content)
-        if arrays is not None and set(arrays) == set(MapLists._fields):
-            kept = MapLists(**arrays)
-            if kept.fit(scene):
-                return kept
+        if arrays is None or set(arrays) != set(MapLists._fields):
+            return None
+        found = MapLists(**arrays)
+        return found if found.fit(scene) else None
+
+    def _make(self, content: str, scene: SceneBatch) -> MapLists:
         made = MapLists.of(scene, self.num_points)
         self._save(content, made._asdict(), small=True)
         return made
