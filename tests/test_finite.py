@@ -17,10 +17,7 @@ from helpers_agents import make_agent
 from helpers_runs import build, tiny
 from helpers_segments import crossing, straight_road
 from symphony import keys
-from symphony.config import (
-    EvaluateConfig,
-    ValidationConfig,
-)
+from symphony.config import EvaluateConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import SymphonyError

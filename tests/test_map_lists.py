@@ -23,9 +23,10 @@ from symphony.envs.points import nearest_points
 from symphony.envs.road import road_distance
 from symphony.envs.scene import PointType
 from symphony.envs.tables import Tables
-from symphony.geometry.cell_lists import Frame, JoinedLists, is_packed, packed, spans
+from symphony.geometry.cell_lists import Frame, JoinedLists, is_packed, packed
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.edges import Edges
+from symphony.geometry.spans import spans
 from symphony.recipes import train
 from symphony.simulation import SceneDataset
 from symphony.simulation.kept import LISTS_VERSION, KeptLists
@@ -59,6 +60,7 @@ def test_spans_are_ranges_one_after_the_other(given_spans: list[tuple[int, int]]
     begin, length = np.array(given_spans, np.int64).reshape(-1, 2).T
     expected = [n for b, k in given_spans for n in range(b, b + k)]
     assert spans(begin, length).tolist() == expected
+    assert spans(0, length).tolist() == [n for _, k in given_spans for n in range(k)]
 
 
 @settings(max_examples=60)

@@ -23,6 +23,7 @@ from symphony.envs.edge import MapEdge, beyond
 from symphony.envs.routes import POINTS, RouteTable, route_table
 from symphony.errors import DataError
 from symphony.geometry.polylines import segments_of
+from symphony.geometry.spans import spans
 from symphony.roadgraph import LaneGraph
 from symphony.streams import stream_of
 
@@ -359,7 +360,7 @@ def resample_lines(
     pieces = np.maximum(np.ceil(length / spacing - 1e-3).astype(np.int64), 1)
     count = np.where(length > 0, pieces + 1, 1)
     line = np.repeat(np.arange(len(lines)), count)
-    rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    rank = spans(0, count)
     share = rank / np.maximum(count[line] - 1, 1)
     at = first[line] + share * length[line]
     point = np.stack([np.interp(at, arc, xy[:, axis]) for axis in (0, 1)], -1)

@@ -15,17 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.geometry.edges import Bools, Indices, Reals
+from symphony.geometry.spans import spans
 
 Whole = NDArray[np.int32]
 
 _HEAD = 9
 _WANTED, _TOTAL, _X, _Y, _SIDE, _COLUMNS, _ROWS, _CELLS, _RUNS = range(_HEAD)
-
-
-def spans(begin: Indices, length: Indices) -> Indices:
-    """The numbers from ``begin`` on, ``length`` of each, one after the other."""
-    before = length.cumsum() - length
-    return np.arange(length.sum()) + np.repeat(begin - before, length)
 
 
 class Frame(NamedTuple):

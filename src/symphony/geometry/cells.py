@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.geometry.cell_lists import Frame, JoinedLists, Whole, packed, spans
+from symphony.geometry.cell_lists import Frame, JoinedLists, Whole, packed
 from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
 from symphony.geometry.nearest import kth_smallest, smallest
+from symphony.geometry.spans import spans
 
 POINT_CELL = 8.0
 """Metres of a cell's side, for points."""

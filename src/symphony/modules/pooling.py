@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from symphony.geometry.nearest import on_host
+from symphony.geometry.spans import spans
 from symphony.modules.rows import FEWER, equal_rows, plain_layers, reusing
 from symphony.modules.winners import own_channel, won
 
@@ -236,7 +237,7 @@ def _plan(valid: Bool[Tensor, "n K"], rows: int) -> _Plan:
     # in the same place of a tile has the same bits.
     sizes, widths = np.array(blocks).T[1:]
     tiles = np.repeat(widths // ALIGNED, sizes)
-    tile = np.arange(start // ALIGNED) - np.repeat(tiles.cumsum() - tiles, tiles)
+    tile = spans(0, tiles)
     own, end = -(-number[order] // ALIGNED), number.cumsum()[order]
     # Of each tile its first place among the valid elements of all sets, and the last one of its set.
     first = np.repeat(end - number[order], tiles) + ALIGNED * np.minimum(tile, np.repeat(own - 1, tiles))

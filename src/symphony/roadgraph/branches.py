@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from symphony.geometry.spans import spans
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Bools, Indices, Reals, turn_between
 
@@ -152,7 +153,7 @@ def _repeated(found: Indices, place: Indices, count: int) -> tuple[Indices, Indi
     each = np.bincount(found, minlength=count)
     number, first = each[place], (each.cumsum() - each)[place]
     state = np.repeat(np.arange(len(place)), number)
-    return state, np.arange(len(state)) + np.repeat(first - (number.cumsum() - number), number)
+    return state, spans(first, number)
 
 
 def _new_passes(events: Indices, begins: Bools) -> tuple[Indices, Indices]:

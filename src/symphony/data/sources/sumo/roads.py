@@ -13,6 +13,7 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.polygon import orient
 
 from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap
+from symphony.geometry.spans import spans
 
 Line = NDArray[np.float64]
 _DEFAULT_WIDTH = 3.2
@@ -310,7 +311,7 @@ def _subdivide(line: Line, spacing: float) -> Line:
     step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
     count = np.maximum(1, np.ceil(step / spacing)).astype(int)
     start = np.repeat(np.arange(len(step)), count)
-    share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / count[start]
+    share = spans(0, count) / count[start]
     return np.concatenate([line[start] + share[:, None] * np.diff(line, axis=0)[start], line[-1:]])
 
 
