@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -167,8 +168,10 @@ def test_a_light_may_stand_beyond_the_map() -> None:
 
 
 def test_a_training_keeps_them_with_its_store(store: Path, tmp_path: Path) -> None:
-    train(tiny("bc", store, tmp_path / "run", steps=2, segments=4))
+    config = tiny("bc", store, tmp_path / "run", steps=2, segments=4)
+    train(config)
     assert files(store)
+    assert replace(config, device="cuda").scenes["num_points"] == 0, "a device makes no use of them"
 
 
 def test_lists_are_made_once_for_each_map(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -292,7 +292,8 @@ class TrainConfig(RunConfig):
             "sampling": self.sampling,
             "most": self.most_interactive,
             "persona": self.agent.persona,
-            "num_points": self.agent.num_points,
+            # Lists of near points are for the CPU; a device compares all points and would only be sent them.
+            "num_points": self.agent.num_points if self.device == "cpu" else 0,
         }
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
