@@ -24,6 +24,7 @@ from symphony.envs.points import nearest_points
 from symphony.envs.road import road_distance
 from symphony.envs.scene import PointType
 from symphony.envs.tables import Tables
+from symphony.errors import DataError
 from symphony.geometry.cell_lists import Frame, JoinedLists, is_packed, packed
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.edges import Edges
@@ -165,6 +166,12 @@ def test_a_light_may_stand_beyond_the_map() -> None:
     found = [nearest_points(one, row, where)[0] for one in tables]
     assert torch.equal(*found)
     assert lights[found[0]].any()
+
+
+def test_those_of_another_map_are_refused() -> None:
+    lists = MapLists.of(scene(straight_road()), 60)
+    with pytest.raises(DataError, match=r"point_lists.*those of another map"):
+        lists.beside(scene(crossing(6)))
 
 
 def test_a_training_keeps_them_with_its_store(store: Path, tmp_path: Path) -> None:

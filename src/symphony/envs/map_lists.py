@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.envs.tables import Tables
+from symphony.errors import DataError
 from symphony.geometry.cell_lists import Whole, is_packed
 
 
@@ -52,7 +53,13 @@ class MapLists(NamedTuple):
         return is_packed(self.points, _map_points(scene)) and is_packed(self.edges, scene.edge_valid.shape[1])
 
     def beside(self, scene: SceneBatch) -> SceneBatch:
-        """The scene with these lists."""
+        """The scene with these lists.
+
+        Raises:
+            DataError: they are of a map with other numbers of points or edges.
+        """
+        if not self.fit(scene):
+            raise DataError("lists of near points are those of another map", field="point_lists")
         points, edges = (torch.from_numpy(lists)[None] for lists in self)
         return scene.replace(point_lists=points, edge_lists=edges)
 
