@@ -77,9 +77,10 @@ def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
     return batch
 
 
-def searched(agent: Any, env: DrivingEnv, rule: Any) -> Any:
+def searched(agent: Any, env: DrivingEnv, rule: Any, start: TensorDict | None = None) -> Any:
     """A search of both scenes."""
-    start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
+    if start is None:
+        start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
     how: Any = {"rule": rule, "prune_every": 1, "leaves": 3, "aggregate": mean_then_sum}
     with torch.no_grad():
         return search(env, agent.policy, agent.discriminator, start, seed=0, **how)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from symphony.agents import load_agent
+from symphony.agents.checkpoint import checkpoints
 from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig
 from symphony.recipes import RECIPES
 from symphony.training import Processes, Trainer
@@ -64,3 +66,13 @@ def weights(run: Path | str) -> dict[str, Tensor]:
 def same_weights(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     """Whether they are the same to the last bit."""
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def stopped(run: Path, out: Path, step: int) -> None:
+    """A copy of a run as it was after so many updates."""
+    shutil.copytree(run, out)
+    for done in checkpoints(out / "checkpoints"):
+        if int(done.name[-12:]) > step:
+            shutil.rmtree(done)
+    lines = (out / "metrics.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
+    (out / "metrics.jsonl").write_text("".join(lines[: step + 1]), encoding="utf-8")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +14,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from helpers_runs import build, pieces, same_weights, tiny, weights
+from helpers_runs import build, pieces, same_weights, stopped, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from symphony import keys
 from symphony.agents import load_agent
-from symphony.agents.checkpoint import CheckpointError, checkpoints
+from symphony.agents.checkpoint import CheckpointError
 from symphony.agents.included import pretrained_names
 from symphony.cli import main
 from symphony.collectors import BeamSearchCollector
@@ -134,16 +133,6 @@ def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: P
     assert same_weights(weights(train(tiny("bc_ts_h", store, tmp_path / "again"))), first)
     other = weights(train(tiny("bc_ts_h", store, tmp_path / "other", seed=1)))
     assert not any(same_weights(of(n, other), of(n, first)) for n in ("policy", "goals", "discriminator"))
-
-
-def stopped(run: Path, out: Path, step: int) -> None:
-    """A copy of a run as it was after so many updates."""
-    shutil.copytree(run, out)
-    for done in checkpoints(out / "checkpoints"):
-        if int(done.name[-12:]) > step:
-            shutil.rmtree(done)
-    lines = (out / "metrics.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
-    (out / "metrics.jsonl").write_text("".join(lines[: step + 1]), encoding="utf-8")
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -22,6 +22,9 @@ ALIGNED = 8
 PoolMode = Literal["auto", "dense", "winner"]
 ROWS = 2048
 """Elements encoded at a time, at most: their activations (512 KiB at width 64) stay in a core's L2 cache."""
+AT_ONCE = 1 << 20
+"""Elements encoded at once elsewhere than on the CPU where no gradient is asked for: their activations take 256 MiB at
+width 64, and there is no more to win by larger products."""
 FEW = 48
 """Largest set for which encoding everything with a graph is faster than finding winners first (measured on one
 CPU core at width 64: the two meet between 48 and 64 elements)."""
@@ -74,7 +77,10 @@ def pool_elements(
     most = _aligned(count)
     rows = max(1, rows // most) * most
     if mode == "dense":
-        pooled = _dense(function, sets, valid)
+        # All at once only where a gradient wants it so.
+        some = n if gradient else max(1, AT_ONCE // count)
+        parts = [_dense(function, sets[a : a + some], valid[a : a + some]) for a in range(0, n, some)]
+        pooled = torch.cat(parts) if len(parts) > 1 else parts[0]
     elif gradient:
         pooled = _through_winners(function, sets, valid, rows)
     else:

@@ -1,0 +1,185 @@
+"""A real card: the numbers of the CPU within rounding, the same bits each time, and no waiting within a step.
+
+What needs no card is tested by ``test_fake_device*.py``, everywhere.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+
+from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
+from helpers_runs import same_weights, stopped, tiny, weights
+from helpers_segments import crossing, straight_road
+from symphony import keys
+from symphony.agents import build_agent
+from symphony.collectors import KeepBest, PruningRule, Systematic
+from symphony.config import EvaluateConfig, MGAILConfig
+from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
+from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
+from symphony.evaluation import evaluate
+from symphony.modules import SeededNoise
+from symphony.recipes import train
+from symphony.simulation.rollouts import simulate, start_states
+
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
+
+
+CUDA = "cuda"
+
+
+def world(space: Any, device: str) -> tuple[Any, DrivingEnv]:
+    """An agent, always the same, and an environment, there."""
+    torch.manual_seed(0)
+    agent = build_agent("agent", spec(space)).to(device)
+    return agent, DrivingEnv(SCENES.to(device), agent.dynamics, agent.observation)
+
+
+@contextmanager
+def never_waiting() -> Iterator[None]:
+    """PyTorch refuses whatever would wait for the card."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that this is a prototype
+        torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def test_waiting_is_refused() -> None:
+    number = torch.ones((), device=CUDA)
+    with pytest.raises(RuntimeError, match="synchroniz"), never_waiting():
+        number.item()
+    assert number.item() == 1
+
+
+@pytest.mark.parametrize("space", ["bicycle", "displacement", "histogram"])
+def test_simulations(space: Any) -> None:
+    found = []
+    for device in ("cpu", CUDA, CUDA):
+        agent, env = world(space, device)
+        policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
+        start = start_states(env, agent.goals, trees=2, branches=1, seed=0)
+        simulate(env, policy, start)  # makes constants
+        if device == CUDA:
+            with never_waiting():
+                found.append(simulate(env, policy, start).state)
+        else:
+            found.append(simulate(env, policy, start).state)
+    here, there, again = (state.cpu() for state in found)
+    assert torch.equal(there, again)
+    torch.testing.assert_close(there, here, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6)], ids=repr)
+def test_searches(rule: PruningRule) -> None:
+    here = searched(*world("bicycle", "cpu"), rule)
+    agent, env = world("bicycle", CUDA)
+    there = searched(agent, env, rule)
+    start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
+    with never_waiting():
+        again = searched(agent, env, rule, start)
+    assert torch.equal(there.totals, again.totals)
+    assert torch.equal(there.trajectories[keys.STATE], again.trajectories[keys.STATE])
+    assert here.trajectories.shape == there.trajectories.shape == (2, 1, 3, LOGGED - 1)
+    torch.testing.assert_close(there.totals.cpu(), here.totals, atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        there.trajectories[keys.STATE].cpu(), here.trajectories[keys.STATE], atol=1e-3, rtol=0
+    )
+
+
+def loss_and_gradients(name: str, space: str, device: str) -> tuple[TensorDict, dict[str, torch.Tensor]]:
+    agent, env = world(space, device)
+    loss = losses(agent, env)[name]
+    row = torch.arange(ROWS, device=device) % 2
+    batch = batch_of(env, env.start(row, row))
+    batch = batch.exclude(keys.ACTION) if name == "mgail" else batch
+
+    def total() -> TensorDict:
+        torch.manual_seed(0)
+        out = loss(batch)
+        sum(value for key, value in out.items() if key.startswith("loss")).backward()
+        return out
+
+    out = total()
+    if device == CUDA:
+        loss.zero_grad()
+        with never_waiting():
+            out = total()
+    gradients = {key: value.grad.cpu() for key, value in loss.named_parameters() if value.grad is not None}
+    return out.detach().cpu(), gradients
+
+
+@pytest.mark.parametrize(("name", "space"), CASES)
+def test_losses_and_their_gradients(name: str, space: str) -> None:
+    there, gradients = loss_and_gradients(name, space, CUDA)
+    assert all(value.isfinite().all() for value in gradients.values())
+    assert gradients
+    if name in ("bc", "distillation", "goal"):  # others draw numbers, on each device its own
+        here, expected = loss_and_gradients(name, space, "cpu")
+        for key, value in expected.items():
+            torch.testing.assert_close(gradients[key], value, atol=1e-4, rtol=1e-3, msg=key)
+        for key, value in here.items():
+            torch.testing.assert_close(there[key], value, atol=1e-4, rtol=1e-3, msg=key)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()], ids=["bicycle", "displacement"])
+@torch.no_grad()
+def test_a_compiled_step_is_the_step(dynamics: Any) -> None:
+    torch.compiler.reset()
+    config = ObservationConfig(num_objects=3, num_points=2000, clearance=True, foresight=(0.5,))
+    env = DrivingEnv(SCENES.to(CUDA), dynamics, config)
+    start = env.start(torch.tensor([0, 1], device=CUDA))
+    action = torch.tensor([[80, 60], [75, 70]], device=CUDA)
+    start.set(
+        keys.ACTION,
+        action if dynamics.discrete else action[..., None] / torch.tensor([50, 500.0], device=CUDA),
+    )
+    plain = env._step(start)
+    env.compile(fullgraph=True)
+    compiled = env._step(start)
+    assert set(compiled.keys(True, True)) == set(plain.keys(True, True))
+    for key in plain.keys(True, True):
+        found, expected = compiled[key], plain[key]
+        if key[-1] in ("objects", "objects_mask", "points", "points_mask", "gap", "gap_ahead"):
+            found, expected = found.double().sum(2), expected.double().sum(2)  # in any order
+        torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    with StoreWriter(path) as writer:
+        for seed in range(2):
+            writer.append(straight_road(4, seed=seed, steps=11))
+            writer.append(crossing(4, seed=seed, steps=11))
+    return path
+
+
+@pytest.mark.parametrize("method", ["bc_ts_h", "mgail_ts_h"])
+def test_training_and_evaluation_are_repeated_and_resumed_to_the_bit(
+    method: Any, store: Path, tmp_path: Path
+) -> None:
+    def trained(name: str, resume: bool = False) -> Path:
+        mgail = MGAILConfig(regression=0, head_start=0, rollouts=4)
+        return train(tiny(method, store, tmp_path / name, mgail=mgail, device=CUDA, resume=resume))
+
+    once, twice = trained("once"), trained("twice")
+    stopped(once, tmp_path / "stopped", 2)
+    resumed = trained("stopped", resume=True)
+    assert same_weights(weights(once), weights(twice))
+    assert same_weights(weights(once), weights(resumed))
+    config = EvaluateConfig(rollouts=2, device=CUDA)
+    numbers = [evaluate(str(run), SegmentStore(store), config).numbers() for run in (once, twice)]
+    assert numbers[0] | {"agent": ""} == numbers[1] | {"agent": ""}
