@@ -1,9 +1,10 @@
-"""What a graphics card makes of it: the paper's update, a rollout of very many branches, and a big batch in one call.
+"""What a graphics card makes of it: the paper's update, its search, and rollouts of very many branches.
 
-    python benchmarks/gpu.py [--branches 10000] [--device cuda]
+    python benchmarks/gpu.py [--branches 10000] [--device cuda] [--compiled]
 
 Prints seconds, agent-steps a second and the peak of the card's memory; with ``--device cpu`` that of the process
-since it began. Networks are untrained, run segments those that come with the package.
+since it began. With ``--compiled`` again with a compiled environment, which takes a minute or two to make.
+Networks are untrained, run segments those that come with the package.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from symphony.envs import DrivingEnv
 from symphony.objectives import BCLoss
 from symphony.simulation import SceneDataset
 from symphony.simulation.search import search
+
+PAPER = 16  # branches of a search when it is evaluated (paper, section V-A)
 
 
 def seconds(work: Callable[[], Any], device: torch.device, rounds: int) -> tuple[float, float]:
@@ -55,12 +58,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--branches", type=int, default=10_000, help="of a rollout, over all scenes")
+    parser.add_argument("--branches", type=int, default=10_000, help="the most, over all scenes")
     parser.add_argument("--scenes", type=int, default=16)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--states", type=int, default=1600, help="of an update")
     parser.add_argument("--points", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--compiled", action="store_true", help="also after compiling")
     options = parser.parse_args()
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
@@ -88,32 +92,40 @@ def main() -> None:
         loss(batch)["loss_bc"].backward()
         optimizer.step()
 
-    env = DrivingEnv(data.scenes(items).to(device), agent.dynamics, agent.observation, device=device)
-    branches = max(2, options.branches // options.scenes)
-    rows = torch.arange(options.scenes, device=device)[:, None].expand(-1, branches)
-    start = env.start(rows, torch.arange(branches, device=device).expand(rows.shape))
-    steps = rows.numel() * env.num_agents
-
-    @torch.no_grad()
-    def step() -> None:
-        env.step(agent.policy(start.copy()))
-
-    @torch.no_grad()
-    def rollout() -> None:
-        state = start.copy()
-        with set_exploration_type(ExplorationType.RANDOM):
-            for _ in range(options.steps):
-                state = env.step_mdp(env.step(agent.policy(state)))
-
-    @torch.no_grad()
-    def searched() -> None:
-        search(env, agent.policy, agent.discriminator, start, seed=0, rule=KeepBest(0.5), prune_every=10)
-
-    name = f"{rows.numel():,} branches"
     show(f"update of {options.states:,} states, {options.points:,} points", update, options.states, "states")
-    show(f"one step of {name}", step, steps, "agent-steps")
-    show(f"rollout of {name}, {options.steps} steps", rollout, steps * options.steps, "agent-steps")
-    show(f"search of {name}", searched, steps * data.decisions, "agent-steps")
+    env = DrivingEnv(data.scenes(items).to(device), agent.dynamics, agent.observation, device=device)
+
+    @torch.no_grad()
+    def simulations(branches: int, compiled: str = "") -> None:
+        rows = torch.arange(options.scenes, device=device)[:, None].expand(-1, branches)
+        start = env.start(rows, torch.arange(branches, device=device).expand(rows.shape))
+        steps, name = rows.numel() * env.num_agents, f"{options.scenes} x {branches:,} branches{compiled}"
+
+        def rollout(number: int) -> None:
+            state = start.copy()
+            with set_exploration_type(ExplorationType.RANDOM):
+                for _ in range(number):
+                    state = env.step_mdp(env.step(agent.policy(state)))
+
+        def searched() -> None:
+            search(env, agent.policy, agent.discriminator, start, seed=0, rule=KeepBest(0.5), prune_every=10)
+
+        show(f"one step of {name}", lambda: rollout(1), steps, "agent-steps")
+        show(
+            f"{options.steps} steps of {name}",
+            lambda: rollout(options.steps),
+            steps * options.steps,
+            "agent-steps",
+        )
+        show(f"search of {name}", searched, steps * data.decisions, "agent-steps")
+
+    wide = max(2, options.branches // options.scenes)
+    simulations(PAPER)
+    simulations(wide)
+    if options.compiled:
+        env.compile()
+        simulations(PAPER, ", compiled")
+        simulations(wide, ", compiled")
 
 
 if __name__ == "__main__":
