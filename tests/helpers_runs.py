@@ -29,7 +29,7 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
         segments=2,
         states=16,
         goals=8,
-        search=SearchConfig(branches=2, prune_every=4, segments=2, updates=2, states=8, test_branches=2),
+        search=SearchConfig(branches=2, prune_every=2, segments=2, updates=2, states=8, test_branches=2),
         discriminator=DiscriminatorConfig(hidden=8, head=8, states=8),
         checkpoint_every=2,
         log_every=1,

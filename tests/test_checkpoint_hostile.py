@@ -223,7 +223,7 @@ def test_counts_are_counts(skips: Any) -> None:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    fill(tmp_path / "store", [crossing(seed=k, steps=21) for k in range(3)])
+    fill(tmp_path / "store", [crossing(seed=k, steps=8) for k in range(3)])
     return tmp_path / "store"
 
 
@@ -231,7 +231,7 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     """The smallest run."""
     small: dict[str, Any] = {
         "agent": AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        "search": SearchConfig(branches=2, prune_every=4, segments=2, updates=2, states=8, test_branches=2),
+        "search": SearchConfig(branches=2, prune_every=2, segments=2, updates=2, states=8, test_branches=2),
         "discriminator": DiscriminatorConfig(hidden=8, head=8, states=8),
         "steps": 4,
         "segments": 2,

@@ -162,8 +162,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
     with StoreWriter(path) as writer:
         for seed in range(2):
-            writer.append(straight_road(4, seed=seed, steps=11))
-            writer.append(crossing(4, seed=seed, steps=11))
+            writer.append(straight_road(4, seed=seed, steps=6))
+            writer.append(crossing(4, seed=seed, steps=6))
     return path
 
 

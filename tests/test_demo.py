@@ -47,8 +47,8 @@ def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     """The table of all eight methods, on a store of two segments."""
     for split, seed in (("train", 0), ("test", 1)):
         with StoreWriter(tmp_path / split) as writer:
-            writer.append(straight_road(4, seed=seed, steps=11))
-            writer.append(crossing(4, seed=seed, steps=11))
+            writer.append(straight_road(4, seed=seed, steps=6))
+            writer.append(crossing(4, seed=seed, steps=6))
     path = Path(__file__).resolve().parents[1] / "scripts" / "make_table.py"
     script = runpy.run_path(str(path))
     monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)

@@ -145,7 +145,7 @@ def test_a_recipe_learns_with_all_of_it(
     )
     mgail = MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.1, react=True)
     perturb = PerturbConfig(share=0.5, begin=1)
-    fill(tmp_path / "store", [straight_road(4, steps=11), crossing(4, steps=11)])
+    fill(tmp_path / "store", [straight_road(4, steps=6), crossing(4, steps=6)])
     config = tiny(method, tmp_path / "store", tmp_path / "run", agent=agent, mgail=mgail, perturb=perturb)
     train(config)
     agent_of = load_agent(str(tmp_path / "run"))

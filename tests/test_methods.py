@@ -51,10 +51,10 @@ Trained = Callable[..., Path]
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
     with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=14))
+        writer.append(straight_road(4, seed=0, steps=8))
         writer.append(crossing(4, seed=0, steps=9))
         # One vehicle comes into sight after the start.
-        writer.append(hide(crossing(5, seed=1, steps=11), 3, slice(0, 4)))
+        writer.append(hide(crossing(5, seed=1, steps=6), 3, slice(0, 4)))
     return path
 
 

@@ -42,15 +42,24 @@ def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     return replace(tiny(method, store, out, steps=6, mgail=SHORT), **changes)
 
 
+def written(path: Path, *steps: int) -> Path:
+    """A store of segments of so many steps; one vehicle comes into sight after the start."""
+    with StoreWriter(path) as writer:
+        writer.append(straight_road(4, seed=0, steps=steps[0]))
+        writer.append(crossing(4, seed=0, steps=steps[1]))
+        writer.append(hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 4)))
+    return path
+
+
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Segments of 2, 2 and 2.4 s; one vehicle comes into sight after the start."""
-    path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=11))
-        writer.append(crossing(4, seed=0, steps=11))
-        writer.append(hide(crossing(5, seed=1, steps=13), 3, slice(0, 4)))
-    return path
+    return written(tmp_path_factory.mktemp("data") / "store", 6, 6, 8)
+
+
+@pytest.fixture(scope="module")
+def seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of 2, 2 and 2.4 s."""
+    return written(tmp_path_factory.mktemp("seconds") / "store", 11, 11, 13)
 
 
 @pytest.fixture(scope="module")
@@ -268,8 +277,8 @@ def test_adversarial_training_starts_from_a_regression(store: Path, tmp_path: Pa
         train(config("mgail", store, tmp_path / "other", warm_start=bicycle))
 
 
-def test_the_duration_cuts_segments(store: Path, tmp_path: Path) -> None:
-    trainer = build(config("mgail_h", store, tmp_path, duration=1))
+def test_the_duration_cuts_segments(seconds: Path, tmp_path: Path) -> None:
+    trainer = build(config("mgail_h", seconds, tmp_path, duration=1))
     for step in range(5):
         trainer._update(step)
     replay, short = pieces(trainer)["replay"], trainer.data
@@ -277,7 +286,7 @@ def test_the_duration_cuts_segments(store: Path, tmp_path: Path) -> None:
     assert replay.leaves.shape == (2, 2, 5)
     assert (scenes.last_step == 5).all()
     assert scenes.log_state.shape[1] == short.fitted(scenes.segment.tolist(), scenes)[0].shape[1] == 6
-    whole = SceneDataset(SegmentStore(store), 2, Displacement())
+    whole = SceneDataset(SegmentStore(seconds), 2, Displacement())
     for item in range(3):
         cut, full = short.segment(item), whole.segment(item)
         assert (cut.position == full.position[:, :6]).all()
@@ -285,30 +294,28 @@ def test_the_duration_cuts_segments(store: Path, tmp_path: Path) -> None:
         assert short.experts(item).states.shape[1] == 6
 
 
-def test_a_segment_too_short_for_the_duration_is_named(store: Path, tmp_path: Path) -> None:
-    settings = config("mgail", store, tmp_path / "run", duration=2, segments=3)
+def test_a_segment_too_short_for_the_duration_is_named(seconds: Path, tmp_path: Path) -> None:
+    settings = config("mgail", seconds, tmp_path / "run", duration=2, segments=3)
     train(replace(settings, steps=1))
     for fails in (
         lambda: train(replace(settings, out=tmp_path / "long", duration=3)),
-        lambda: evaluate("constant_velocity", store, EvaluateConfig(rollouts=1, duration=3)),
+        lambda: evaluate("constant_velocity", seconds, EvaluateConfig(rollouts=1, duration=3)),
     ):
         with pytest.raises(DataError, match=r"has 2.* s, 3 are asked for") as caught:
             fails()
-        assert caught.value.file == store
+        assert caught.value.file == seconds
         assert caught.value.segment in ("straight-0", "crossing-0", "crossing-1")
     with pytest.raises(ConfigError, match="duration"):
-        config("mgail", store, tmp_path, duration=-1)
+        config("mgail", seconds, tmp_path, duration=-1)
 
 
-def test_an_agent_is_evaluated_for_the_duration_it_was_trained_with(
-    trained: Trained, store: Path, tmp_path: Path
-) -> None:
-    run = train(config("mgail", store, tmp_path / "run", duration=1, steps=1))
+def test_an_agent_is_evaluated_for_the_duration_it_was_trained_with(seconds: Path, tmp_path: Path) -> None:
+    run = train(config("mgail", seconds, tmp_path / "run", duration=1, steps=1))
     agent = load_agent(str(run))
     assert agent.duration == 1
     assert agent.spec is not None
 
-    def numbers(of: int, asked: int, where: Path = store) -> Any:
+    def numbers(of: int, asked: int, where: Path = seconds) -> Any:
         evaluated = replace(SETTINGS, duration=asked)
         other = replace(agent, spec=replace(agent.spec, duration=of))
         return pytest.approx(evaluate(other, where, evaluated).numbers(), nan_ok=True)

@@ -24,7 +24,7 @@ def make(n=7, count=60, features=5, hidden=16, share=0.6, dtype=torch.float64, s
 def results(network, elements, mask, mode, **kwargs):
     elements = elements.clone().requires_grad_()
     pooled = pool_elements(network, elements, mask, mode=mode, **kwargs)
-    weights = torch.linspace(-1, 2, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
+    weights = torch.linspace(-1, 2, pooled.numel(), dtype=pooled.dtype, device=pooled.device).view_as(pooled)
     gradients = torch.autograd.grad((pooled * weights).sum(), [elements, *network.parameters()])
     return [pooled.detach(), *gradients]
 

@@ -50,7 +50,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
     with StoreWriter(path) as writer:
         for seed in range(3):
-            writer.append(straight_road(6, seed=seed, steps=14).replace(segment_id=f"road-{seed}"))
+            writer.append(straight_road(6, seed=seed, steps=8).replace(segment_id=f"road-{seed}"))
             writer.append(crossing(4, seed=seed, steps=9).replace(segment_id=f"crossing-{seed}"))
     return path
 

@@ -30,6 +30,8 @@ COMMON = [*TINY, "--wandb", "disabled", "--rollouts", "2"]
 SEARCH = [
     "--search.branches",
     "2",
+    "--search.prune-every",
+    "3",
     "--search.test-branches",
     "2",
     "--search.updates",
@@ -68,8 +70,8 @@ def test_recipe(
 ) -> None:
     for split, seed in (("train", 0), ("test", 1)):
         with StoreWriter(tmp_path / split) as writer:
-            writer.append(straight_road(4, seed=seed, steps=16))
-            writer.append(crossing(4, seed=seed, steps=16))
+            writer.append(straight_road(4, seed=seed, steps=8))
+            writer.append(crossing(4, seed=seed, steps=8))
     data = [
         "--data",
         str(tmp_path / "train"),
@@ -98,7 +100,7 @@ def test_mistakes_are_told_in_a_line_before_the_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with StoreWriter(tmp_path / "train") as writer:
-        writer.append(straight_road(4, steps=16))
+        writer.append(straight_road(4, steps=8))
     words = [
         "--data",
         str(tmp_path / "train"),

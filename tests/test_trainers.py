@@ -50,7 +50,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
     with StoreWriter(path) as writer:
         for seed in range(3):
-            writer.append(straight_road(4, seed=seed, steps=26 + 5 * seed))
+            writer.append(straight_road(4, seed=seed, steps=11 + 3 * seed))
             writer.append(crossing(4, seed=seed, steps=31))
     return path
 

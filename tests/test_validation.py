@@ -35,14 +35,14 @@ from symphony.training.validation import METRICS
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "train"
-    fill(path, [straight_road(4, seed=0, steps=14), crossing(4, seed=0, steps=12)])
+    fill(path, [straight_road(4, seed=0, steps=8), crossing(4, seed=0, steps=7)])
     return path
 
 
 @pytest.fixture(scope="module")
 def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "held_out"
-    fill(path, [crossing(6, seed=10 + seed, steps=16) for seed in range(4)])
+    fill(path, [crossing(6, seed=10 + seed, steps=8) for seed in range(4)])
     return path
 
 
@@ -168,7 +168,7 @@ def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(
     train(replace(short, resume=True, steps=4, validation=replace(short.validation, data=moved, every=4)))
     # Nor can scores on other segments be compared, whether or not it was evaluated in between.
     others = tmp_path / "others"
-    fill(others, [crossing(6, seed=20 + seed, steps=16) for seed in range(4)])
+    fill(others, [crossing(6, seed=20 + seed, steps=8) for seed in range(4)])
     for between in (False, True):
         if between:
             train(replace(short, resume=True, steps=6, validation=ValidationConfig(rollouts=2)))
@@ -233,7 +233,7 @@ def test_an_agent_is_evaluated_without_its_folder(store: Path, held_out: Path, r
 
 def test_stores_that_cannot_be_used_are_found_before_training(store: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
-    fill(few, [straight_road(4, steps=14), straight_road(1, seed=1, steps=14)])
+    fill(few, [straight_road(4, steps=8), straight_road(1, seed=1, steps=8)])
     empty = tmp_path / "empty"
     fill(empty, [])
     for data, message in ((few, "interactive"), (empty, "no run segments"), (tmp_path / "none", "none")):
