@@ -22,7 +22,7 @@ from symphony.data.bounds import (
 )
 from symphony.data.segment import AgentType, RunSegment, SignalState
 
-STEPS = 7
+STEPS = 5
 
 
 def road(**changes: Any) -> RunSegment:

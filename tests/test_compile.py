@@ -22,7 +22,6 @@ SEES = ObservationConfig(num_objects=3, num_points=60, clearance=True, foresight
     ("dynamics", "config", "edge"),
     [
         (Bicycle(), SEES, False),
-        (Displacement(), ObservationConfig.nothing(), False),
         (Bicycle(), ObservationConfig.nothing(), True),
     ],
 )
@@ -57,7 +56,7 @@ def test_a_compiled_step_is_the_step(dynamics: Any, config: ObservationConfig, e
 def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not() -> None:
     torch.compiler.reset()
     env = DrivingEnv(
-        collate([scene(straight_road(), [0, 1])]), observation=ObservationConfig.nothing(), seed=0
+        collate([scene(straight_road(), [0, 1])]), Displacement(), ObservationConfig.nothing(), seed=0
     )
     plain = env.rollout(4)
     calls = []

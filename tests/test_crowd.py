@@ -213,7 +213,7 @@ def test_one_that_finds_no_room_waits_until_there_is() -> None:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
     path = tmp_path_factory.mktemp("crowd") / "store"
-    fill(path, [row(cars(k), steps=11, name=f"row-{k}") for k in range(3)] + [crossing(4, steps=11)])
+    fill(path, [row(cars(k), steps=8, name=f"row-{k}") for k in range(3)] + [crossing(4, steps=8)])
     return SegmentStore(path)
 
 

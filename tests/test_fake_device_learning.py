@@ -91,22 +91,19 @@ def test_rules_stay_on_the_device(rule: PruningRule, grouped: bool) -> None:
         assert device.waits == []
 
 
-@pytest.mark.parametrize(
-    ("name", "space"),
-    CASES,
-)
-def test_losses_and_their_gradients_stay_on_the_device(name: str, space: str) -> None:
+@pytest.mark.parametrize("space", sorted({space for _, space in CASES}))
+def test_losses_and_their_gradients_stay_on_the_device(space: str) -> None:
     with world(space) as (device, agent, env):
-        loss = losses(agent, env)[name]
         row = torch.arange(ROWS, device=device.device) % 2
-        batch = batch_of(env, env.start(row, row))
-        device.waits.clear()
-        out = loss(batch.exclude(keys.ACTION) if name == "mgail" else batch)
-        total = sum(value for key, value in out.items() if key.startswith("loss"))
-        assert isinstance(total, torch.Tensor)
-        assert total.device.type == NAME
-        total.backward()
-        assert device.waits == []
+        batch, known = batch_of(env, env.start(row, row)), losses(agent, env)
+        for name in (name for name, used in CASES if used == space):
+            device.waits.clear()
+            out = known[name](batch.exclude(keys.ACTION) if name == "mgail" else batch.copy())
+            total = sum(value for key, value in out.items() if key.startswith("loss"))
+            assert isinstance(total, torch.Tensor), name
+            assert total.device.type == NAME, name
+            total.backward()
+            assert device.waits == [], name
         assert device.constants < FEW
 
 

@@ -24,7 +24,7 @@ from symphony.errors import SymphonyError
 from symphony.evaluation import evaluate
 from symphony.simulation.finite import NotFiniteError
 
-LENGTHS = (9, 6, 12)
+LENGTHS = (7, 4, 8)
 """Steps of the segments ``straight-0``, ``crossing-1`` and ``crossing-2``."""
 SEARCHES = (
     ("none", "best"),

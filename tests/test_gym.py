@@ -31,7 +31,7 @@ WITH_ROUTE = ObservationConfig(num_objects=4, num_points=8, route=True)
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
     late = hide(straight_road(3, seed=5), 0, slice(0, 2))
-    fill(tmp_path / "store", [late, crossing(4, steps=21), straight_road(4, steps=21)])
+    fill(tmp_path / "store", [late, crossing(4, steps=9), straight_road(4, steps=9)])
     return tmp_path / "store"
 
 

@@ -99,7 +99,7 @@ def odd(given: Any) -> type[Odd]:
     return type("Odd", (Odd,), {"what": staticmethod(given) if callable(given) else given})
 
 
-def dataset(agent: Any, count: int = 2, duration: int = 4, interactive: int = 2) -> SceneDataset:
+def dataset(agent: Any, count: int = 2, duration: int = 2, interactive: int = 2) -> SceneDataset:
     store = SegmentStore(builtin_store("test"))
     return SceneDataset(store, interactive, agent.dynamics, range(count), routes=True, duration=duration)
 
@@ -284,14 +284,14 @@ def test_failures_are_those_of_their_own_rollouts_in_a_search() -> None:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    late = hide(straight_road(3, seed=5, steps=21), 0, slice(0, 2))
-    fill(tmp_path / "store", [crossing(4, steps=21), late, straight_road(4, steps=21)])
+    late = hide(straight_road(3, seed=5, steps=11), 0, slice(0, 2))
+    fill(tmp_path / "store", [crossing(4, steps=11), late, straight_road(4, steps=11)])
     return tmp_path / "store"
 
 
 def run(store: Path, out: Path, planner: str, batch: int = 2, **settings: Any) -> RolloutFolder:
     agent = small()
-    data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=4)
+    data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=2)
     config = EvaluateConfig(rollouts=2, branches=4, batch=batch, **settings)
     return save_simulation(out, agent, data, config, planner=planner)
 
@@ -331,7 +331,7 @@ def test_the_command_simulates_reports_and_shows(
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     sim = str(tmp_path / "sim")
-    words = ["--data", str(store), "--out", sim, "--rollouts", "2", "--search", "none", "--duration", "4"]
+    words = ["--data", str(store), "--out", sim, "--rollouts", "2", "--search", "none", "--duration", "2"]
     assert main(["simulate", AGENT, "--planner", "mine:Planner", *words]) == 0
     assert "4 of 6 runs failed, the first: crossing-0, step 5: " in capsys.readouterr().out
     found = report(load_rollouts(sim), "ego")

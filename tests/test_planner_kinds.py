@@ -77,14 +77,14 @@ class Together:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("planners") / "store"
-    fill(path, [crossing(4, steps=16), straight_road(4, steps=16)])
+    fill(path, [crossing(4, steps=11), straight_road(4, steps=11)])
     return path
 
 
 def run(store: Path, out: Path, planner: Any, agent: str = "", **settings: Any) -> RolloutFolder:
     known = load_agent(agent) if agent else small()
     count = 1 if known.policy is None else 2
-    data = SceneDataset(SegmentStore(store), count, known.dynamics, routes=True, duration=3)
+    data = SceneDataset(SegmentStore(store), count, known.dynamics, routes=True, duration=2)
     seconds = settings.pop("planner_seconds", 60.0)
     config = EvaluateConfig(**{"rollouts": 2, "search": "none", **settings})
     return save_simulation(out, known, data, config, planner=planner, planner_seconds=seconds)
@@ -259,7 +259,7 @@ def test_the_command_compares_planners_among_crowds(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A record that `evaluate` writes and the folder that it keeps say the same, and the table has both planners."""
-    words = ["--data", str(store), "--rollouts", "2", "--search", "none", "--duration", "3"]
+    words = ["--data", str(store), "--rollouts", "2", "--search", "none", "--duration", "2"]
     record, sim = tmp_path / "idm.json", tmp_path / "sim"
     assert (
         main(
@@ -293,8 +293,8 @@ def test_the_command_compares_planners_among_crowds(
 
 
 def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> None:
-    late = hide(straight_road(3, seed=5, steps=16), 0, slice(0, 2))
-    found = zip([crossing(3, steps=16), late, straight_road(3, steps=16)], "aab", strict=True)
+    late = hide(straight_road(3, seed=5, steps=11), 0, slice(0, 2))
+    found = zip([crossing(3, steps=11), late, straight_road(3, steps=11)], "aab", strict=True)
     fill(tmp_path / "store", [segment.replace(group=group) for segment, group in found])
     record = planner_record(run(tmp_path / "store", tmp_path / "sim", "log", "playback", rollouts=1))
     assert {bool(one["failed"]): one["group"] for one in record["per_run"][1:]} == {False: "b", True: "a"}
