@@ -165,7 +165,7 @@ def test_only_the_actor_receives_a_gradient(env, checkpoint):
 def test_checkpoints_change_nothing(env, more):
     for td in (planned(env), env.start(torch.tensor([0, 1]))):
         found = []
-        for checkpoint in (0, 1, 3, 10):
+        for checkpoint in (0, 1, 4):
             torch.manual_seed(3)  # draws where there is no plan
             found.append(value_and_gradient(make(env, horizon=STEPS, checkpoint=checkpoint, **more), td))
             assert_same(found[0], found[-1], rtol=1e-9, atol=1e-12)
