@@ -306,6 +306,23 @@ def test_bad_arguments_are_refused():
         mlp((3,))
 
 
+@pytest.mark.parametrize("at_once", [1, 60, 100, 150, 420])
+def test_many_elements_are_encoded_a_part_at_a_time(at_once, monkeypatch):
+    network, elements, mask = make()
+    monkeypatch.setattr(pooling, "AT_ONCE", at_once)
+    sizes = []
+    network.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
+    with torch.no_grad():
+        pooled = pool_elements(network, elements, mask, mode="dense")
+    assert max(sizes) <= max(at_once, 60)
+    assert len(sizes) == -(-7 // max(1, at_once // 60))
+    torch.testing.assert_close(pooled, reference(network, elements, mask))
+    # With a gradient it is one piece.
+    sizes.clear()
+    pool_elements(network, elements, mask, mode="dense")
+    assert len(sizes) == 1
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("mode", ["auto", "dense", "winner"])

@@ -23,8 +23,8 @@ PoolMode = Literal["auto", "dense", "winner"]
 ROWS = 2048
 """Elements encoded at a time, at most: their activations (512 KiB at width 64) stay in a core's L2 cache."""
 AT_ONCE = 1 << 20
-"""Elements encoded at once elsewhere than on the CPU where no gradient is asked for: their activations take 256 MiB at
-width 64, and there is no more to win by larger products."""
+"""Elements encoded at once elsewhere than on the CPU, without a gradient: their activations take 256 MiB at width 64,
+and larger products are hardly faster."""
 FEW = 48
 """Largest set for which encoding everything with a graph is faster than finding winners first (measured on one
 CPU core at width 64: the two meet between 48 and 64 elements)."""
@@ -48,7 +48,8 @@ def pool_elements(
         elements: `[..., K, F]`.
         mask: `[..., K]` bool, True where an element is valid.
         rows: elements encoded at a time where work is done in chunks.
-        mode: `"dense"` encodes everything at once and differentiates through all of it. `"winner"` encodes
+        mode: `"dense"` encodes everything at once (without a gradient, whole sets of at most :data:`AT_ONCE`
+            elements) and differentiates through all of it. `"winner"` encodes
             in chunks without a graph, and then, where a gradient is asked for, encodes the at
             most H winning elements of each set again with one. Both have the same values and gradients, those
             of any order included, up to rounding. `"auto"` is `"winner"` on the CPU (but `"dense"` for the
