@@ -30,14 +30,14 @@ from symphony.simulation.search import ENDED, search
 from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]
-STEPS = 6
+STEPS = 5
 SIZES = (SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES)
 SEES = ObservationConfig(num_objects=4, num_points=20, clearance=True)
 
 
 def world(*agents):
-    """In float64: a crossing of 7 steps and a road of 4, with as many interactive agents as given for each."""
-    segments = (crossing(4, steps=8, seed=1), straight_road(4, steps=5))
+    """In float64: a crossing of 6 steps and a road of 4, with as many interactive agents as given for each."""
+    segments = (crossing(4, steps=7, seed=1), straight_road(4, steps=5))
     scenes = [scene(s, list(range(n))) for s, n in zip(segments, agents or (2, 2), strict=False)]
     exact = collate(scenes).apply(lambda t: t.double() if t.is_floating_point() else t)
     return DrivingEnv(exact, Displacement(), SEES)

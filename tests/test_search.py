@@ -35,7 +35,8 @@ from symphony.simulation.driving import simulated, simulation
 from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of
 from symphony.simulation.search import AGGREGATES, ENDED, flag_score, search
 
-SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=3)
+EVERY = 2
+SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=EVERY)
 KINDS = ("none", "tree", "oracle", "best")
 at_the_end = Aggregate("last")
 
@@ -65,11 +66,12 @@ def searching(agent: Agent, **changes: Any) -> Agent:
 
 
 SEGMENTS = [
-    crossing(3, seed=1, steps=7),
-    straight_road(4, seed=0, steps=11),
-    crossing(4, seed=2, steps=9),
-    straight_road(3, seed=3, steps=7),
+    crossing(3, seed=1, steps=5),
+    straight_road(4, seed=0, steps=8),
+    crossing(4, seed=2, steps=6),
+    straight_road(3, seed=3, steps=5),
 ]
+DECISIONS = 7
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def start_of(env: DrivingEnv, branches: int) -> TensorDict:
 
 
 def look(env: DrivingEnv, agent: Agent, start: TensorDict, **changes: Any) -> BeamSearchResult:
-    settings: dict[str, Any] = {"seed": 5, "rule": KeepBest(0.5), "prune_every": 3}
+    settings: dict[str, Any] = {"seed": 5, "rule": KeepBest(0.5), "prune_every": EVERY}
     with torch.no_grad():
         return search(env, agent.policy, agent.discriminator, start, **{**settings, **changes})
 
@@ -191,7 +193,7 @@ def test_low_scores_survive(env: DrivingEnv, agent: Agent) -> None:
     result = look(env, agent, start_of(env, 4), keep_tree=True)
     # Totals by hand: the worst moment of each agent in the period, added up.
     for period in range(result.totals.shape[1]):
-        steps = slice(3 * period, 3 * period + 3)
+        steps = slice(EVERY * period, EVERY * (period + 1))
         total = result.simulated_scores[:, :, steps].amax(2).sum(-1)
         torch.testing.assert_close(result.totals[:, period], total)
         kept = total.argsort(dim=-1, stable=True)[:, [0, 1, 0, 1]]
@@ -203,8 +205,9 @@ def test_copies_of_a_branch_part_and_slots_keep_their_random_numbers(env: Drivin
     assert result.tree is not None
     state, action = result.tree[keys.STATE], result.tree[keys.ACTION]
     # Slots 0 and 2 go on from one branch: the same state, but then other actions.
-    assert torch.equal(state[:, 0, 3], state[:, 2, 3])
-    assert (action[:, 0, 3:6] != action[:, 2, 3:6]).flatten(1).any(1).all()
+    assert torch.equal(state[:, 0, EVERY], state[:, 2, EVERY])
+    period = slice(EVERY, 2 * EVERY)
+    assert (action[:, 0, period] != action[:, 2, period]).flatten(1).any(1).all()
 
 
 def test_an_agents_goal_is_that_of_its_tree_in_every_branch(env: DrivingEnv, agent: Agent) -> None:
@@ -219,7 +222,7 @@ def test_an_agents_goal_is_that_of_its_tree_in_every_branch(env: DrivingEnv, age
     start = start_of(env, 4)
     assert agent.policy is not None
     look(env, replace(agent, policy=TensorDictSequential(_module(Spy()), agent.policy)), start)
-    assert len(seen) == 10
+    assert len(seen) == DECISIONS
     assert all(torch.equal(goal, start[keys.GOAL]) for goal in seen)
 
 
@@ -319,8 +322,8 @@ def test_the_best_is_the_best_up_to_the_end(dataset: SceneDataset, agent: Agent)
 def test_rollouts_of_a_segment_stay_in_it(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
     scenes = dataset.scenes(range(4))
     found = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2))
-    assert found.state.shape == (4, 4, 11, 2, 4)
-    assert found.collision.shape == found.offroad.shape == found.counted.shape == (4, 4, 10, 2)
+    assert found.state.shape == (4, 4, DECISIONS + 1, 2, 4)
+    assert found.collision.shape == found.offroad.shape == found.counted.shape == (4, 4, DECISIONS, 2)
     first = scenes.log_state[:, 0].gather(1, scenes.interactive[..., None].expand(4, 2, 5))
     assert torch.equal(found.state[:, :, 0, :, :3], first[:, None, :, :3].expand(-1, 4, -1, -1))
     step = (found.state[:, :, 1:, :, :2] - found.state[:, :, :-1, :, :2]).norm(dim=-1)
@@ -352,7 +355,7 @@ def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, kin
     assert same(few, part(many, slice(None), slice(0, 4)))
 
 
-@pytest.mark.parametrize("changes", [{"rule": "systematic"}, {"prune_every": 2}, {"temperature": 0.01}])
+@pytest.mark.parametrize("changes", [{"rule": "systematic"}, {"prune_every": 3}, {"temperature": 0.01}])
 def test_the_evaluation_decides_the_pruning(
     dataset: SceneDataset, agent: Agent, changes: dict[str, Any]
 ) -> None:

@@ -51,7 +51,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with StoreWriter(path) as writer:
         for seed in range(3):
             writer.append(straight_road(4, seed=seed, steps=11 + 3 * seed))
-            writer.append(crossing(4, seed=seed, steps=31))
+            writer.append(crossing(4, seed=seed, steps=16))
     return path
 
 
@@ -163,9 +163,9 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
     scenes = dataset.scenes(range(len(dataset)))
     env = DrivingEnv(scenes, Bicycle(), ObservationConfig(num_points=1))
     start = env.start(torch.arange(len(dataset))[:, None].expand(-1, 20), torch.arange(20))
-    done = simulate(env, env.rand_action, start, steps=25)
-    where = scenes.log_state[:, None, :26].transpose(2, 3).repeat(1, 20, 1, 1, 1)
-    valid = scenes.log_valid[:, None, :26].transpose(2, 3).repeat(1, 20, 1, 1)
+    done = simulate(env, env.rand_action, start)
+    where = scenes.log_state[:, None].transpose(2, 3).repeat(1, 20, 1, 1, 1)
+    valid = scenes.log_valid[:, None].transpose(2, 3).repeat(1, 20, 1, 1)
     rows = torch.arange(len(dataset))[:, None, None], torch.arange(20)[:, None], scenes.interactive[:, None]
     where[rows] = torch.cat([done.state, done.state[..., :1]], -1).transpose(2, 3)
     valid[rows] = True
