@@ -39,7 +39,6 @@ SCENES = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(),
     ("config", "dynamics", "gradient"),
     [
         *((config, Bicycle(), False) for config in (EVERYTHING, MANY, NOTHING)),
-        (EVERYTHING, Displacement(), False),
         *((config, Displacement(), True) for config in (EVERYTHING, MANY, NOTHING)),
     ],
 )

@@ -349,18 +349,18 @@ def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store, out = tmp_path / "store", tmp_path / "scores.json"
     fill(store, found)
     command = ["wosac", "evaluate", AGENT, "--data", str(store), "--search", "none", "--json", str(out)]
-    assert main(command) == 0
+    assert main([*command, "--horizon", "2"]) == 0
     assert "WOSAC 2025, 3 run segments, 2 recordings" in capsys.readouterr().out
     record = json.loads(out.read_text())
     assert list(record["agents"]) == ["playback", "constant_velocity", "random", AGENT]
-    assert record["how"] == {"search": "none", "seed": 0, "logged_goals": False}
+    assert record["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 2.0}
     for numbers in record["agents"].values():
         each = [one["metametric"] for one in numbers["segments"].values()]
         assert numbers["metametric"] == pytest.approx(np.mean(each))
         assert numbers["metametric_se"] >= 0
     steady = record["agents"]["constant_velocity"]["segments"][found[1].segment_id]
     assert steady == pytest.approx(
-        scored(wosac_scenario(found[1]), constant_velocity(wosac_window(found[1])))
+        scored(wosac_scenario(found[1], 20), constant_velocity(wosac_window(found[1], 20), future=20))
     )
     # One recording has no error; a part of the store can be named.
     assert main([*command, "--segments", "2", "--config", "2024"]) == 0
