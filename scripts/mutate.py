@@ -55,7 +55,7 @@ TESTED = {
     "roadgraph.routes": "test_roadgraph_routes.py test_env_routes.py",
     "simulation.experts": "test_experts.py test_fit.py",
     "simulation.importance": "test_importance.py",
-    "simulation.search": "test_search.py test_search_goals.py",
+    "simulation.search": "test_search.py test_search_goals.py test_planner.py test_mgail_training.py",
     "simulation.rollouts": "test_search.py test_search_goals.py test_driving_inputs.py",
     "simulation.background": "test_crowd.py",
     "simulation.calibration": "test_calibration.py",

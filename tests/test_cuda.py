@@ -32,8 +32,6 @@ from symphony.recipes import train
 from symphony.simulation.rollouts import simulate, start_states
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
-
-
 CUDA = "cuda"
 
 
