@@ -19,12 +19,12 @@ from tensordict.nn import TensorDictSequential
 from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
 from helpers_runs import same_weights, stopped, tiny, weights
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony import keys
 from symphony.agents import build_agent
 from symphony.collectors import KeepBest, PruningRule, Systematic
 from symphony.config import EvaluateConfig, MGAILConfig
 from symphony.data.store import SegmentStore
-from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.evaluation import evaluate
 from symphony.modules import SeededNoise
@@ -158,10 +158,7 @@ def test_a_compiled_step_is_the_step(dynamics: Any) -> None:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        for seed in range(2):
-            writer.append(straight_road(4, seed=seed, steps=6))
-            writer.append(crossing(4, seed=seed, steps=6))
+    fill(path, [make(4, seed=seed, steps=6) for seed in range(2) for make in (straight_road, crossing)])
     return path
 
 

@@ -10,9 +10,9 @@ import torch
 
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.config import EvaluateConfig, Method, MGAILConfig
 from symphony.data.store import SegmentStore
-from symphony.data.store_writer import StoreWriter
 from symphony.evaluation import evaluate
 from symphony.recipes import train
 from symphony.training.logging import read_metrics
@@ -25,10 +25,7 @@ FIRST = ("loss_policy", "loss_goals", "loss_discriminator")
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        for seed in range(2):
-            writer.append(straight_road(4, seed=seed, steps=6))
-            writer.append(crossing(4, seed=seed, steps=6))
+    fill(path, [make(4, seed=seed, steps=6) for seed in range(2) for make in (straight_road, crossing)])
     return path
 
 
