@@ -282,6 +282,28 @@ def test_failures_are_those_of_their_own_rollouts_in_a_search() -> None:
     assert sorted(found.failed[0]) == [k for k, slot in enumerate(first) if slot % 2 == 0]
 
 
+def test_nobody_plans_beyond_the_end_of_a_segment_beside_a_longer_one(tmp_path: Path) -> None:
+    asked: dict[str, list[int]] = {}
+
+    class Noted(Wanderer):
+        def reset(self, scenario: Scenario) -> None:
+            super().reset(scenario)
+            self.steps = asked.setdefault(scenario.segment_id, [])
+
+        def plan(self, traffic: Traffic) -> Pose:
+            self.steps.append(traffic.step)
+            return super().plan(traffic)
+
+    segments = [crossing(4, steps=4), straight_road(4, steps=7)]
+    fill(tmp_path / "store", segments)
+    agent = small()
+    data = SceneDataset(SegmentStore(tmp_path / "store"), 2, agent.dynamics, routes=True)
+    egos = EgoPlanners("mine", Noted, segments)
+    config = EvaluateConfig(rollouts=1, search="none")
+    assert simulation(agent, data.scenes(range(2)), config, egos=egos).failed == ({}, {})
+    assert asked == {s.segment_id: list(range(s.num_steps - 1)) for s in segments}
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
     late = hide(straight_road(3, seed=5, steps=11), 0, slice(0, 2))
