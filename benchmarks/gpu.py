@@ -3,7 +3,7 @@
     python benchmarks/gpu.py [--branches 10000] [--device cuda] [--compiled]
 
 Prints seconds, agent-steps a second and the peak of the card's memory; with ``--device cpu`` that of the process
-since it began. With ``--compiled`` again with a compiled environment, which takes a minute or two to make.
+since it began. With ``--compiled`` again with a compiled environment, which takes minutes to make.
 Networks are untrained, run segments those that come with the package.
 """
 

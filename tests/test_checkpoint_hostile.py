@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import nn
 
+from helpers_runs import tiny
 from helpers_segments import crossing
 from helpers_store import fill
 from symphony.agents.checkpoint import (
@@ -25,7 +26,7 @@ from symphony.agents.checkpoint import (
 )
 from symphony.agents.choice import choose
 from symphony.agents.fitting import match_optimizer
-from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig, ValidationConfig
+from symphony.config import ValidationConfig
 from symphony.recipes import train
 from symphony.training.alarms import Skips
 
@@ -225,22 +226,6 @@ def test_counts_are_counts(skips: Any) -> None:
 def store(tmp_path: Path) -> Path:
     fill(tmp_path / "store", [crossing(seed=k, steps=8) for k in range(3)])
     return tmp_path / "store"
-
-
-def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
-    """The smallest run."""
-    small: dict[str, Any] = {
-        "agent": AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        "search": SearchConfig(branches=2, prune_every=2, segments=2, updates=2, states=8, test_branches=2),
-        "discriminator": DiscriminatorConfig(hidden=8, head=8, states=8),
-        "steps": 4,
-        "segments": 2,
-        "states": 16,
-        "checkpoint_every": 2,
-        "log_every": 1,
-        "wandb": "disabled",
-    }
-    return TrainConfig(method=method, data=store, out=out, **small | changes)
 
 
 @pytest.mark.parametrize("at", ["best", "skips", "processes"])
