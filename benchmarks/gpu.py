@@ -77,6 +77,8 @@ def main() -> None:
     )
     agent = build_agent("measured", spec).to(device)
     data = SceneDataset(SegmentStore(builtin_store("train")), 2, agent.dynamics)
+    if not 1 <= options.scenes <= len(data):
+        raise SystemExit(f"--scenes is 1 to {len(data)}, is {options.scenes}")
     items, rng = list(range(options.scenes)), torch.Generator().manual_seed(0)
 
     def show(name: str, work: Callable[[], Any], count: int, unit: str) -> None:
