@@ -387,6 +387,16 @@ def test_bars_are_shares_of_all_visits(tmp_path_factory: Any, counts: list[int],
     assert axes.get_ylim()[1] > max(drawn["policy"].values.max(), drawn["log"].values.max())
 
 
+@pytest.mark.parametrize("name", ["pretrained:mgail_ts_h", "runs/" + "a" * 60])
+def test_titles_of_a_figure_are_not_cut_off(name: str, tmp_path: Path) -> None:
+    panels = {f"MGAIL+TS+H ({name}): JSD 70.62 · 10⁻³{k}": (np.ones(21), np.ones(21)) for k in range(2)}
+    for columns in (1, 2):
+        figure = plot_curvature(panels, tmp_path / "curvature.png", columns=columns)
+        boxes = [axes._left_title.get_window_extent() for axes in figure.axes]
+        assert all(0 <= box.x0 < box.x1 <= figure.bbox.x1 for box in boxes)
+        assert columns == 1 or boxes[0].x1 < boxes[1].x0
+
+
 def test_figures_of_nothing_are_refused(tmp_path: Path) -> None:
     some, none = np.ones(21, int), np.zeros(21, int)
     for panels, message in (

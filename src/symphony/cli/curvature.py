@@ -68,7 +68,8 @@ class Curvature:
                 divergence = 1000 * float(jensen_shannon(policy, log))
             except (ValueError, TypeError) as error:
                 raise DataError(f"no histogram ({error})", file=folder, field="curvature") from error
-            title = f"{method_name(config['method'])} ({name}): JSD {divergence:.2f} · 10⁻³"
+            score = f"JSD {divergence:.2f} · 10⁻³".replace(" ", "\N{NO-BREAK SPACE}")  # on one line
+            title = f"{method_name(config['method'])} ({name}): {score}"
             panels[title] = policy, log
         try:
             plot_curvature(panels, self.out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from symphony.render.style import INK, LANE, new_figure, picture_path, save
 
 LOG_COLOR = "#0072B2"
 POLICY_COLOR = "#E69F00"
+TITLE = 40
+"""Characters of a line above a panel."""
 LEAST_REACH = 0.1
 """Curvature in 1/m that is shown to either side, at least."""
 
@@ -89,7 +92,7 @@ def _draw_panel(axes: Axes, title: str, policy: NDArray[np.float64], log: NDArra
     axes.stairs(log, edges, fill=True, color=LOG_COLOR, alpha=0.6, gid="log")
     axes.stairs(policy, edges, color=POLICY_COLOR, linewidth=1.5, gid="policy")
     axes.set_yscale("function", functions=(lambda y: np.sqrt(np.maximum(y, 0)), np.square))
-    axes.set_title(title, loc="left", fontsize=9, fontweight="bold", color=INK, parse_math=False)
+    axes.set_title(fill(title, TITLE), loc="left", fontsize=9, fontweight="bold", color=INK, parse_math=False)
     axes.tick_params(labelsize=7.5, color=LANE, labelcolor=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(LANE)
