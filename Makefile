@@ -1,8 +1,9 @@
 # Every target sets itself up: a machine with Python 3.11 or newer and make needs nothing else.
 VENV ?= .venv
 BIN := $(VENV)/bin
-PYTHON ?= $(shell for python in python3.11 python3; do \
-	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
+# Looked for when it is first needed, and then no more.
+PYTHON ?= $(eval PYTHON := $(shell for python in python3.11 python3; do \
+	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done))$(PYTHON)
 
 # Idle torch threads otherwise spin and take the cores from each other.
 export OMP_WAIT_POLICY := passive

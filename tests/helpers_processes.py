@@ -65,6 +65,13 @@ def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -
     return process
 
 
+def forget(*packages: str) -> None:
+    """Have packages and modules imported anew from now on, in a process that :func:`apart` has started."""
+    for name in list(sys.modules):
+        if name.partition(".")[0] in packages:
+            del sys.modules[name]
+
+
 def share_the_server() -> None:
     """Have workers of this process, itself started by :func:`apart`, forked from the same server (Linux).
 

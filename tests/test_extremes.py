@@ -62,11 +62,10 @@ def scenes() -> list[RunSegment]:
     return [validate(make().replace(segment_id=name)) for name, make in SCENES.items()]
 
 
-@pytest.mark.parametrize("method", [*SETTINGS, "mgail_h"])
+@pytest.mark.parametrize("method", SETTINGS)
 def test_every_part_of_the_methods(scenes: list[RunSegment], method: str, tmp_path: Path) -> None:
     agent = learned([each for each in scenes if each.dt == 0.2], method, tmp_path)
-    if method in SETTINGS:
-        assert_metrics_finite(agent, tmp_path / "store")
+    assert_metrics_finite(agent, tmp_path / "store")
 
 
 @pytest.mark.parametrize("dt", sorted({make().dt for make in SCENES.values()} - {0.2}))
@@ -76,6 +75,6 @@ def test_other_time_steps(scenes: list[RunSegment], dt: float, tmp_path: Path) -
 
 
 def test_a_long_log(tmp_path: Path) -> None:
-    """A minute at 5 Hz, all simulated."""
-    agent = learned([straight_road(2, steps=301)], "bc", tmp_path)
+    """Half a minute at 5 Hz, all simulated."""
+    agent = learned([straight_road(2, steps=151)], "bc", tmp_path)
     assert_metrics_finite(agent, tmp_path / "store")

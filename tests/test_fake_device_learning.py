@@ -4,8 +4,7 @@ tensors are what signatures say."""
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
+import runpy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from helpers_device import NAME, PretendDevice, on, pretend
 from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
+from helpers_processes import apart, forget
 from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
@@ -43,7 +43,7 @@ def world(space: Any = "bicycle") -> Iterator[tuple[PretendDevice, Any, DrivingE
         yield device, agent, on(device, env)
 
 
-@pytest.mark.parametrize("space", ["bicycle", "displacement", "histogram"])
+@pytest.mark.parametrize("space", ["bicycle", "displacement"])
 def test_simulations_stay_on_the_device(space: Any) -> None:
     with world(space) as (device, agent, env):
         policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
@@ -72,10 +72,9 @@ def test_others_that_a_rule_drives_stay_on_the_device() -> None:
 def test_searches_stay_on_the_device() -> None:
     with world() as (device, agent, env):
         start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
-        for rule in (KeepBest(0.5), Systematic(0.6)):
-            found = searched(agent, env, rule, start)
-            assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
-            assert found.totals.device.type == NAME
+        found = searched(agent, env, Systematic(0.6), start)
+        assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
+        assert found.totals.device.type == NAME
         assert device.waits == []
         assert device.constants < FEW
 
@@ -116,16 +115,21 @@ def test_every_loss_is_among_them() -> None:
     assert known == set(there)
 
 
-def test_what_is_taken_and_returned_is_what_signatures_say() -> None:
+def instrumented() -> None:
+    """Take every loss once, as :mod:`helpers_losses` does as a program."""
+    os.environ["SYMPHONY_COMPILED"] = "0"  # numba does not compile what is instrumented
+    forget("symphony", *(path.stem for path in Path(__file__).parent.glob("helpers_*.py")))
+    runpy.run_module("helpers_losses", run_name="__main__")
+
+
+def test_what_is_taken_and_returned_is_what_signatures_say(tmp_path: Path) -> None:
     """All that runs for a step and a loss, with shapes and kinds of numbers checked."""
-    # In a process of its own, as the package must be instrumented when it is first imported.
-    command = [sys.executable, "-m", "helpers_losses"]
-    environment = {**os.environ, "SYMPHONY_COMPILED": "0"}  # numba does not compile what is instrumented
-    done = subprocess.run(
-        command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-4000:]
-    assert [tuple(line.split()) for line in done.stdout.splitlines()] == CASES
+    # In a process of its own, as the package must be instrumented when it is imported.
+    said = tmp_path / "said"
+    process = apart(instrumented, said=said)
+    process.join()
+    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
+    assert [tuple(line.split()) for line in said.read_text().splitlines()] == CASES
 
 
 @jaxtyped(typechecker=tensors_only)

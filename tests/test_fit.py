@@ -22,8 +22,9 @@ def final_errors(segments: list[RunSegment]) -> torch.Tensor:
 
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_greedy_fit_of_the_built_in_set(split: str) -> None:
-    errors = final_errors(list(SegmentStore(builtin_store(split))))
-    assert len(errors) > 300
+    store = SegmentStore(builtin_store(split))
+    errors = final_errors([store[item] for item in range(0, len(store), 3)])
+    assert len(errors) > 100
     assert errors.mean() < 0.15
 
 

@@ -382,11 +382,11 @@ def test_conforms(layout: Callable[..., Path], tmp_path: Path) -> None:
     path = layout(
         tmp_path / "tree", *([rows] if layout is public else []), *extra, **({} if extra else {"rows": rows})
     )
-    report = check_reader(get_reader("interaction"), [path], flips=12)
+    report = check_reader(get_reader("interaction"), [path], flips=6)
     assert report.segments == 1
     flat = tmp_path / "flat"
     flat.mkdir()
-    assert check_reader(get_reader("interaction"), [one_folder(flat, path)], flips=4).segments == 1
+    assert check_reader(get_reader("interaction"), [one_folder(flat, path)], flips=3).segments == 1
 
 
 @pytest.mark.parametrize("seed", range(40))

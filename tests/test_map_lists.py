@@ -248,7 +248,7 @@ def test_a_changed_bit_is_noticed(store: Path) -> None:
     right = kept.of(one)
     (file,) = files(store)
     whole = file.read_bytes()
-    for place in range(0, len(whole), len(whole) // 250):
+    for place in range(0, len(whole), len(whole) // 100):
         damaged = bytearray(whole)
         damaged[place] ^= 1 << place % 8
         file.write_bytes(bytes(damaged))

@@ -169,7 +169,7 @@ def test_a_policy_tells_two_manners_apart():
     for cells in (0, 11):
         actor = policy(cells=cells)
         loss, optimizer = BCLoss(actor), torch.optim.Adam(actor.parameters(), lr=0.02)
-        for _ in range(150):
+        for _ in range(75):
             optimizer.zero_grad()
             loss(td)["loss_bc"].backward()
             optimizer.step()

@@ -163,9 +163,9 @@ def test_only_the_actor_receives_a_gradient(env, checkpoint):
 
 @pytest.mark.parametrize("more", [{}, {"truncate": 2, "detach_keys": SEEN}, {"truncate": 3}])
 def test_checkpoints_change_nothing(env, more):
-    for td in (planned(env), env.start(torch.tensor([0, 1]))):
+    for td, checkpoints in ((planned(env), (0, 1, 4)), (env.start(torch.tensor([0, 1])), (0, 2))):
         found = []
-        for checkpoint in (0, 1, 4):
+        for checkpoint in checkpoints:
             torch.manual_seed(3)  # draws where there is no plan
             found.append(value_and_gradient(make(env, horizon=STEPS, checkpoint=checkpoint, **more), td))
             assert_same(found[0], found[-1], rtol=1e-9, atol=1e-12)

@@ -77,8 +77,8 @@ def test_idm_keeps_its_place_where_steps_are_long(dt: float) -> None:
 def test_idm_follows_at_its_headway() -> None:
     """Where nothing changes any more, s = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     leader = 8.0
-    found = states(in_a_row([12, leader], [20, 60], steps=401))
-    gap = 60 + leader * 80 - found[-1, 0] - LENGTH
+    found = states(in_a_row([12, leader], [20, 60], steps=251))
+    gap = 60 + leader * 50 - found[-1, 0] - LENGTH
     assert found[-1, 3] == pytest.approx(leader, abs=0.05)
     assert gap == pytest.approx((2 + 1.5 * leader) / np.sqrt(1 - (leader / LIMIT) ** 4), abs=0.3)
 

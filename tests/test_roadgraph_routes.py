@@ -276,7 +276,7 @@ def two_blocks():
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_the_error_of_a_route_does_not_depend_on_those_beside_it(seed, drives):
     graph, found, ways = two_blocks()
     rng = np.random.default_rng(seed)

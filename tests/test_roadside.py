@@ -31,7 +31,7 @@ FULL = Roadside(parked=1.0, pedestrians=40)
 def lined() -> list[tuple[RunSegment, RunSegment]]:
     """Simulated segments before and after."""
     store = SegmentStore(builtin_store("train"))
-    return [(store[k], add_roadside(store[k], FULL, k)) for k in range(0, 24, 3)]
+    return [(store[k], add_roadside(store[k], FULL, k)) for k in range(0, 24, 6)]
 
 
 def outside(segment: RunSegment, points: np.ndarray) -> np.ndarray:

@@ -66,7 +66,7 @@ def test_every_changed_byte_is_noticed(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for path in files(tmp_path / "store"):
         good = path.read_bytes()
-        for bit in rng.integers(0, 8 * len(good), 25 if good else 0).tolist():
+        for bit in rng.integers(0, 8 * len(good), 12 if good else 0).tolist():
             damaged = bytearray(good)
             damaged[bit // 8] ^= 1 << bit % 8
             path.write_bytes(damaged)

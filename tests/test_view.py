@@ -36,7 +36,7 @@ def pages() -> list[SavedRollouts]:
     saved = played(turned, [0, 2], 3, failed={2: "broke <b>off</b>"})
     saved = dataclasses.replace(saved, trees=random_trees(saved, branches=5))
     lost = random_segment("odd name", seed=3, agents=4, steps=6, lights=2, marks=3)
-    return [saved, played(straight_road(2)), played(lost, [1])]
+    return [saved, played(straight_road(2, steps=16)), played(lost, [1])]
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -109,7 +109,7 @@ def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.
     for name in ("a.png", "a.gif"):
         assert main(["view", sim, "--out", str(tmp_path / name)]) == 0
         with Image.open(tmp_path / name) as image:
-            assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 50)
+            assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 20)
     assert main(["view", sim, "--out", str(tmp_path / "a.doc")]) == 1
     assert ".mp4" in capsys.readouterr().err
     assert main(["view", sim, "--segments", "nothing"]) == 1
