@@ -63,7 +63,7 @@ def elements(seen: Any, group: str) -> Tensor:
     return joined.gather(-2, order[..., None].expand(joined.shape))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("counts", [(3, 60, 2), (16, 4000, 30)])
 @torch.no_grad()
 def test_a_device_sees_and_flags_the_same(

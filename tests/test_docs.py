@@ -14,6 +14,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -103,21 +104,25 @@ def test_other_commands_exist() -> None:
             assert target in targets, f"{page}: make {target}"
 
 
-def test_tables_are_those_of_the_records(capsys: pytest.CaptureFixture[str]) -> None:
-    page = runpy.run_path(str(ROOT / "scripts" / "results_page.py"))
-    assert page["main"](["--check"]) == 0, capsys.readouterr().err
+@pytest.fixture(scope="module")
+def tables() -> dict[str, Any]:
+    """The program that writes tables into pages."""
+    return runpy.run_path(str(ROOT / "scripts" / "results_page.py"))
+
+
+def test_tables_are_those_of_the_records(tables: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert tables["main"](["--check"]) == 0, capsys.readouterr().err
     blocks = [
-        found[2] for name in page["PAGES"] for found in page["BLOCK"].finditer((ROOT / name).read_text())
+        found[2] for name in tables["PAGES"] for found in tables["BLOCK"].finditer((ROOT / name).read_text())
     ]
-    assert set(blocks) == set(page["TABLES"])
+    assert set(blocks) == set(tables["TABLES"])
 
 
-def test_a_changed_figure_is_found() -> None:
-    page = runpy.run_path(str(ROOT / "scripts" / "results_page.py"))
+def test_a_changed_figure_is_found(tables: dict[str, Any]) -> None:
     text = (ROOT / "docs" / "results.md").read_text()
     figure = re.search(r"\| BC \| (\d+\.\d) ", text)
     assert figure is not None
-    assert page["rewritten"](text.replace(figure[0], "| BC | 0.1 ")) == text
+    assert tables["rewritten"](text.replace(figure[0], "| BC | 0.1 ")) == text
 
 
 def anchors(page: Path) -> set[str]:

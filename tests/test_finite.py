@@ -97,10 +97,13 @@ def test_weights_that_are_not_finite_are_found_at_once(
 
 
 @pytest.mark.parametrize(
-    ("search", "rule", "value"),
-    [*((*how, math.nan) for how in SEARCHES), *(("tree", "best", value) for value in (math.inf, -math.inf))],
+    ("search", "rule", "value", "batch"),
+    [
+        *((*how, math.nan, 3) for how in SEARCHES),
+        *(("tree", "best", value, 3) for value in (math.inf, -math.inf)),
+        *((*how, math.nan, 1) for how in SEARCHES[:2]),
+    ],
 )
-@pytest.mark.parametrize("batch", [1, 3])
 def test_segment_and_step_are_those_where_it_began(
     store: SegmentStore, search: Any, rule: str, value: float, batch: int
 ) -> None:
