@@ -244,7 +244,7 @@ def test_agrees_with_the_definition(make):
     graph = LaneGraph(road)
     rng = np.random.default_rng(5)
     hits = 0
-    for _ in range(12):
+    for _ in range(20):
         # A loose walk along the lanes, and now and then none.
         lane, path = rng.integers(len(graph)), []
         for _ in range(rng.integers(1, 9)):
