@@ -279,7 +279,9 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
     st.integers(1024, 1400),
     st.integers(1, 200),
     st.integers(0, 10**6),
-    st.sampled_from(["even", "equal", "ascending", "descending", "where looked", "where not looked"]),
+    st.sampled_from(
+        ["even", "equal", "ascending", "descending", "where looked", "where not looked", "negative, too"]
+    ),
     st.floats(0, 0.99),
     st.sampled_from([0.0, 0.3, 1.0]),
 )
@@ -297,6 +299,7 @@ def test_in_long_rows_they_are_the_same(
         "descending": -np.sort(-values),
         "where looked": values + 100 * (place != 0),
         "where not looked": values + 100 * (place == 0),
+        "negative, too": values - 10,
     }[kind].astype(np.float32)
     values[0, rng.random(width) < spoiled] = np.nan
     values[-1, rng.random(width) < padded] = np.inf

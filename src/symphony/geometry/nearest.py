@@ -61,7 +61,11 @@ def kth_smallest(values: NDArray[Any], count: int) -> NDArray[Any]:
 
 def _partitioned(own: NDArray[Any], count: int) -> NDArray[Any]:
     """The same, of an array that nobody else needs."""
-    own.partition(count - 1, axis=-1)
+    if own.size >= LONG and own.min() >= 0:  # not where there is NaN
+        # Their bits, read as whole numbers, are in the same order, and quicker to compare.
+        own.view(f"i{own.itemsize}").partition(count - 1, axis=-1)
+    else:
+        own.partition(count - 1, axis=-1)
     return own[:, count - 1 : count]
 
 
@@ -75,9 +79,9 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
         return np.arange(values.size)
     cut = kth_smallest(values, count)
     chosen = values <= cut
-    number = np.count_nonzero(chosen, axis=1)
-    odd = np.flatnonzero(number != count)
-    if len(odd):
+    # Where no number is missing each row has as many at least: if they add up there is no tie. Quicker than row by row.
+    if np.count_nonzero(chosen) != count * len(values) or np.isnan(cut).any():
+        odd = np.flatnonzero(np.count_nonzero(chosen, axis=1) != count)
         if np.isnan(cut[odd]).any():
             order = np.argsort(values[odd], axis=-1, kind="stable")[:, :count]
             chosen[odd] = False
