@@ -46,6 +46,8 @@ def main() -> None:
     if arguments.save is not None:
         save(arguments.save)
         return
+    if arguments.before is None:
+        parser.error("the following arguments are required: --before")
     with tempfile.TemporaryDirectory() as folder, checked_out(arguments.before) as old:
         parts = []
         for name, root in (("before", old), ("after", ROOT)):
