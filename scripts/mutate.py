@@ -237,7 +237,6 @@ def main(args: list[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("out/mutate.json"), help="where the counts are kept")
     given = parser.parse_args(args)
-    os.environ["SYMPHONY_COMPILED"] = "0"  # else what is changed would not run where numba is installed
     given.out.parent.mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {} if given.again is None else json.loads(given.again.read_text())
     for name in list(found) or given.modules:

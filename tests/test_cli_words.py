@@ -69,7 +69,7 @@ def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[s
     found = json.loads(capsys.readouterr().out)
     assert found["simulation"]["rollouts"] == 2
     assert found["packages"]["torch"]
-    assert set(found["extras"]) == {"sumo", "argoverse2", "ray", "video", "compiled", "gym"}
+    assert set(found["extras"]) == {"sumo", "argoverse2", "ray", "video", "gym"}
     assert "bc_ts_h" in found["agents"]["included"]
 
 

@@ -3,7 +3,6 @@ tensors are what signatures say."""
 
 from __future__ import annotations
 
-import os
 import runpy
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -117,7 +116,6 @@ def test_every_loss_is_among_them() -> None:
 
 def instrumented() -> None:
     """Take every loss once, as :mod:`helpers_losses` does as a program."""
-    os.environ["SYMPHONY_COMPILED"] = "0"  # numba does not compile what is instrumented
     forget("symphony", *(path.stem for path in Path(__file__).parent.glob("helpers_*.py")))
     runpy.run_module("helpers_losses", run_name="__main__")
 

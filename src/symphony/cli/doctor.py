@@ -16,7 +16,6 @@ EXTRAS = {
     "argoverse2": ("pyarrow", "pyarrow"),
     "ray": ("ray", "ray"),
     "video": ("imageio_ffmpeg", "imageio-ffmpeg"),
-    "compiled": ("numba", "numba"),
     "gym": ("gymnasium", "gymnasium"),
 }
 """Optional extras: the module that each brings, and its distribution."""

@@ -5,14 +5,11 @@ Shapes: M rows (any flattened batch), N observing agents, K points each observes
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.envs.compiled import point_writer
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
@@ -192,8 +189,7 @@ def _features_in_place(
     angle, (x, y) = -heading.flatten(), origin.reshape(-1, 2).t().contiguous()
     pose = [v.numpy() for v in (x, y, angle.cos(), angle.sin(), (speed / config.speed_scale).flatten())]
     rows, table = index.view(agents, count).numpy(), tables.points.numpy()
-    write = point_writer() or _write_in_blocks
-    write(rows, table, *pose, table.dtype.type(config.distance_scale), out.numpy())
+    _write_in_blocks(rows, table, pose, table.dtype.type(config.distance_scale), out.numpy())
     seen = out.view(*flat.shape, POINT_FEATURES)
     if tables.light is not None:
         light = tables.light.index_select(0, index)
@@ -207,9 +203,18 @@ def _features_in_place(
     return seen
 
 
-def _write_in_blocks(rows: np.ndarray, table: np.ndarray, *pose_scale_out: Any) -> None:
-    """Rows of the table, copied and overwritten block by block; arguments as of what is compiled."""
-    *pose, scale, out = pose_scale_out
+def _write_in_blocks(
+    rows: np.ndarray, table: np.ndarray, pose: list[np.ndarray], scale: float, out: np.ndarray
+) -> None:
+    """Rows [R, K] of a table [T, F], copied to [R, K, F] and overwritten block by block.
+
+    Args:
+        rows: those that each agent sees.
+        table: features in the world's frame.
+        pose: [R] each of the agents: x, y, cosine and sine of the angle by which the world is turned, scaled speed.
+        scale: metres that become 1, of the table's type.
+        out: written to.
+    """
     agents, count = rows.shape
     block = max(1, _ROWS // count)
     buffers = np.empty((3, block, 2 * count), table.dtype)

@@ -79,7 +79,7 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
         return np.arange(values.size)
     cut = kth_smallest(values, count)
     chosen = values <= cut
-    # Where no number is missing each row has as many at least: if they add up there is no tie. Quicker than row by row.
+    # Where no number is missing each row has as many at least. Counted by rows, which is slow, only for ties.
     if np.count_nonzero(chosen) != count * len(values) or np.isnan(cut).any():
         odd = np.flatnonzero(np.count_nonzero(chosen, axis=1) != count)
         if np.isnan(cut[odd]).any():
