@@ -273,6 +273,11 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
     assert not finite[:, expected.shape[1] :].any()
 
 
+def test_ties_of_one_row_do_not_make_up_for_numbers_that_another_lacks() -> None:
+    values = np.array([[1, 1, 1, 1], [np.nan, np.nan, 2, np.nan]], np.float32)
+    assert smallest(values, 2).tolist() == [0, 1, 4, 6]
+
+
 @settings(max_examples=60)
 @given(
     st.integers(1, 5),
