@@ -65,6 +65,21 @@ def test_every_dependency_is_pinned_within_its_range(extra: str, file: str) -> N
         assert need.specifier.contains(version, prereleases=True), f"{need}: pinned to {version}"
 
 
+@pytest.mark.parametrize(
+    ("page", "line"),
+    [
+        ("README.md", r"# with extras: (.+)"),
+        ("README.md", r"Extras: (.+)\."),
+        ("docs/index.md", r"The extras are (.+?\(Gymnasium\))\."),
+    ],
+)
+def test_pages_name_the_extras_that_there_are(page: str, line: str) -> None:
+    found = re.search(line, (ROOT / page).read_text())
+    assert found is not None
+    words = re.sub(r"\([^)]*\)", "", found[1]).replace(" and ", ", ").replace("`", "")
+    assert {word.strip() for word in words.split(",")} == {*RUNTIME} - {"core"}
+
+
 def test_the_lowest_versions_are_those_promised() -> None:
     lowest = {
         canonicalize_name(need.name): next(part.version for part in need.specifier if part.operator == ">=")
