@@ -65,6 +65,16 @@ def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -
     return process
 
 
+def output_of(function: Callable[..., Any], *given: Any, said: Path, limit: float | None = None) -> str:
+    """What a function prints that :func:`apart` starts and that must end well, within so many seconds."""
+    process = apart(function, *given, said=said)
+    process.join(limit)
+    process.kill()  # where it hangs
+    process.join()
+    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
+    return said.read_text()
+
+
 def forget(*packages: str) -> None:
     """Have packages and modules imported anew from now on, in a process that :func:`apart` has started."""
     for name in list(sys.modules):

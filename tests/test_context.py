@@ -315,4 +315,4 @@ def test_a_log_of_minutes_is_looked_at_in_parts() -> None:
     interactive_agents(smooth(log, 0.3), 2)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert most < 60e6  # of all steps at once it would be twice that
+    assert most < 60e6  # of all steps at once it would be five times that

@@ -11,7 +11,7 @@ import torch
 
 import helpers_distributed
 from helpers_distributed import LOSSES, TRAINED
-from helpers_processes import apart
+from helpers_processes import output_of
 from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import checkpoints, latest, load_checkpoint
@@ -30,12 +30,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
         for seed in range(2):
             writer.append(straight_road(4, seed=seed, steps=9))
             writer.append(crossing(4, seed=seed, steps=8))
-    said = base / "said.txt"
-    process = apart(helpers_distributed.both, base / "store", base, said=said)
-    process.join(500)
-    process.kill()  # where it hangs
-    process.join()
-    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
+    output_of(helpers_distributed.both, base / "store", base, said=base / "said.txt", limit=500)
     return base, [json.loads((base / f"rank{rank}.json").read_text()) for rank in range(2)]
 
 

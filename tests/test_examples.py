@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from helpers_processes import apart, forget
+from helpers_processes import forget, output_of
 from helpers_runs import tiny
 from symphony import keys
 from symphony.agents import load_agent
@@ -65,11 +65,8 @@ def without_cars() -> None:
 
 def test_what_has_nothing_to_do_with_cars_loads_nothing_of_them(tmp_path: Path) -> None:
     """Neither collectors nor losses nor the examples of them do."""
-    said = tmp_path / "said"
-    process = apart(without_cars, said=said)
-    process.join()
-    assert process.exitcode == 0, Path(f"{said}.err").read_text()
-    told = {line.split()[0]: line.split()[1:] for line in said.read_text().splitlines() if line.strip()}
+    lines = output_of(without_cars, said=tmp_path / "said").splitlines()
+    told = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
     assert "independent" in told
     alone = {"symphony", "symphony._version", "symphony.errors"}
     assert (

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from helpers_device import NAME, PretendDevice, on, pretend
 from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
-from helpers_processes import apart, forget
+from helpers_processes import forget, output_of
 from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
@@ -123,11 +123,8 @@ def instrumented() -> None:
 def test_what_is_taken_and_returned_is_what_signatures_say(tmp_path: Path) -> None:
     """All that runs for a step and a loss, with shapes and kinds of numbers checked."""
     # In a process of its own, as the package must be instrumented when it is imported.
-    said = tmp_path / "said"
-    process = apart(instrumented, said=said)
-    process.join()
-    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
-    assert [tuple(line.split()) for line in said.read_text().splitlines()] == CASES
+    lines = output_of(instrumented, said=tmp_path / "said").splitlines()
+    assert [tuple(line.split()) for line in lines] == CASES
 
 
 @jaxtyped(typechecker=tensors_only)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import helpers_killed
-from helpers_processes import apart
+from helpers_processes import output_of
 from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
@@ -60,11 +60,8 @@ def records(run: Path) -> list[dict[str, Any]]:
 def killed(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of several methods, each once in one go and once in many."""
     out = tmp_path_factory.mktemp("killed")
-    said = out / "said.txt"
-    process = apart(helpers_killed.main, store, out, list(METHODS), said=said)
-    process.join()
-    assert process.exitcode == 0, Path(f"{said}.err").read_text()[-4000:]
-    assert said.read_text().split() == [name for name, _, _ in helpers_killed.DEATHS] * len(METHODS)
+    words = output_of(helpers_killed.main, store, out, list(METHODS), said=out / "said.txt").split()
+    assert words == [name for name, _, _ in helpers_killed.DEATHS] * len(METHODS)
     return out
 
 

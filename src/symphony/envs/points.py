@@ -237,18 +237,21 @@ def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: n
     pair = np.result_type(part.dtype, np.complex64)
     place, along, across = buffers
     pairs, both, turned = part[..., :4].view(pair), place.view(pair), across.view(pair)
-    np.subtract(pairs[..., 0], np.concatenate((x, y), -1).view(pair), out=both)
-    for column in range(2):
-        if column:
-            both[:] = pairs[..., column]
-        # (x cos, y cos) and i (x sin, y sin) = (-y sin, x sin).
+
+    def turn() -> None:
+        """(x cos, y cos) + i (x sin, y sin), which is (x cos - y sin, y cos + x sin)."""
         np.multiply(place, cos, out=along)
         np.multiply(place, sin, out=across)
-        turned *= 1j
+        np.multiply(turned, 1j, out=turned)
         np.add(along, across, out=place)
-        if not column:
-            place /= scale
-        pairs[..., column] = both
+
+    np.subtract(pairs[..., 0], np.concatenate((x, y), -1).view(pair), out=both)
+    turn()
+    np.divide(place, scale, out=place)
+    pairs[..., 0] = both
+    both[:] = pairs[..., 1]
+    turn()
+    pairs[..., 1] = both
     part[..., 5] = own
 
 

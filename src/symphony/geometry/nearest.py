@@ -36,6 +36,10 @@ LONG = 1024
 """Elements of a row from which on that is faster than to partition it."""
 
 
+MANY = 1024
+"""Elements from which on it pays to find out that none is negative."""
+
+
 def kth_smallest(values: NDArray[Any], count: int) -> NDArray[Any]:
     """The ``count``-th smallest of the real numbers in each row [R, W], as [R, 1]. NaN comes last."""
     width = values.shape[1]
@@ -61,7 +65,7 @@ def kth_smallest(values: NDArray[Any], count: int) -> NDArray[Any]:
 
 def _partitioned(own: NDArray[Any], count: int) -> NDArray[Any]:
     """The same, of an array that nobody else needs."""
-    if own.size >= LONG and own.min() >= 0:  # not where there is NaN
+    if own.size >= MANY and own.min() >= 0:  # not where there is NaN
         # Their bits, read as whole numbers, are in the same order, and quicker to compare.
         own.view(f"i{own.itemsize}").partition(count - 1, axis=-1)
     else:
