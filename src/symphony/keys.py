@@ -34,6 +34,8 @@ GOAL: Key = ("agents", "goal")
 """[..., N] int64: the route the agent follows, a row of its scene's table; -1 for none."""
 GOAL_SET: Key = ("agents", "goal_set")
 """[..., N, G] bool: the feasible routes among which an expert's log does not tell; where given, instead of GOAL."""
+PROGRESS: Key = ("agents", "progress")
+"""[..., N] float: metres that the agent has come along its route; 0 where it begins, and without one."""
 PERSONA: Key = ("agents", "persona")
 """[..., N, 2] float: the agent's headway and speed among those of the log, from -1 (shortest, slowest) to 1."""
 ACTION: Key = ("agents", "action")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -17,7 +17,7 @@ from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import Objects, objects_at
 from symphony.envs.observation import Observation, ObservationConfig, observe
-from symphony.envs.routes import pick_routes, route_choices
+from symphony.envs.routes import route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.specs import make_specs
 from symphony.envs.tables import Tables
@@ -36,6 +36,32 @@ def penalty(before: TensorDictBase, after: TensorDictBase) -> Float[Tensor, "*b 
     """Reward of -1 for an agent that collides or is off the road, else 0."""
     bad = after.get(keys.COLLISION) | after.get(keys.OFFROAD)
     return -bad.squeeze(-1).to(after.get(keys.STATE).dtype)
+
+
+class State(NamedTuple):
+    """The simulation state, all of it; leading dimensions [*b] are those of the batch.
+
+    Attributes:
+        scene: [*b] rows of the scene batch.
+        step: [*b] simulated steps since the first state.
+        stream: [*b] identity of the rollout.
+        state: [*b, N, 4] x, y, heading, speed.
+        valid: [*b, N] who is there.
+        goal: [*b, N] routes that agents follow, -1 for none.
+        progress: [*b, N] metres that they have come along them.
+        waiting: [*b, N] who has not entered yet; None where traffic is not open.
+        persona: [*b, N, 2] driving styles; None where they are not observed.
+    """
+
+    scene: Tensor
+    step: Tensor
+    stream: Tensor
+    state: Tensor
+    valid: Tensor
+    goal: Tensor
+    progress: Tensor
+    waiting: Tensor | None = None
+    persona: Tensor | None = None
 
 
 class DrivingEnv(EnvBase):
@@ -194,12 +220,12 @@ class DrivingEnv(EnvBase):
         persona = None
         if self.observation.persona:
             persona = _rows(self.scenes.persona, scene, self.scenes.interactive[scene])
-        begin, there = torch.zeros_like(scene), real & early
-        return self._from_state(scene, begin, stream, first, there, goal, waiting, persona)
+        begin, there, progress = torch.zeros_like(scene), real & early, torch.zeros_like(first[..., 0])
+        return self._from_state(State(scene, begin, stream, first, there, goal, progress, waiting, persona))
 
     def at(self, state: TensorDictBase) -> TensorDict:
         """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
-        return self._from_state(*self._read(state))
+        return self._from_state(self._read(state))
 
     def choices(self, state: TensorDictBase) -> TensorDictBase:
         """Add the feasible routes of a start state, as the goal policy observes them.
@@ -207,11 +233,12 @@ class DrivingEnv(EnvBase):
         Writes ``ROUTES`` [..., N, G, F] and ``ROUTES_MASK`` [..., N, G] into a copy.
         """
         row = state.get(keys.SCENE).squeeze(-1)
-        position = state.get(keys.STATE)
+        position, flat, routes = state.get(keys.STATE), row.flatten(), self.scenes.routes
         features, mask = route_choices(
             position.reshape(-1, *position.shape[-2:]),
-            self.scenes.route[row.flatten()],
-            self.scenes.route_count[row.flatten()],
+            routes.point.flatten(0, 1),
+            routes.first[flat] + (flat * routes.point.shape[1])[:, None, None],
+            routes.length[flat],
             self.observation.distance_scale,
             turns=self.observation.turns,
         )
@@ -221,15 +248,16 @@ class DrivingEnv(EnvBase):
 
     def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
         """A start state whose agents follow the given routes (by default those nearest to the log)."""
-        scene, step, stream, agents, valid, _, waiting, persona = self._read(state)
-        goal = self.scenes.route_logged[scene] if goal is None else goal
-        return self._from_state(scene, step, stream, agents, valid, goal, waiting, persona)
+        start = self._read(state)
+        goal = self.scenes.route_logged[start.scene] if goal is None else goal
+        start = start._replace(goal=goal, progress=torch.zeros_like(start.progress))
+        return self._from_state(start._replace(progress=self._progress(start, start.state)))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=[], device=self.device)
         if kwargs.get("set_state"):
-            return self._from_state(*self._read(tensordict))
+            return self._from_state(self._read(tensordict))
         partial = tensordict.get("_reset", None)
         named = tensordict.get(keys.SCENE, None)
         if named is not None and partial is None:
@@ -258,16 +286,32 @@ class DrivingEnv(EnvBase):
         return (torch.arange(shape.numel()) % len(items)).reshape(shape)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scene, step, stream, state, valid, goal, waiting, persona = self._read(tensordict)
-        index = _of(self.scenes.interactive, scene)
-        size = _rows(self.scenes.box_size, scene, index)
-        after = self._moved(tensordict, state, size)
-        after = torch.where(valid[..., None], after, state)
+        now = self._read(tensordict)
+        index = _of(self.scenes.interactive, now.scene)
+        size = _rows(self.scenes.box_size, now.scene, index)
+        after = self._moved(tensordict, now.state, size)
+        after = torch.where(now.valid[..., None], after, now.state)
+        valid, waiting = now.valid, now.waiting
         if waiting is not None:
-            valid, waiting = self._flow(scene, step + 1, state, after, valid, waiting)
-        out = self._from_state(scene, step + 1, stream, after, valid, goal, waiting, persona)
+            valid, waiting = self._flow(now.scene, now.step + 1, now.state, after, valid, waiting)
+        progress = self._progress(now, after)
+        later = now._replace(step=now.step + 1, state=after, valid=valid, progress=progress, waiting=waiting)
+        out = self._from_state(later)
         earned = self.reward(tensordict, out)
         return out.set(keys.REWARD, earned.reshape(*valid.shape, 1))
+
+    @torch.no_grad()
+    def _progress(self, before: State, after: Float[Tensor, "*b N 4"]) -> Float[Tensor, "*b N"]:
+        """Metres [..., N] that agents have come along their routes, from where they were before."""
+        if self.scenes.route_point.shape[1] == 0:
+            return before.progress
+        old, new, goal, about = (
+            part.reshape(-1, *part.shape[before.scene.ndim :])
+            for part in (before.state, after, before.goal, before.progress)
+        )
+        moved = (new[..., :2] - old[..., :2]).square().sum(-1).sqrt()
+        routes = self.scenes.routes.of(before.scene.flatten(), goal)
+        return routes.progress(new[..., :2], about, moved).reshape(before.progress.shape)
 
     def _moved(
         self, tensordict: TensorDictBase, state: Float[Tensor, "*b N 4"], size: Float[Tensor, "*b N 2"]
@@ -315,21 +359,14 @@ class DrivingEnv(EnvBase):
             without(found, index, self.scenes.interactive_valid[row] & ~valid) if self.open_traffic else found
         )
 
-    def _read(
-        self, tensordict: TensorDictBase
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+    def _read(self, tensordict: TensorDictBase) -> State:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
-        state, valid, goal = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL))
-        return (
-            scene,
-            step,
-            stream,
-            state,
-            valid,
-            goal,
-            tensordict.get(keys.WAITING) if self.open_traffic else None,
-            tensordict.get(keys.PERSONA, None) if self.observation.persona else None,
+        state, valid, goal, progress = (
+            tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS)
         )
+        waiting = tensordict.get(keys.WAITING) if self.open_traffic else None
+        persona = tensordict.get(keys.PERSONA, None) if self.observation.persona else None
+        return State(scene, step, stream, state, valid, goal, progress, waiting, persona)
 
     def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
         """The logged states [..., N, 4] in which agents begin, those that enter later included."""
@@ -337,18 +374,9 @@ class DrivingEnv(EnvBase):
         logged = with_speed(self.scenes.log_state[row, self.scenes.enter[scene], index])
         return torch.cat([logged[..., :3], logged[..., 3:].clamp_min(0.0)], -1)
 
-    def _from_state(
-        self,
-        scene: Tensor,
-        step: Tensor,
-        stream: Tensor,
-        state: Tensor,
-        valid: Tensor,
-        goal: Tensor,
-        waiting: Tensor | None = None,
-        persona: Tensor | None = None,
-    ) -> TensorDict:
+    def _from_state(self, now: State) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
+        scene, step, stream, state, valid, goal, progress, waiting, persona = now
         shape = scene.shape
         row, at = scene.flatten(), step.flatten()
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
@@ -356,8 +384,8 @@ class DrivingEnv(EnvBase):
         objects = self.objects(row, at, moved, real)
         routes = None
         if self.observation.route or self.observation.along:
-            follows = goal.reshape(-1, goal.shape[-1])
-            routes = pick_routes(self.scenes.route, self.scenes.route_count, row, follows)
+            follows, come = (part.reshape(-1, part.shape[-1]) for part in (goal, progress))
+            routes = self.scenes.routes.of(row, follows).window(come)
         seen = observe(self.scenes, row, at, objects, index, self.observation, self._kept(), routes)
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
@@ -375,6 +403,7 @@ class DrivingEnv(EnvBase):
             "valid": valid,
             "state": state,
             "goal": goal,
+            "progress": progress,
             "collision": back(collision)[..., None],
             "offroad": back(offroad)[..., None],
         }

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.routes import along_route
+from symphony.envs.routes import RouteWindow, along_route
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, Tables
 from symphony.geometry.boxes import gap_between
@@ -116,7 +116,7 @@ def observed_objects(
     index: Int[Tensor, "M N"],
     own: Float[Tensor, "M N 5"],
     own_size: Float[Tensor, "M N 2"],
-    routes: tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]] | None,
+    routes: RouteWindow | None,
 ) -> Seen:
     """The nearest others, by the distance between centres.
 
@@ -127,7 +127,7 @@ def observed_objects(
         index: those that observe.
         own: their states.
         own_size: length and width of their boxes.
-        routes: points of their routes and how many of them exist; without, nothing is seen along routes.
+        routes: what they see of their routes; without, nothing is seen along routes.
     """
     config, agents = tables.config, objects.valid.shape[1]
     chosen, mask = _nearest(objects, index, own, config.num_objects)
@@ -144,7 +144,7 @@ def observed_objects(
     size = objects.size.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
     along = None
     if follows and routes is not None:
-        along = along_route(own, own_size, state, size, *routes) * mask[..., None]
+        along = along_route(own, own_size, state, size, routes) * mask[..., None]
     if not measures:
         return Seen(features, mask, along=along)
     gap = _gaps(config.foresight, own, own_size, state, size)

@@ -16,7 +16,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from symphony.envs.objects import OBJECT_FEATURES, Objects, Seen, observed_objects
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
-from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, route_ahead
+from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, RouteWindow, route_ahead
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners
@@ -161,7 +161,7 @@ def observe(
     index: Int[Tensor, "M N"],
     config: ObservationConfig,
     tables: Tables | None = None,
-    routes: tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]] | None = None,
+    routes: RouteWindow | None = None,
 ) -> Observation:
     """Observation of the agents ``index`` among ``objects``.
 
@@ -176,7 +176,7 @@ def observe(
         index: those that observe.
         config: what they see.
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
-        routes: points of the agents' routes and how many of them exist; without, nothing of routes is observed.
+        routes: what agents see of their routes; without, nothing of routes is observed.
     """
     if config.blind and not config.route:
         return Observation()
@@ -207,7 +207,7 @@ def observe(
         lights, lights_mask = observed_lights(tables, scene, step, origin, heading, speed)
     if config.route and routes is not None:
         pose = torch.cat([own[..., :3], speed[..., None]], -1)
-        route = route_ahead(pose, *routes, config.distance_scale)
+        route = route_ahead(pose, routes, config.distance_scale)
     if config.clearance or config.road:
         places = [origin[..., None, :], box_corners(origin, heading, own_size)]
         if config.road and config.foresight:

@@ -1,11 +1,14 @@
 """Routes as tables of points: what a goal looks like to a policy.
 
-Legend: G feasible routes of one vehicle, K points of a route, N agents, M rows.
+Legend: B scenes, G feasible routes of a vehicle, R points of all routes of a scene, K points of a route, W points of the
+part of it that is seen, N agents, M rows.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,19 +20,17 @@ from symphony.data.segment import RunSegment
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
 from symphony.geometry.nearest import first_smallest, on_host
-from symphony.roadgraph import (
-    LaneGraph,
-    ground_truth_routes,
-    route_polyline,
-    routes,
-    starting_lanes,
-)
+from symphony.geometry.stations import stations_along
+from symphony.roadgraph import LaneGraph, ground_truth_routes, route_lines, routes, starting_lanes
+from symphony.roadgraph.routes import HORIZON
 from symphony.streams import stream_of
 
 SPACING = 3.0
-"""Metres between the points of a route."""
+"""Metres between the points of a route; its last piece may be shorter."""
 POINTS = 64
-"""Points of a route: 189 m, past what a fast vehicle drives in 10 s."""
+"""Points of a route, from its beginning on, by which it is chosen: 189 m."""
+BEHIND, WINDOW = 12, 56
+"""Points of a route that are seen: so many behind the agent, so many in all (36 m behind to 129 m ahead)."""
 AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
 """Points of its route that a vehicle observes, counted from the one nearest to it."""
 ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
@@ -41,6 +42,14 @@ STRIDE = 4
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
+ONWARD = 200.0
+"""Metres that routes reach beyond what the fastest agent can drive."""
+_FASTER, _FASTEST = 1.1, 45.0
+"""What is driven may be faster than the fastest of the log by this factor, up to so many m/s."""
+_BACK, _SEARCHED = 4, 16
+"""Points before the last place along a route from which on the next one is looked for, and points looked at."""
+_CUT, _SLACK = 1.5, 3.0
+"""Metres along a route to a metre driven (who cuts a corner gets on faster), and metres besides."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +57,9 @@ class RouteTable:
     """Feasible routes of one vehicle from where it begins.
 
     Attributes:
-        points: [G, K, 2] float32, :data:`SPACING` apart from beside the vehicle on; past the end the last one again.
-        count: [G] int64 points before the end.
+        points: [P, 2] float32 points of all routes, one route after the other, :data:`SPACING` apart from beside the
+            vehicle on.
+        count: [G] int64 points of each.
         right: [G] bool the routes nearest to the logged trajectory; several where they part beyond its end.
         logged: one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane.
     """
@@ -59,9 +69,28 @@ class RouteTable:
     right: NDArray[np.bool_]
     logged: int
 
+    def line(self, route: int) -> NDArray[np.float32]:
+        """Points [K, 2] of one route."""
+        begin = int(self.count[:route].sum())
+        return self.points[begin : begin + int(self.count[route])]
 
-def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
+
+NO_ROUTES = RouteTable(np.zeros((0, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1)
+
+
+def drivable(segment: RunSegment) -> float:
+    """Metres that the fastest agent of a segment can drive from its first to its last state, or a little more."""
+    speed = np.linalg.norm(segment.velocity[segment.valid], axis=-1).max(initial=0.0)
+    return min(_FASTER * float(speed), _FASTEST) * (segment.num_steps - 1) * segment.dt
+
+
+def route_table(
+    segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0, *, reach: float | None = None
+) -> RouteTable:
     """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
+
+    They follow every branch for :data:`symphony.roadgraph.routes.HORIZON` metres, or as far as agents can drive in
+    the segment, and reach :data:`ONWARD` metres beyond what can be driven, unless the map ends.
 
     Args:
         segment: with the agent's log.
@@ -69,6 +98,7 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
         agent: row of the segment.
         begin: step at which the agent comes in; routes begin with its first valid state from there on, of one that
             comes in later with the first on a lane.
+        reach: of :func:`drivable`, where that is known.
     """
     steps = begin + np.flatnonzero(segment.valid[agent, begin:])
     for first in steps if begin else steps[:1]:
@@ -77,37 +107,174 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
         if starts:
             break
     else:
-        return RouteTable(
-            np.zeros((0, POINTS, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1
-        )
-    choices, along = routes(graph, starts), dict(starts)
-    # A route that begins with a lane change starts on the neighbour, beside the lane the vehicle is on.
-    default = next(iter(along.values()), 0.0)
-    points = np.empty((len(choices), POINTS, 2), np.float32)
-    count = np.empty(len(choices), np.int64)
-    for k, route in enumerate(choices):
-        line = route_polyline(
-            graph,
-            route,
-            spacing=SPACING,
-            start=along.get(route[0], default),
-            length=SPACING * (POINTS - 1),
-        )[:POINTS]
-        points[k, : len(line)] = line
-        points[k, len(line) :] = line[-1]
-        count[k] = len(line)
-    path, valid = segment.position[agent, :, :2], segment.valid[agent]
-    right = ground_truth_routes(graph, choices, path, valid)
+        return NO_ROUTES
+    reach = drivable(segment) if reach is None else reach
+    horizon = max(HORIZON, reach)
+    onward = max(reach + ONWARD - horizon, 0.0)
+    _, lines = route_lines(
+        graph,
+        routes(graph, starts, horizon=horizon, onward=onward),
+        dict(starts),
+        spacing=SPACING,
+        length=max(horizon, reach + ONWARD),
+        speed=float(np.linalg.norm(segment.velocity[agent, first])),
+    )
+    right = ground_truth_routes(lines, segment.position[agent, first:, :2], segment.valid[agent, first:])
     tied = np.flatnonzero(right)
     draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
-    return RouteTable(points, count, right, int(tied[draw]))
+    count = np.array([len(line) for line in lines], np.int64)
+    return RouteTable(np.concatenate(lines).astype(np.float32), count, right, int(tied[draw]))
+
+
+def logged_progress(
+    tables: Sequence[RouteTable], position: Float[NDArray[np.floating], "N T 2"], valid: Bool[NDArray, "N T"]
+) -> Float[NDArray[np.float32], "N T"]:
+    """Metres that agents have come along the routes that they took, at each step; 0 where that is not known."""
+    found = np.zeros(valid.shape, np.float32)
+    rows = [row for row, table in enumerate(tables) if table.logged >= 0]
+    if not rows:
+        return found
+    lines = [tables[row].line(tables[row].logged) for row in rows]
+    most = max(2, *map(len, lines))
+    padded = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in lines])
+    places = stations_along(padded.astype(np.float64), position[rows].astype(np.float64), valid[rows])
+    found[rows] = np.nan_to_num(places)
+    return found
+
+
+class Routes(NamedTuple):
+    """Routes of the agents of some scenes, all points of a scene in one list.
+
+    Attributes:
+        point: [B, R, 2].
+        first: [B, N, G] int64 place in the list of the first point of each route.
+        length: [B, N, G] int64 points of each; 0 for padding.
+    """
+
+    point: Tensor
+    first: Tensor
+    length: Tensor
+
+    def of(self, scene: Int[Tensor, " M"], goal: Int[Tensor, "M N"]) -> FollowedRoutes:
+        """The routes that agents follow: none where there is no route of that number."""
+        _, agents, number = self.length.shape
+        if number == 0:
+            none = torch.zeros_like(goal)
+            return FollowedRoutes(self.point.flatten(0, 1), none, none)
+        agent = torch.arange(agents, device=goal.device)
+        # Places in the flattened [B, N, G], and then in the flattened [B, R].
+        row = ((scene[:, None] * agents + agent) * number + goal.clamp(0, number - 1)).flatten()
+        first = self.first.flatten().index_select(0, row).unflatten(0, goal.shape)
+        count = self.length.flatten().index_select(0, row).unflatten(0, goal.shape)
+        exists = (goal >= 0) & (goal < number)
+        begin = first + (scene * self.point.shape[1])[:, None]
+        return FollowedRoutes(self.point.flatten(0, 1), begin, torch.where(exists, count, 0))
+
+    def beginnings(self) -> tuple[Float[Tensor, "B N G K 2"], Int[Tensor, "B N G"]]:
+        """The first :data:`POINTS` points of all routes, by which one is chosen, and how many of them exist."""
+        shift = self.point.shape[1] * torch.arange(len(self.point), device=self.first.device)[:, None, None]
+        points = _beginnings(self.point.flatten(0, 1), self.first + shift, self.length)
+        return points, self.length.clamp_max(POINTS)
+
+
+class FollowedRoutes(NamedTuple):
+    """One route for each of some agents.
+
+    Attributes:
+        point: [Q, 2] points of many routes.
+        begin: [M, N] int64 place of the first point of each agent's.
+        length: [M, N] int64 points of it; 0 for none.
+    """
+
+    point: Tensor
+    begin: Tensor
+    length: Tensor
+
+    def window(self, progress: Float[Tensor, "M N"]) -> RouteWindow:
+        """What is seen of the routes by agents that have come so many metres along them."""
+        own = (progress / SPACING).round().long().minimum((self.length - 2).clamp_min(0))
+        start = (own - BEHIND).clamp_min(0)
+        place = start[..., None] + constant(tuple(range(WINDOW)), torch.int64, start.device)
+        points = _points_at(self.point, self.begin, self.length, place)
+        return RouteWindow(points, place < self.length[..., None], own - start)
+
+    def progress(
+        self,
+        position: Float[Tensor, "M N 2"],
+        about: Float[Tensor, "M N"],
+        moved: Float[Tensor, "M N"] | None = None,
+    ) -> Float[Tensor, "M N"]:
+        """Metres along the routes of the places nearest to agents, looked for around where they were before.
+
+        Args:
+            position: of the agents.
+            about: where they were, in metres along.
+            moved: metres that they have driven since; nothing by default.
+        """
+        with torch.no_grad():
+            reach = _SLACK if moved is None else _CUT * moved[..., None] + _SLACK
+            start = ((about / SPACING).long() - _BACK).clamp_min(0)
+            place = start[..., None] + constant(tuple(range(_SEARCHED)), torch.int64, start.device)
+            x, y = _points_at(self.point, self.begin, self.length, place).unbind(-1)
+            first, way = (x[..., :-1], y[..., :-1]), (x.diff(dim=-1), y.diff(dim=-1))
+            length = (way[0].square() + way[1].square()).sqrt()
+            away = [position[..., k, None] - first[k] for k in (0, 1)]
+            along = (away[0] * way[0] + away[1] * way[1]) / length.clamp_min(1e-6)
+            along = along.clamp_min(0.0).minimum(length)
+            share = along / length.clamp_min(1e-6)
+            squared = (away[0] - share * way[0]).square() + (away[1] - share * way[1]).square()
+            arc = SPACING * place[..., :-1].to(about.dtype)
+            near = (arc <= about[..., None] + reach) & (arc + SPACING >= about[..., None] - reach)
+            near &= place[..., 1:] < self.length[..., None]
+            which = first_smallest(squared.masked_fill(~near, torch.inf))[..., None]
+            found = (arc + along).gather(-1, which)[..., 0]
+            return torch.where(near.any(-1), found, about)
+
+    def lines(self) -> tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]]:
+        """All points of the routes, those past the end as the last one, and their number. On a device this waits."""
+        most = max(2, int(self.length.max())) if self.length.numel() else 2
+        place = torch.arange(most, device=self.begin.device).expand(*self.begin.shape, most)
+        return _points_at(self.point, self.begin, self.length, place), self.length
+
+
+def _points_at(
+    point: Float[Tensor, "Q 2"],
+    begin: Int[Tensor, "*b"],
+    count: Int[Tensor, "*b"],
+    place: Int[Tensor, "*b K"],
+) -> Float[Tensor, "*b K 2"]:
+    """Points of routes at their own places; past the end the last one again, zeros without a route."""
+    if not len(point):
+        return point.new_zeros(*place.shape, 2)
+    row = begin[..., None] + place.minimum((count[..., None] - 1).clamp_min(0))
+    found = point.index_select(0, row.clamp_max(len(point) - 1).flatten()).unflatten(0, place.shape)
+    return found * (count > 0)[..., None, None]
+
+
+def _beginnings(
+    point: Float[Tensor, "Q 2"], begin: Int[Tensor, "*b"], count: Int[Tensor, "*b"]
+) -> Float[Tensor, "*b K 2"]:
+    """The first :data:`POINTS` points of routes."""
+    place = torch.arange(POINTS, device=begin.device).expand(*begin.shape, POINTS)
+    return _points_at(point, begin, count, place)
+
+
+class RouteWindow(NamedTuple):
+    """What agents see of their routes.
+
+    Attributes:
+        points: [M, N, W, 2] points, :data:`SPACING` apart.
+        exists: [M, N, W] which of them are there.
+        own: [M, N] int64 the one that is nearest to where the agent has come to, or the last but one.
+    """
+
+    points: Tensor
+    exists: Tensor
+    own: Tensor
 
 
 def route_ahead(
-    state: Float[Tensor, "M N 4"],
-    points: Float[Tensor, "M N K 2"],
-    count: Int[Tensor, "M N"],
-    distance_scale: float,
+    state: Float[Tensor, "M N 4"], routes: RouteWindow, distance_scale: float
 ) -> Float[Tensor, "M N F"]:
     """What each agent observes of its route, in its own frame.
 
@@ -116,29 +283,19 @@ def route_ahead(
 
     Args:
         state: x, y, heading, speed.
-        points: the agents' routes.
-        count: points of each route that exist; 0 for none.
+        routes: what is seen of the agents' routes.
         distance_scale: metres that become 1.
     """
     position, heading = state[..., :2], state[..., 2]
-    exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
-    with torch.no_grad():
-        # Component by component: sums over a last dimension of 2 are slow.
-        x, y = (points - position[..., None, :]).square().unbind(-1)
-        squared = x + y
-        # The last point has nothing ahead of it, so the one before gives the direction.
-        nearest = first_smallest(squared.masked_fill(~exists, torch.inf))
-        nearest = nearest.minimum((count - 2).clamp_min(0))
-        which = nearest[..., None] + constant(AHEAD, torch.int64, points.device)
-        there = which < count[..., None]
-        which = which.clamp_max(points.shape[2] - 1)
-    seen = points.gather(2, which[..., None].expand(*which.shape, 2))
+    which = routes.own[..., None] + constant(AHEAD, torch.int64, position.device)
+    there = routes.exists.gather(2, which)
+    seen = routes.points.gather(2, which[..., None].expand(*which.shape, 2))
     local = rotate(seen - position[..., None, :], -heading[..., None])
     along = local[..., 1, :] - local[..., 0, :]
     length = along.norm(dim=-1, keepdim=True)
     along = along / length.clamp_min(1e-3)
     offset = along[..., 0] * local[..., 0, 1] - along[..., 1] * local[..., 0, 0]
-    has = (count > 1).to(state.dtype)[..., None]
+    has = routes.exists[..., 1:2].to(state.dtype)
     ahead = torch.cat([local / distance_scale, there[..., None].to(state.dtype)], -1)
     ahead = ahead[..., 1:, :] * there[..., 1:, None]
     features = torch.cat(
@@ -152,37 +309,37 @@ def along_route(
     own_size: Float[Tensor, "M N 2"],
     others: Float[Tensor, "M N O 5"],
     size: Float[Tensor, "M N O 2"],
-    points: Float[Tensor, "M N K 2"],
-    count: Int[Tensor, "M N"],
+    routes: RouteWindow,
 ) -> Float[Tensor, "M N O F"]:
     """Where others are along each agent's route (Frenet coordinates), as bounded numbers.
 
     Whether it can be said; the gap along the route between the boxes (three scales, positive ahead, 0 while they are
     side by side); how far to the left of the route (two scales) and how far beside the agent's own width; how much
     faster along the route (two scales); the share d / (d + 2) of the deceleration d in m/s^2 that keeps the agent
-    behind what it closes in on; whether it is ahead. All zero beyond the ends of the route, more than
+    behind what it closes in on; whether it is ahead. All zero beyond what is seen of the route, more than
     :data:`BESIDE` metres from it, and without one. Every number is within [-1, 1] at any speed.
 
     Args:
         own: x, y, heading, velocity of the agents.
         own_size: length and width of their boxes.
-        others: likewise.
-        size: likewise.
-        points: the agents' routes, :data:`SPACING` apart.
-        count: points of each route that exist; 0 for none.
+        others: x, y, heading, velocity of the others.
+        size: length and width of the others' boxes.
+        routes: what is seen of the agents' routes.
     """
     # Component by component: operations on a last dimension of 2 are slow.
     x, y, speed_x, speed_y = (torch.cat([own[..., k, None], others[..., k]], -1) for k in (0, 1, 3, 4))
-    points_x, points_y = points.unbind(-1)
+    points_x, points_y = routes.points.unbind(-1)
+    count, last = routes.exists.sum(-1), routes.points.shape[2] - 1
     with torch.no_grad():
-        exists = torch.arange(points.shape[2], device=points.device) < count[..., None]
         # |p - q|^2 less |p|^2, about the agent so that numbers stay small: [M, N, 1 + O, K]
         here = torch.stack([x - x[..., :1], y - y[..., :1]], -1)
         line = torch.stack([points_x - x[..., :1], points_y - y[..., :1]], -2)
-        own_part = line.square().sum(-2).masked_fill(~exists, torch.inf)
-        nearest = first_smallest(own_part[..., None, :] - 2.0 * here @ line)
+        own_part = line.square().sum(-2).masked_fill(~routes.exists, torch.inf)
+        # The agent's own place is where it has come to, which on a route that passes itself is not the nearest one.
+        nearest = first_smallest(own_part[..., None, :] - 2.0 * here[..., 1:, :] @ line)
+        nearest = torch.cat([routes.own[..., None], nearest], -1)
         start = nearest.minimum((count[..., None] - 2).clamp_min(0))
-        following = (start + 1).clamp_max(points.shape[2] - 1)
+        following = (start + 1).clamp_max(last)
     first_x, first_y = points_x.gather(2, start), points_y.gather(2, start)
     along_x, along_y = points_x.gather(2, following) - first_x, points_y.gather(2, following) - first_y
     length = (along_x.square() + along_y.square()).sqrt().clamp_min(1e-3)
@@ -222,7 +379,8 @@ def along_route(
 
 def route_choices(
     state: Float[Tensor, "M N 4"],
-    points: Float[Tensor, "M N G K 2"],
+    point: Float[Tensor, "Q 2"],
+    first: Int[Tensor, "M N G"],
     count: Int[Tensor, "M N G"],
     distance_scale: float,
     *,
@@ -230,18 +388,29 @@ def route_choices(
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
     """Every feasible route as features in the agent's frame, and which of them exist.
 
-    A feature vector is position, direction and existence of every :data:`STRIDE`-th point. With ``turns`` also where
-    the route begins, resolved to decimetres near the agent, and the sine of the turn at every point: a route jumps
-    where it changes lanes, which points 12 m apart hardly show.
+    A feature vector is position, direction and existence of every :data:`STRIDE`-th of the first :data:`POINTS`
+    points. With ``turns`` also where the route begins, resolved to decimetres near the agent, and the sine of the
+    turn at every point.
+
+    Args:
+        state: x, y, heading, speed of the agents.
+        point: of many routes.
+        first: place of the first point of each agent's routes.
+        count: points of each; 0 for padding.
+        distance_scale: metres that become 1.
+        turns: whether to say more of a route.
     """
     state = state[..., None, :].expand(*count.shape, state.shape[-1])
     there = (count > 0).flatten().nonzero().squeeze(-1) if on_host(count) else None
     if there is None:
-        return _shape_of_routes(state, points, count, distance_scale, turns=turns), count > 1
+        line = _beginnings(point, first, count)
+        shape = _shape_of_routes(state, line, count.clamp_max(POINTS), distance_scale, turns=turns)
+        return shape, count > 1
     # Some agents have ten times as many routes as most.
     lead = count.ndim - 1
-    chosen, line, number = (part.flatten(0, lead)[there] for part in (state, points, count))
-    found = _shape_of_routes(chosen, line, number, distance_scale, turns=turns)
+    chosen, begin, number = (part.flatten(0, lead)[there] for part in (state, first, count))
+    line = _beginnings(point, begin, number)
+    found = _shape_of_routes(chosen, line, number.clamp_max(POINTS), distance_scale, turns=turns)
     features = found.new_zeros(count.numel(), found.shape[-1]).index_copy(0, there, found)
     return features.unflatten(0, count.shape), count > 1
 
@@ -273,21 +442,3 @@ def _shape_of_routes(
         begin = (local[..., 0, :] / 3.0).tanh()
         features = torch.cat([features, begin * (exists > 0), torch.where(inner, turn, 0.0)], -1)
     return features
-
-
-def pick_routes(
-    route: Float[Tensor, "B N G K 2"],
-    count: Int[Tensor, "B N G"],
-    scene: Int[Tensor, " M"],
-    goal: Int[Tensor, "M N"],
-) -> tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]]:
-    """The points of one route per agent and how many of them exist: none where there is no route of that number."""
-    _, agents, routes = count.shape
-    if routes == 0:
-        return route.new_zeros(*goal.shape, POINTS, 2), torch.zeros_like(goal)
-    place = torch.arange(agents, device=goal.device)
-    # Places in the flattened [B, A, G].
-    row = ((scene[:, None] * agents + place) * routes + goal.clamp(0, routes - 1)).flatten()
-    points = route.flatten(0, 2).index_select(0, row).unflatten(0, goal.shape)
-    exists = count.flatten().index_select(0, row).unflatten(0, goal.shape)
-    return points, torch.where((goal >= 0) & (goal < routes), exists, 0)

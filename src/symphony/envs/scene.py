@@ -20,7 +20,7 @@ from torch import Tensor
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.envs.edge import MapEdge, beyond
-from symphony.envs.routes import POINTS, RouteTable, route_table
+from symphony.envs.routes import Routes, RouteTable, drivable, route_table
 from symphony.errors import DataError
 from symphony.geometry.polylines import segments_of
 from symphony.geometry.spans import spans
@@ -112,8 +112,10 @@ class SceneBatch(TensorClass):
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
         segment: [B] int64 number of the run segment among those that scenes are drawn from.
         dt: [B] float64 seconds per step, the same in all scenes of a batch.
-        route: [B, N, G, K, 2] points of the feasible routes of the interactive agents; G = 0 where not asked for.
-        route_count: [B, N, G] int64 points that exist; 0 for padding.
+        route_point: [B, R, 2] points of the feasible routes of the interactive agents, one route after the other;
+            R = 0 where not asked for.
+        route_first: [B, N, G] int64 place of the first point of each route.
+        route_count: [B, N, G] int64 points of each; 0 for padding.
         route_logged: [B, N] int64 the route nearest to what the log shows, -1 for none.
     """
 
@@ -146,9 +148,20 @@ class SceneBatch(TensorClass):
     stream: Tensor
     segment: Tensor
     dt: Tensor
-    route: Tensor
+    route_point: Tensor
+    route_first: Tensor
     route_count: Tensor
     route_logged: Tensor
+
+    @property
+    def routes(self) -> Routes:
+        """The feasible routes of the interactive agents."""
+        return Routes(self.route_point, self.route_first, self.route_count)
+
+    def whole_route(self, scene: int, agent: int, route: int) -> Tensor:
+        """Points [K, 2] of one route of an interactive agent."""
+        begin = int(self.route_first[scene, agent, route])
+        return self.route_point[scene, begin : begin + int(self.route_count[scene, agent, route])]
 
 
 def scene(
@@ -187,8 +200,11 @@ def scene(
                 field="interactive",
             )
     enter = np.zeros(len(chosen), np.int64) if edge is None else _first_inside(segment, chosen, edge)
+    reach = drivable(segment) if graph else 0.0
     tables = [
-        route_table(segment, graph, int(a), int(at)) for a, at in zip(chosen, enter, strict=True) if graph
+        route_table(segment, graph, int(a), int(at), reach=reach)
+        for a, at in zip(chosen, enter, strict=True)
+        if graph
     ]
     log = np.concatenate(
         [segment.position[..., :2], segment.heading[..., None], segment.velocity], axis=-1
@@ -266,7 +282,7 @@ _AGENT_FIELDS = {
     "interactive_valid",
     "enter",
     "background",
-    "route",
+    "route_first",
     "route_count",
     "route_logged",
 }
@@ -274,12 +290,20 @@ _AGENT_FIELDS = {
 
 def _routes(tables: Sequence[RouteTable], agents: int) -> dict[str, NDArray[Any]]:
     most = max((len(table.count) for table in tables), default=0)
-    points = np.zeros((agents, most, POINTS, 2), np.float32)
-    count = np.zeros((agents, most), np.int64)
+    first, count = np.zeros((2, agents, most), np.int64)
+    points, begin = [np.zeros((0, 2), np.float32)], 0
     for k, table in enumerate(tables):
-        points[k, : len(table.count)], count[k, : len(table.count)] = table.points, table.count
+        count[k, : len(table.count)] = table.count
+        first[k, : len(table.count)] = begin + np.cumsum(table.count) - table.count
+        points.append(table.points)
+        begin += len(table.points)
     logged = np.array([table.logged for table in tables] or [-1] * agents, np.int64)
-    return {"route": points, "route_count": count, "route_logged": logged}
+    return {
+        "route_point": np.concatenate(points),
+        "route_first": first,
+        "route_count": count,
+        "route_logged": logged,
+    }
 
 
 def _first_inside(segment: RunSegment, chosen: NDArray[np.int64], edge: MapEdge) -> NDArray[np.int64]:

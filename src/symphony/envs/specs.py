@@ -55,6 +55,7 @@ def make_specs(
         "valid": lambda: flags(agents),
         "state": lambda: floats(agents, 4),
         "goal": lambda: numbers(agents),
+        "progress": lambda: floats(agents),
     }
     if open_traffic:
         parts["waiting"] = lambda: flags(agents)

@@ -321,13 +321,13 @@ def _add(
 
 def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
     """What a search made of the goals; None without search or without goals."""
-    if found.search is None or found.drawn is None or not scenes.route.shape[2]:
+    if found.search is None or found.drawn is None or not scenes.route_point.shape[1]:
         return None
     # The rollouts of a tree are the first of its leaves.
     each = found.goal.shape[1] // found.drawn.shape[1]
     first = found.search.slots[..., 0, :each].sort(-1).values
     founders = 1 + (first.diff(dim=-1) != 0).sum(-1)
-    turn = route_turns(scenes.route, scenes.route_count)
+    turn = route_turns(*scenes.routes.beginnings())
     # Goals of the background are nobody's choice.
     drawn, goal = (
         torch.where(scenes.background[:, None], -1, each) for each in (found.drawn.flatten(1, 2), found.goal)

@@ -210,6 +210,6 @@ def _routes(scene: SceneBatch, goals: Int[Tensor, "S N"]) -> list[Any]:
     """Points of the route of each agent; None where it follows none, or not the same in all branches."""
     same = torch.where((goals == goals[:1]).all(0), goals[0], -1)
     return [
-        scene.route[0, n, route, : scene.route_count[0, n, route]].cpu().numpy() if route >= 0 else None
+        scene.whole_route(0, n, route).cpu().numpy() if route >= 0 else None
         for n, route in enumerate(same.tolist())
     ]

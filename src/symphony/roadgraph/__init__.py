@@ -5,12 +5,14 @@ from __future__ import annotations
 from symphony.roadgraph.assign import lane_of, starting_lanes
 from symphony.roadgraph.branches import visited_curvatures, visited_regions
 from symphony.roadgraph.graph import LaneGraph, Regions
+from symphony.roadgraph.paths import blend, centre_line
 from symphony.roadgraph.routes import (
     Route,
     feasible_routes,
     ground_truth_routes,
     route_errors,
-    route_polyline,
+    route_line,
+    route_lines,
     routes,
 )
 
@@ -18,11 +20,14 @@ __all__ = [
     "LaneGraph",
     "Regions",
     "Route",
+    "blend",
+    "centre_line",
     "feasible_routes",
     "ground_truth_routes",
     "lane_of",
     "route_errors",
-    "route_polyline",
+    "route_line",
+    "route_lines",
     "routes",
     "starting_lanes",
     "visited_curvatures",

@@ -105,6 +105,8 @@ class LaneGraph:
         left: per lane, the lanes a change to the left reaches.
         right: per lane, the lanes a change to the right reaches.
         regions: the branching regions, by parent, then by lane.
+        followed: lines [P, 2] of pairs of a lane and its successor that were looked for already, see
+            :func:`symphony.roadgraph.paths.followed`.
     """
 
     def __init__(self, road: Road, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
@@ -122,6 +124,7 @@ class LaneGraph:
         turns = [((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi).sum() for heading in headings]
         self.curvature: Reals = np.array(turns, dtype=np.float64) / np.where(self.length > 0, self.length, 1)
         self.regions = self._branching()
+        self.followed: dict[tuple[int, int], Reals] = {}
 
     def __len__(self) -> int:
         return len(self.lines)

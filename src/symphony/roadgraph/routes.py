@@ -1,25 +1,23 @@
-"""Feasible routes: the lane sequences a vehicle can follow, and the one it did (section III of the paper)."""
+"""Feasible routes: the ways a vehicle can take along lanes, and the one it did (section III of the paper)."""
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import shapely
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from symphony.geometry.stations import stations_along
+from symphony.geometry.stations import stations_along, to_pieces
 from symphony.roadgraph.assign import starting_lanes
 from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Reals, line_strings
-
-Route = tuple[int, ...]
-"""Lane indices in driving order."""
+from symphony.roadgraph.lines import Reals, turn_between
+from symphony.roadgraph.paths import arc_lengths, at, beside, blend, centre_line, distinct, sharpest
 
 HORIZON = 240.0
-"""Metres ahead that routes reach: 10 s at 20 m/s and a margin."""
+"""Metres ahead up to which routes take every branch: 10 s at 20 m/s and a margin."""
 
 LIMIT = 200
 """Most routes a vehicle gets."""
@@ -27,9 +25,34 @@ LIMIT = 200
 MAX_LANES = 500
 """Most lanes of a route."""
 
-_AROUND = 10.0
-"""Metres along a route around a vehicle within which its lanes are those that it is on."""
+CHANGE_METRES, CHANGE_SECONDS = 20.0, 3.0
+"""A change of lanes takes so many metres, or so many seconds at the vehicle's speed, whichever is longer."""
+CHANGE_TURN = np.radians(25.0)
+"""Largest angle between two lanes where one changes, and what a change may turn more within 3 m than the lanes do."""
+CHANGE_WIDTH = 7.0
+"""Metres between the centre lines of two lanes beside each other, at most."""
+SAME = 1.0
+"""Metres within which two routes are one."""
 _TIE = 1e-3
+_SLACK = 30.0
+"""Metres of a route beyond 1.5 times the way driven that are compared with it."""
+_RETURN_METRES, _RETURN_WIDTH = 25.0, 6.0
+"""A line comes by a place twice where, so many metres farther along, it is within so many metres of it."""
+
+
+class Route(NamedTuple):
+    """Lanes in driving order, with at most one change of lanes.
+
+    Attributes:
+        lanes: each a successor of the one before, but for the one that the change leads to.
+        change: place in ``lanes`` of the lane that the change leads to; 0 for none.
+        begins: metres along the lane before that one at which the change begins.
+    """
+
+    lanes: tuple[int, ...]
+    change: int = 0
+    begins: float = 0.0
+
 
 Path = tuple[float, Route]
 """How far a route reaches ahead of the vehicle, in metres, and the route."""
@@ -57,21 +80,22 @@ def routes(
     starts: Sequence[tuple[int, float]],
     *,
     horizon: float = HORIZON,
+    onward: float = 0.0,
     limit: int = LIMIT,
     lane_change: bool = True,
 ) -> list[Route]:
     """Lane sequences that follow every branch until they reach the horizon or the lanes end.
 
     Routes without a lane change come first, by start and then by lane index; those with one change follow as far as
-    the limit allows. A change is written as the neighbour in place of the lane it is left from, and is offered
-    where it first becomes possible: on the lane of the start, and where a neighbour begins beside the route (a
-    turn pocket). If there are more routes than the limit, the nearest branches are all kept, and beyond them
-    routes go on along the straightest lane.
+    the limit allows. A change is offered where it first becomes possible: on the lane of the start, and where a
+    neighbour begins beside the route (a turn pocket). If there are more routes than the limit, the nearest branches
+    are all kept, and beyond them routes go on along the straightest lane.
 
     Args:
         graph: the lane graph.
         starts: pairs (lane, metres from the lane's start at which the vehicle is).
-        horizon: metres ahead of the vehicle.
+        horizon: metres ahead of the vehicle within which every branch is followed.
+        onward: metres past the horizon for which routes go on along the straightest lane.
         limit: most routes to return.
         lane_change: whether to add the routes with a change.
 
@@ -80,175 +104,274 @@ def routes(
     """
     if limit < 1:
         raise ValueError(f"limit must be at least 1, is {limit}")
-    seeds: list[Path] = [(float(graph.length[lane]) - along, (lane,)) for lane, along in starts]
-    rank = {route[0]: k for k, (_, route) in reversed(list(enumerate(seeds)))}
-    plain = _complete(graph, seeds, horizon, limit)
-    plain.sort(key=lambda route: (rank[route[0]], route))
-    if not lane_change or len(plain) >= limit:
-        return plain
-    known = set(plain)
-    changed = [
-        route
-        for route in _complete(graph, _changes(graph, plain, dict(starts), horizon), horizon, limit)
-        if route not in known
-    ]
-    return plain + sorted(changed, key=lambda r: (rank.get(r[0], len(rank)), r))[: limit - len(plain)]
+    seeds = [(float(graph.length[lane]) - along, Route((lane,))) for lane, along in starts]
+    rank = {lane: k for k, (lane, _) in reversed(list(enumerate(starts)))}
+
+    def order(path: Path) -> tuple[Any, ...]:
+        return rank[path[1].lanes[0]], path[1]
+
+    plain = sorted(_complete(graph, seeds, horizon, limit), key=order)
+    changed: list[Path] = []
+    if lane_change and len(plain) < limit:
+        offered = _changes(graph, [route for _, route in plain], dict(starts), horizon)
+        changed = sorted(_complete(graph, offered, horizon, limit), key=order)[: limit - len(plain)]
+    return [_onward(graph, reach, route, horizon + onward) for reach, route in plain + changed]
 
 
-def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: int) -> list[Route]:
+def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: int) -> list[Path]:
     """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest.
 
     Lanes of next to no length in a circle would never get there: a path ends after :data:`MAX_LANES`.
     """
     frontier = sorted(set(seeds))[:limit]
     heapq.heapify(frontier)
-    done: list[Route] = []
+    done: list[Path] = []
     while frontier:
         reach, route = heapq.heappop(frontier)
-        after = graph.successors[route[-1]]
-        if reach >= horizon or not after or len(route) >= MAX_LANES:
-            done.append(route)
+        after = graph.successors[route.lanes[-1]]
+        if reach >= horizon or not after or len(route.lanes) >= MAX_LANES:
+            done.append((reach, route))
             continue
         if len(done) + len(frontier) + len(after) > limit:
-            after = (min(after, key=lambda k: (abs(_turn(graph, k)), k)),)
+            after = (_straightest(graph, after),)
         for lane in after:
-            heapq.heappush(frontier, (reach + float(graph.length[lane]), (*route, lane)))
-    return list(dict.fromkeys(done))
+            longer = route._replace(lanes=(*route.lanes, lane))
+            heapq.heappush(frontier, (reach + float(graph.length[lane]), longer))
+    return done
 
 
-def _turn(graph: LaneGraph, lane: int) -> float:
-    return float(graph.curvature[lane] * graph.length[lane])
+def _onward(graph: LaneGraph, reach: float, route: Route, until: float) -> Route:
+    """A route that goes on along the straightest lanes until it reaches so far."""
+    lanes = list(route.lanes)
+    while reach < until and graph.successors[lanes[-1]] and len(lanes) < MAX_LANES:
+        lanes.append(_straightest(graph, graph.successors[lanes[-1]]))
+        reach += float(graph.length[lanes[-1]])
+    return route._replace(lanes=tuple(lanes))
+
+
+def _straightest(graph: LaneGraph, lanes: Sequence[int]) -> int:
+    return min(lanes, key=lambda k: (abs(float(graph.curvature[k] * graph.length[k])), k))
 
 
 def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], horizon: float) -> list[Path]:
     """Paths up to and including the lane that a change leads to."""
     found: dict[Route, float] = {}
     for route in plain:
-        reach = -along[route[0]]
-        before: set[int] = set()
-        for k, lane in enumerate(route):
+        first = along[route.lanes[0]]
+        reach, offered = -first, set(along)
+        for k, lane in enumerate(route.lanes):
             if reach >= horizon:
                 break
-            beside = {*graph.left[lane], *graph.right[lane]}
+            here: set[int] = set(along) if k == 0 else set()
+            for other in {*graph.left[lane], *graph.right[lane]} - here:
+                # Where the neighbour continues one that was offered already, the change came earlier; where it is a
+                # branch of the route itself, it takes no change.
+                if k and not offered.union(route.lanes[k - 1 : k]).isdisjoint(graph.predecessors[other]):
+                    here.add(other)
+                    continue
+                place = _change_at(graph, lane, other, first if k == 0 else 0.0)
+                if place is not None:
+                    here.add(other)
+                    begins, onto = place
+                    path = Route((*route.lanes[: k + 1], other), k + 1, begins)
+                    found[path] = reach + begins + float(graph.length[other]) - onto
             reach += float(graph.length[lane])
-            for other in beside:
-                # Where the neighbour continues one that was already beside the route, the change came earlier;
-                # where it is a branch of the route itself, it takes no change.
-                reachable = before.union(route[k - 1 : k]).intersection(graph.predecessors[other])
-                if not reachable:
-                    found[(*route[:k], other)] = reach
-            before = beside
+            offered = here
     return [(reach, path) for path, reach in found.items()]
 
 
-def route_errors(
-    graph: LaneGraph,
-    choices: Sequence[Route],
-    trajectory: NDArray[Any],
-    valid: NDArray[np.bool_],
-    *,
-    within: float = np.inf,
-) -> Reals:
-    """Mean distance [G] in metres of a trajectory's valid points [T, 2] to each route (NaN if there are none).
+def _change_at(graph: LaneGraph, lane: int, other: int, start: float) -> tuple[float, float] | None:
+    """Metres along a lane, from ``start`` on, at which a change to another begins, and metres along that one; None
+    where the two are not side by side.
+    """
+    line, target = graph.lines[lane], graph.lines[other]
+    begins = max(start, beside(line, target[0])[0])
+    if begins >= graph.length[lane]:
+        return None
+    point = at(line, graph.arc[lane], np.array([begins]))[0]
+    onto, away = beside(target, point)
+    if onto >= graph.length[other] or away > CHANGE_WIDTH:
+        return None
+    headings = []
+    for number, place in ((lane, begins), (other, max(onto, 0.0))):
+        row = min(int(np.searchsorted(graph.arc[number], place, side="right")), len(graph.arc[number]) - 1)
+        headings.append(np.arctan2(*(graph.lines[number][row] - graph.lines[number][row - 1])[::-1]))
+    if turn_between(np.array(headings[0]), np.array(headings[1])) > CHANGE_TURN:
+        return None
+    return begins, max(onto, 0.0)
 
-    Of a route that comes by twice only the pass counts that the trajectory is on: else one that goes around the block
-    first would be as right as the direct one.
+
+def change_length(speed: float) -> float:
+    """Metres that a change of lanes takes at a speed in m/s."""
+    return max(CHANGE_METRES, CHANGE_SECONDS * abs(speed))
+
+
+def route_line(graph: LaneGraph, route: Route, start: float = 0.0, speed: float = 0.0) -> Reals | None:
+    """The line [P, 2] that a vehicle follows on a route, in the graph's own points.
+
+    It is the centre line of the lanes, each joined to the one before. A change is a
+    :func:`~symphony.roadgraph.paths.blend` from the lane it leaves to the one beside it, :func:`change_length` long,
+    or half of that where it is too sharp. Where that is too sharp as well, nobody can drive the route.
 
     Args:
         graph: the lane graph.
-        choices: the routes.
-        trajectory: [T, 2].
-        valid: [T].
-        within: metres; a route that is worse than the best by more may get infinity instead, which is faster.
+        route: one with a change begins on the lane that is left.
+        start: metres along the first lane at which the line begins.
+        speed: m/s of the vehicle where it begins.
+
+    Returns:
+        None for a route that nobody can drive.
     """
-    path = np.asarray(trajectory, dtype=np.float64)[np.asarray(valid, dtype=bool)]
-    points = shapely.points(path)
-    if len(points) == 0:
-        return np.full(len(choices), np.nan)
-    lanes = sorted({lane for route in choices for lane in route})
-    row = {lane: k for k, lane in enumerate(lanes)}
-    distance = shapely.distance(line_strings([graph.lines[lane] for lane in lanes])[:, None], points[None])
-    away = [distance[[row[lane] for lane in route]] for route in choices]
-    errors = np.array([each.min(0).mean() for each in away])
-    again = np.array([len(set(route)) < len(route) for route in choices])
-    # With all passes counted the error is at most what it is with one.
-    close = errors <= errors[~again].min(initial=np.inf) + within
-    errors[again & ~close] = np.inf
-    twice = np.flatnonzero(again & close).tolist()
-    for k, on in zip(twice, _passed(graph, [choices[k] for k in twice], path), strict=True):
-        errors[k] = np.where(on, away[k], np.inf).min(0).mean()
-    return errors
+    if not route.change:
+        return centre_line(graph, route.lanes, start)
+    before, after = route.lanes[: route.change], route.lanes[route.change :]
+    left = graph.lines[before[-1]], graph.arc[before[-1]]
+    point = at(*left, np.array([route.begins]))[0]
+    kept = centre_line(graph, before, start)
+    arc = arc_lengths(kept)
+    kept = kept[arc < arc[-1] - (left[1][-1] - route.begins) - 1e-6]
+    onto = beside(graph.lines[after[0]], point)[0]
+    target = centre_line(graph, after, onto)
+    arc = arc_lengths(target)
+    for length in (change_length(speed), change_length(speed) / 2):
+        if arc[-1] < length:
+            continue
+        way = blend(target, point, length)
+        part = way[arc_lengths(way) <= length + 3.0]
+        if (
+            sharpest(distinct(np.concatenate([kept[-1:], part])))
+            <= sharpest(target[arc <= length + 3.0]) + CHANGE_TURN
+        ):
+            return distinct(np.concatenate([kept, way]))
+    return None
 
 
-def _passed(graph: LaneGraph, choices: Sequence[Route], path: Reals) -> list[NDArray[np.bool_]]:
-    """[lanes, T] for each route which of its lanes are near the place along it to which a path [T, 2] has come."""
-    if not choices:
-        return []
-    lines = [np.concatenate([graph.lines[lane] for lane in route]) for route in choices]
-    # Shorter ones end with their last point again.
-    most = max(len(line) for line in lines)
-    padded = np.stack([np.concatenate([line, line[-1:].repeat(most - len(line), 0)]) for line in lines])
-    shape = len(lines), *path.shape
-    stations = stations_along(padded, np.broadcast_to(path, shape), np.ones(shape[:2], bool))
-    found = []
-    for route, line, station in zip(choices, lines, stations, strict=True):
-        arc = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
-        ends = np.cumsum([len(graph.lines[lane]) for lane in route])
-        begin, end = arc[np.concatenate([[0], ends[:-1]])], arc[ends - 1]
-        found.append((begin[:, None] <= station + _AROUND) & (end[:, None] >= station - _AROUND))
-    return found
+def route_lines(
+    graph: LaneGraph,
+    found: Sequence[Route],
+    along: dict[int, float],
+    *,
+    spacing: float,
+    length: float,
+    speed: float = 0.0,
+) -> tuple[list[Route], list[Reals]]:
+    """Routes that can be driven, without those that are the same within :data:`SAME`, and their lines.
+
+    Args:
+        graph: the lane graph.
+        found: routes, of which the first of several that are the same is kept.
+        along: metres along the first lanes of routes at which lines begin.
+        spacing: metres between the points of a line; the last piece may be shorter.
+        length: metres after which lines end.
+        speed: m/s of the vehicle.
+    """
+    kept: list[Route] = []
+    lines: list[Reals] = []
+    ends: dict[tuple[int, int, int], list[int]] = {}
+    for route in found:
+        line = route_line(graph, route, along[route.lanes[0]], speed)
+        if line is None:
+            continue
+        points = resampled(line, spacing, length)
+        # Lines that are the same have last points in one cell, or in cells side by side.
+        cell = len(points), *np.floor(points[-1] / SAME).astype(int).tolist()
+        close = (
+            k
+            for x in (-1, 0, 1)
+            for y in (-1, 0, 1)
+            for k in ends.get((cell[0], cell[1] + x, cell[2] + y), ())
+        )
+        if any(np.hypot(*(lines[k] - points).T).max() < SAME for k in close):
+            continue
+        ends.setdefault(cell, []).append(len(lines))
+        kept.append(route)
+        lines.append(points)
+    return kept, lines
+
+
+def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:
+    """Points [Q, 2], Q >= 2, of a line so many metres apart, up to a length; the last piece may be shorter."""
+    arc = arc_lengths(line)
+    end = min(length, arc[-1])
+    places = np.append(np.arange(0.0, end - 1e-6, spacing), end)
+    return at(line, arc, places if len(places) > 1 else np.array([0.0, end]))
+
+
+def route_errors(
+    lines: Sequence[Reals], path: Float[NDArray[Any], "T 2"]
+) -> Float[NDArray[np.float64], " G"]:
+    """Mean distance in metres of what was driven to each of the lines [P, 2] that may be followed.
+
+    Only the part of a line that can have been reached counts. Of a line that comes by a place twice only the pass
+    counts that the path is on: else one that goes around the block first would be as right as the direct one.
+
+    Args:
+        lines: of the routes, with the same number of metres between all points but the last two.
+        path: T >= 1 places in the order of time.
+    """
+    path = np.asarray(path, np.float64)
+    way = np.hypot(*np.diff(path, axis=0).T).sum()
+    spacing = max(np.hypot(*(lines[0][1] - lines[0][0])), _TIE)
+    most = min(max(map(len, lines)), int((1.5 * way + _SLACK) / spacing) + 2)
+    # Shorter ones end with their last point again. Routes that part farther on are one here.
+    padded = np.stack(
+        [np.pad(line[:most], ((0, max(0, most - len(line))), (0, 0)), "edge") for line in lines]
+    )
+    padded, number = np.unique(padded, axis=0, return_inverse=True)
+    twice = _returns(padded, spacing)
+    errors = np.empty(len(padded))
+    for block in np.array_split(np.flatnonzero(~twice), max(1, len(padded) // 16)):
+        errors[block] = _away(padded[block], path).min(-1).mean(-1)
+    if twice.any():
+        same = np.broadcast_to(path, (int(twice.sum()), *path.shape))
+        places = stations_along(padded[twice], same, np.ones(same.shape[:2], bool))
+        on = [at(line, arc_lengths(line), place) for line, place in zip(padded[twice], places, strict=True)]
+        errors[twice] = np.linalg.norm(np.stack(on) - same, axis=-1).mean(-1)
+    return errors[number.reshape(-1)]
+
+
+def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool[NDArray[np.bool_], " R"]:
+    """Which lines come near a place that they were at before."""
+    place = np.arange(lines.shape[1])
+    later = place[None] - place[:, None] > _RETURN_METRES / spacing
+    first, second = np.nonzero(later)
+    away = lines[:, first] - lines[:, second]
+    # Padding repeats the end of a line, and is no return to it.
+    moves = (lines[:, second] != lines[:, second - 1]).any(-1)
+    return ((np.hypot(away[..., 0], away[..., 1]) < _RETURN_WIDTH) & moves).any(-1)
+
+
+def _away(lines: Float[NDArray[np.float64], "R P 2"], path: Reals) -> Float[NDArray[np.float64], "R T P-1"]:
+    """Metres from points of a path to the pieces of lines."""
+    way = np.diff(lines, axis=1)
+    length = np.hypot(way[..., 0], way[..., 1])
+    direction = way / np.maximum(length, np.finfo(np.float64).tiny)[..., None]
+    return to_pieces(lines[:, None, :-1], direction[:, None], length[:, None], path[None, :, None])[2]
 
 
 def ground_truth_routes(
-    graph: LaneGraph, choices: Sequence[Route], trajectory: NDArray[Any], valid: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+    lines: Sequence[Reals],
+    trajectory: Float[NDArray[Any], "T 2"],
+    valid: Bool[NDArray[np.bool_], " T"],
+) -> Bool[NDArray[np.bool_], " G"]:
     """The feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
 
     The error is that of :func:`route_errors`. Routes whose errors are within a millimetre are equally right: those
     that part beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place
     would bias what is learned of choices.
 
-    Returns:
-        [G] whether a route is one of them.
+    Args:
+        lines: of the routes, see :func:`route_lines`.
+        trajectory: of the vehicle.
+        valid: which of its states exist.
 
     Raises:
         ValueError: there are no routes.
     """
-    if not choices:
+    if not lines:
         raise ValueError("no routes to choose from")
-    errors = route_errors(graph, choices, trajectory, valid, within=_TIE)
-    if np.isnan(errors).all():
-        return np.ones(len(choices), np.bool_)
+    path = np.asarray(trajectory)[np.asarray(valid, bool)]
+    if len(path) == 0:
+        return np.ones(len(lines), np.bool_)
+    errors = route_errors(lines, path)
     return errors <= errors.min() + _TIE
-
-
-def route_polyline(
-    graph: LaneGraph, route: Route, *, spacing: float = 2.0, start: float = 0.0, length: float | None = None
-) -> Reals:
-    """Centre line of a route, resampled.
-
-    Args:
-        graph: the lane graph.
-        route: lane indices.
-        spacing: metres between points (the last piece may be shorter).
-        start: metres from the first lane's start at which the polyline begins.
-        length: metres after which it ends, if the route is longer.
-
-    Returns:
-        [K, 2] points, K >= 2 unless nothing of the route is left at ``start`` (then its last point, twice).
-
-    Raises:
-        ValueError: an empty route, or spacing that is not positive.
-    """
-    if not route or spacing <= 0:
-        raise ValueError("a route polyline needs at least one lane and a positive spacing")
-    points = np.concatenate([graph.lines[lane] for lane in route])
-    step = np.hypot(*np.diff(points, axis=0).T)
-    keep = np.concatenate(([True], step > 0))
-    points, arc = points[keep], np.concatenate(([0.0], np.cumsum(step[step > 0])))
-    begin = min(max(start, 0.0), arc[-1])
-    end = arc[-1] if length is None else min(begin + length, arc[-1])
-    places = np.append(np.arange(begin, end - 1e-6, spacing), end)
-    if len(places) < 2:
-        places = np.array([begin, end])
-    return np.stack([np.interp(places, arc, points[:, axis]) for axis in (0, 1)], axis=-1)

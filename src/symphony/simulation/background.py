@@ -20,7 +20,7 @@ from symphony.data.segment import SignalState
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import WHEELBASE, bicycle_step
 from symphony.envs.objects import Objects
-from symphony.envs.routes import SPACING, pick_routes
+from symphony.envs.routes import SPACING
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap
 from symphony.geometry.nearest import nearest, on_host
@@ -202,7 +202,7 @@ class _Lines(NamedTuple):
 def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
     """The routes of the log of all agents [B, N]; without one, straight on."""
     row = torch.arange(len(scenes), device=scenes.route.device)
-    points, exist = pick_routes(scenes.route, scenes.route_count, row, scenes.route_logged)
+    points, exist = scenes.routes.of(row, scenes.route_logged).lines()
     # Of an agent without a route: two points from where it enters.
     enters = scenes.log_state[row[:, None], scenes.enter, scenes.interactive]
     place = torch.arange(points.shape[2], device=row.device)

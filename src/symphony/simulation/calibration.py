@@ -46,7 +46,7 @@ def logged_totals(
         scenes = dataset.scenes(items).to(device)
         env = DrivingEnv(scenes, agent.dynamics, agent.observation)
         score = realism_score(env, agent.discriminator)
-        state, logged = dataset.fitted(items, scenes)
+        state, logged, progress = dataset.fitted(items, scenes)
         past = torch.arange(state.shape[1], device=device) > scenes.last_step[:, None]
         there = (logged | ~scenes.interactive_valid[:, None]).all(-1) | past
         scene = torch.arange(len(items), device=device)
@@ -62,6 +62,7 @@ def logged_totals(
                 keys.STREAM: torch.zeros_like(rows)[:, None],
                 keys.VALID: scenes.interactive_valid[rows],
                 keys.GOAL: goal[rows],
+                keys.PROGRESS: progress[rows, begin - 1],
             }
             scores = []
             for step in steps:

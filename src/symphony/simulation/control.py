@@ -127,10 +127,10 @@ def _place(goal: str, where: str, segment: RunSegment) -> NDArray[np.float64]:
 def _distances(scenes: SceneBatch, b: int, n: int, target: NDArray[np.float64]) -> NDArray[np.float64]:
     """Metres [G] from points to each route, on average."""
     found = []
-    for points, count in zip(scenes.route[b, n].cpu(), scenes.route_count[b, n].tolist(), strict=True):
+    for route, count in enumerate(scenes.route_count[b, n].tolist()):
         if count < 2:
             found.append(np.inf)
             continue
-        line = shapely.LineString(points[:count].numpy())
+        line = shapely.LineString(scenes.whole_route(b, n, route).cpu().numpy())
         found.append(float(shapely.distance(line, shapely.points(target)).mean()))
     return np.array(found)

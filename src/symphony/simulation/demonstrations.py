@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -21,7 +21,7 @@ from symphony.data.selection import interactive_choice
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
-from symphony.envs.routes import POINTS, route_choices
+from symphony.envs.routes import RouteWindow, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
 from symphony.geometry.frames import with_speed
@@ -37,6 +37,8 @@ from symphony.streams import stream_of, uniform
 
 GRAPHS = 64
 """Lane graphs held in memory."""
+DISPLACED = 2.0
+"""Metres that a state to learn from may lie from the log, for which its place along the route is looked for."""
 _COUNT = (1 << 40) + 3
 """Number, in a segment's stream, of the draw of how many agents act: far above those of rollouts and steps."""
 
@@ -262,8 +264,10 @@ class SceneDataset:
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
             size = scenes.box_size[item, agent]
             state, action = perturbed(state, action, now, later, size, self.dynamics, self.dt, perturb, rng)
-        tables = [table for expert in found for table in expert.routes]
-        taken = logged_routes(tables, row) if observation.route else None
+        seen = None
+        if observation.route:
+            progress = torch.cat([e.progress.flatten() for e in found])[begin[row] + when]
+            seen = _seen_routes(found, row, progress, state)
         return expert_batch(
             scenes.to(device),
             item.to(device),
@@ -272,7 +276,7 @@ class SceneDataset:
             state.to(device),
             observation,
             action=action.to(device),
-            routes=None if taken is None else (taken[0].to(device), taken[1].to(device)),
+            routes=None if seen is None else RouteWindow(*(part.to(device) for part in seen)),
         )
 
     def _pick(
@@ -323,11 +327,14 @@ class SceneDataset:
         when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
         tables = [e.routes[k] for _, e, k in chosen]
         most = max(1, *(len(table.count) for table in tables))
-        points, counts = np.zeros((count, most, POINTS, 2), np.float32), np.zeros((count, most), np.int64)
-        right = np.zeros((count, most), np.bool_)
+        firsts, counts = np.zeros((2, count, most), np.int64)
+        right, begin = np.zeros((count, most), np.bool_), 0
         for row, table in enumerate(tables):
-            points[row, : len(table.count)], counts[row, : len(table.count)] = table.points, table.count
+            counts[row, : len(table.count)] = table.count
+            firsts[row, : len(table.count)] = begin + np.cumsum(table.count) - table.count
             right[row, : len(table.count)] = table.right
+            begin += len(table.points)
+        points = np.concatenate([table.points for table in tables])
         state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
             device
         )
@@ -341,7 +348,8 @@ class SceneDataset:
         )
         features, mask = route_choices(
             state[:, None],
-            torch.from_numpy(points)[:, None].to(device),
+            torch.from_numpy(points).to(device),
+            torch.from_numpy(firsts)[:, None].to(device),
             torch.from_numpy(counts)[:, None].to(device),
             observation.distance_scale,
             turns=observation.turns,
@@ -353,7 +361,7 @@ class SceneDataset:
         batch.set(keys.GOAL_SET, torch.from_numpy(right)[:, None].to(device) & mask)
         return batch
 
-    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor]:
+    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
         """What the interactive agents of some segments did, as the fit to the action space has it.
 
         Args:
@@ -361,16 +369,32 @@ class SceneDataset:
             scenes: their scenes.
 
         Returns:
-            States [B, T, N, 4] and where the log is valid [B, T, N]; agents that are no experts as logged.
+            States [B, T, N, 4], where the log is valid [B, T, N], and metres along the routes that were taken
+            [B, T, N], 0 without routes; agents that are no experts as logged.
         """
         state, valid = logged(scenes)
-        state, valid = state.clone(), valid.clone()
+        state, valid, progress = state.clone(), valid.clone(), torch.zeros_like(state[..., 0])
         for b, expert in enumerate(self.experts.many(items)):
             steps = expert.states.shape[1]
             hit = expert.agent[:, None].to(scenes.device) == scenes.interactive[b]
             which, place = hit.nonzero(as_tuple=True)
             state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
-        return state, valid
+            if self.routes:
+                progress[b, :steps, place] = expert.progress.to(scenes.device)[which].T
+        return state, valid, progress
+
+
+def _seen_routes(
+    experts: Sequence[Experts],
+    row: Int[Tensor, " M"],
+    progress: Float[Tensor, " M"],
+    state: Float[Tensor, "M 4"],
+) -> RouteWindow:
+    """What experts see of the routes they took from states that may lie beside where they were."""
+    taken = logged_routes([table for expert in experts for table in expert.routes], row)
+    # Whoever is displaced along the route by up to some metres has come as far as where it is now.
+    near = torch.full_like(progress, DISPLACED)[:, None]
+    return taken.window(taken.progress(state[:, None, :2], progress[:, None], near))
 
 
 def _nbytes(scene: SceneBatch) -> int:

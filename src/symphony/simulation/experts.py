@@ -13,7 +13,7 @@ from torch import Tensor
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
 from symphony.envs.dynamics import Bicycle, Displacement
-from symphony.envs.routes import RouteTable, route_table
+from symphony.envs.routes import RouteTable, drivable, logged_progress, route_table
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, lane_of
 
@@ -34,6 +34,7 @@ class Experts:
         actions: [K, T - 1] int16 or [K, T - 1, 2].
         valid: [K, T - 1] where the log is valid before and after the action.
         error: [K] metres between the last valid fitted and logged position.
+        progress: [K, T] metres that each has come along the route it took; [K, 0] where routes were not asked for.
         routes: feasible routes of each expert from its first valid state; empty where not asked for.
     """
 
@@ -42,12 +43,13 @@ class Experts:
     actions: Tensor
     valid: Tensor
     error: Tensor
+    progress: Tensor
     routes: tuple[RouteTable, ...] = ()
 
     @property
     def nbytes(self) -> int:
         """Bytes it takes in memory."""
-        tensors = (self.agent, self.states, self.actions, self.valid, self.error)
+        tensors = (self.agent, self.states, self.actions, self.valid, self.error, self.progress)
         tables = (part for table in self.routes for part in (table.points, table.count, table.right))
         return sum(part.nbytes for part in (*tensors, *tables))
 
@@ -90,9 +92,16 @@ def fit_experts(
         last = mask.shape[1] - 1 - mask.flip(1).int().argmax(1)
         which = torch.arange(len(chosen))
         away = states[which, last, :2] - torch.from_numpy(segment.position[chosen, last.numpy(), :2])
-        tables = tuple(route_table(segment, graph, int(row)) for row in chosen) if routes else ()
+        reach = drivable(segment)
+        tables = tuple(route_table(segment, graph, int(row), reach=reach) for row in chosen) if routes else ()
+        come = np.zeros((len(chosen), 0), np.float32)
+        if routes:
+            # Along what was fitted, as that is what is learned from; it exists from the first valid state on.
+            path, there = states[..., :2].numpy(), np.maximum.accumulate(segment.valid[chosen], 1)
+            come = logged_progress(tables, path, there)
         known = mask[:, 1:] & mask[:, :-1]
-        found.append(Experts(torch.from_numpy(chosen), states, actions, known, away.norm(dim=-1), tables))
+        progress, error = torch.from_numpy(come), away.norm(dim=-1)
+        found.append(Experts(torch.from_numpy(chosen), states, actions, known, error, progress, tables))
     return found
 
 

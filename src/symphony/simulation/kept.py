@@ -20,12 +20,12 @@ from torch import Tensor
 
 import symphony
 from symphony.envs.map_lists import MapLists, map_parts
-from symphony.envs.routes import POINTS, RouteTable
+from symphony.envs.routes import RouteTable
 from symphony.envs.scene import SceneBatch
 from symphony.files import replacing
 from symphony.simulation.experts import Experts
 
-VERSION = 2
+VERSION = 3
 """Of the fit: raised when it gives something else for the same segment, or other routes (a test says when)."""
 LISTS_VERSION = 1
 """Of the lists: raised when the same points and edges give others (likewise)."""
@@ -160,13 +160,12 @@ class KeptLists(KeptFiles):
 def _to_arrays(experts: Experts) -> dict[str, Any]:
     routes = experts.routes
     arrays = {
-        name: getattr(experts, name).numpy() for name in ("agent", "states", "actions", "valid", "error")
+        name: getattr(experts, name).numpy()
+        for name in ("agent", "states", "actions", "valid", "error", "progress")
     }
     return arrays | {
         "route_number": np.array([len(table.count) for table in routes], np.int64),
-        "route_points": np.concatenate(
-            [np.zeros((0, POINTS, 2), np.float32), *(table.points for table in routes)]
-        ),
+        "route_points": np.concatenate([np.zeros((0, 2), np.float32), *(table.points for table in routes)]),
         "route_count": np.concatenate([np.zeros(0, np.int64), *(table.count for table in routes)]),
         "route_right": np.concatenate([np.zeros(0, np.bool_), *(table.right for table in routes)]),
         "route_logged": np.array([table.logged for table in routes], np.int64),
@@ -178,11 +177,14 @@ def _from_arrays(arrays: dict[str, NDArray[Any]]) -> Experts:
     agents, steps = len(arrays["agent"]), arrays["states"].shape[1]
     ends = arrays["route_number"].cumsum()
     total = int(ends[-1]) if len(ends) else 0
+    # Points of the routes of each agent end where those of its last route do.
+    point_ends = np.append(0, arrays["route_count"].cumsum())[np.append(0, ends)]
     expected = {
         "states": (agents, steps, 4),
         "valid": (agents, steps - 1),
         "error": (agents,),
-        "route_points": (total, POINTS, 2),
+        "progress": (agents, steps if len(ends) else 0),
+        "route_points": (int(arrays["route_count"].sum()), 2),
         "route_count": (total,),
         "route_right": (total,),
         "route_logged": (len(ends),),
@@ -194,12 +196,14 @@ def _from_arrays(arrays: dict[str, NDArray[Any]]) -> Experts:
         raise ValueError("actions or routes of another number of agents")
     tables = tuple(
         RouteTable(
-            arrays["route_points"][end - count : end],
+            arrays["route_points"][first:last],
             arrays["route_count"][end - count : end],
             arrays["route_right"][end - count : end],
             int(logged),
         )
-        for end, count, logged in zip(ends, arrays["route_number"], arrays["route_logged"], strict=True)
+        for end, count, logged, first, last in zip(
+            ends, arrays["route_number"], arrays["route_logged"], point_ends[:-1], point_ends[1:], strict=True
+        )
     )
 
     def tensor(name: str) -> Tensor:
@@ -211,5 +215,6 @@ def _from_arrays(arrays: dict[str, NDArray[Any]]) -> Experts:
         actions=tensor("actions"),
         valid=tensor("valid"),
         error=tensor("error"),
+        progress=tensor("progress"),
         routes=tables,
     )

@@ -13,19 +13,18 @@ from torch import Tensor
 from symphony import keys
 from symphony.envs.objects import objects_at
 from symphony.envs.observation import ObservationConfig, observe
-from symphony.envs.routes import POINTS, RouteTable
+from symphony.envs.routes import FollowedRoutes, RouteTable, RouteWindow
 from symphony.envs.scene import SceneBatch
 from symphony.geometry.frames import with_speed
 
 
-def logged_routes(
-    tables: Sequence[RouteTable], row: Int[Tensor, " M"]
-) -> tuple[Float[Tensor, "M K 2"], Int[Tensor, " M"]]:
-    """Points and their number (0 where there is none) of the routes that experts took."""
-    none = np.zeros((POINTS, 2), np.float32)
-    points = np.stack([table.points[table.logged] if table.logged >= 0 else none for table in tables])
-    count = np.array([table.count[table.logged] if table.logged >= 0 else 0 for table in tables])
-    return torch.from_numpy(points)[row], torch.from_numpy(count)[row]
+def logged_routes(tables: Sequence[RouteTable], row: Int[Tensor, " M"]) -> FollowedRoutes:
+    """The routes that experts took, one expert in each row [M, 1]."""
+    none = np.zeros((0, 2), np.float32)
+    lines = [table.line(table.logged) if table.logged >= 0 else none for table in tables]
+    count = torch.tensor([len(line) for line in lines])
+    begin = count.cumsum(0) - count
+    return FollowedRoutes(torch.from_numpy(np.concatenate(lines)), begin[row][:, None], count[row][:, None])
 
 
 def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
@@ -46,16 +45,15 @@ def expert_batch(
     observation: ObservationConfig,
     *,
     action: Tensor | None = None,
-    routes: tuple[Tensor, Tensor] | None = None,
+    routes: RouteWindow | None = None,
 ) -> TensorDict:
-    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and, from
-    points [M, K, 2] and counts [M], their routes, where given.
+    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and what
+    they see of their routes, where given.
     """
     index, here = agent[:, None], state[:, None]
     real = torch.ones_like(index, dtype=torch.bool)
     objects = objects_at(scenes, scene_of, step, here, index, real)
-    known = None if routes is None else (routes[0][:, None], routes[1][:, None])
-    seen = observe(scenes, scene_of, step, objects, index, observation, routes=known)
+    seen = observe(scenes, scene_of, step, objects, index, observation, routes=routes)
     batch = TensorDict({}, batch_size=[len(step)], device=state.device)
     batch.set(keys.VALID, real)
     batch.set(keys.STATE, here)

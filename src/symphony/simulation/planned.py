@@ -95,7 +95,7 @@ class EgoPlanners:
         Raises:
             ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
         """
-        if env.scenes.route.shape[2] == 0:
+        if env.scenes.route_point.shape[1] == 0:
             goal = start.get(keys.GOAL)
         else:
             logged = env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)][..., :1]

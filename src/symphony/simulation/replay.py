@@ -126,7 +126,7 @@ class SearchReplay:
 
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
         scenes = self.env.scenes
-        state, logged = self.data.fitted(scenes.segment.tolist(), scenes)
+        state, logged, progress = self.data.fitted(scenes.segment.tolist(), scenes)
         rows = logged[:, 1:].any(-1).nonzero()
         scene, step = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)].unbind(-1)
         step = step + 1
@@ -141,6 +141,7 @@ class SearchReplay:
                 keys.VALID: valid,
                 keys.STATE: state[scene, step],
                 keys.GOAL: route[scene],
+                keys.PROGRESS: progress[scene, step],
             },
             batch_size=[count],
         )
@@ -177,7 +178,8 @@ def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:
 
 def _after(steps: TensorDictBase) -> TensorDictBase:
     """The states that steps led to."""
-    after = {keys.STEP: steps.get(keys.STEP) + 1, keys.STATE: steps.get(("next", *keys.STATE))}
+    after = {keys.STEP: steps.get(keys.STEP) + 1}
+    after |= {key: steps.get(("next", *key)) for key in (keys.STATE, keys.PROGRESS)}
     kept = steps.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL)
     return kept.update(TensorDict(after, batch_size=kept.batch_size))
 

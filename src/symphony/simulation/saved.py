@@ -208,8 +208,7 @@ def _routes(
     # Agents have routes of their own: a pair (agent, route) is one line.
     pairs, number = np.unique(np.stack([place, chosen], -1).reshape(-1, 2), axis=0, return_inverse=True)
     follows = pairs[:, 1] >= 0
-    points, count = _array(scenes.route[row]), _array(scenes.route_count[row])
-    lines = [points[n, g, : count[n, g]] for n, g in pairs[follows]]
+    lines = [_array(scenes.whole_route(row, *pair)) for pair in pairs[follows].tolist()]
     line = np.where(follows, np.cumsum(follows) - 1, -1)
     return line[number.reshape(chosen.shape)], Polylines.of(lines)
 

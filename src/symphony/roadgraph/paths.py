@@ -1,0 +1,149 @@
+"""The line that a vehicle follows along lanes: forward only, without the jumps that maps have where lanes meet.
+
+Arrays of points are [P, 2] in metres, in the map's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from symphony.roadgraph.graph import LaneGraph
+from symphony.roadgraph.lines import Reals
+
+CHORD = 3.0
+"""Metres of a piece of a line that has a direction, and over which a change of direction is measured."""
+_STEP = 1.0
+"""Metres between the points of a blend."""
+_SMOOTH = 1.5
+"""Metres to either side over which the direction of a line is taken when something is moved beside it."""
+_JOINED = 0.02
+"""Metres between two lanes that meet."""
+_JOIN = 6.0
+"""Metres along for a metre to the side, where a lane does not begin exactly where the one before it ends."""
+
+
+def blend(line: Reals, point: Reals, length: float) -> Reals:
+    """The way from a point beside a line onto it.
+
+    The way runs beside the line, from where the point is along it, and comes nearer like 1 - 3 u² + 2 u³, with u from
+    0 to 1 over the length: it begins and ends in the direction of the line. Beyond that it is the line itself. Where
+    the point is before the beginning of the line, the line is taken to come straight from there.
+
+    Args:
+        line: the line to get to, with P >= 2 points that differ from their neighbours.
+        point: [2] where the way begins.
+        length: metres along the line until the way is on it; less, where the line ends before.
+
+    Returns:
+        [Q, 2] the way, of which the first point is ``point``; the point alone, if the line ends behind it.
+    """
+    begin, _ = beside(line, point)
+    if begin < 0.0:
+        first = line[1] - line[0]
+        line = np.concatenate([line[:1] + begin * (first / np.hypot(*first)), line])
+        begin = 0.0
+    arc = arc_lengths(line)
+    if begin >= arc[-1]:
+        return point[None]
+    end = min(begin + max(length, _STEP), arc[-1])
+    own = arc[(arc > begin) & (arc < end)]
+    places = np.unique(np.concatenate([np.arange(begin, end, _STEP), own, [end]]))
+    ahead, behind = (at(line, arc, places + shift) for shift in (_SMOOTH, -_SMOOTH))
+    way = ahead - behind
+    normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.hypot(*way.T)[:, None]
+    on = at(line, arc, places)
+    aside = float((point - on[0]) @ normal[0])
+    share = (places - begin) / (end - begin)
+    fades = 1.0 - share * share * (3.0 - 2.0 * share)
+    moved = on + (aside * fades)[:, None] * normal
+    moved[0] = point
+    return np.concatenate([moved, line[arc > end]])
+
+
+def beside(line: Reals, point: Reals) -> tuple[float, float]:
+    """Metres along a line of its place nearest to a point, and from there to the point.
+
+    A point before the beginning has a negative place, on the line as it would come straight from there; one past the
+    end has the length of the line.
+    """
+    start, way = line[:-1], np.diff(line, axis=0)
+    length = np.maximum(np.hypot(*way.T), np.finfo(np.float64).tiny)
+    away = point - start
+    share = (away * way).sum(-1) / length
+    before = float(share[0])
+    share = share.clip(0.0, length)
+    distance = np.hypot(*(away - (share / length)[:, None] * way).T)
+    piece = int(distance.argmin())
+    if piece == 0 and before < 0.0:
+        return before, float(distance[0])
+    return float(length[:piece].sum() + share[piece]), float(distance[piece])
+
+
+def at(line: Reals, arc: Reals, places: Reals) -> Reals:
+    """Points [Q, 2] so many metres along a line [P, 2] with arc lengths [P]; past its ends, those."""
+    return np.stack([np.interp(places, arc, line[:, axis]) for axis in (0, 1)], -1)
+
+
+def arc_lengths(line: Reals) -> Reals:
+    """Metres [P] from the beginning of a line to each of its points."""
+    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
+
+
+def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
+    """The centre line of a lane as one follows it from the end of the lane before.
+
+    It is the lane's own line where the two meet. Where they do not, what overlaps is left out, and what lies aside is
+    made up for by a short blend.
+    """
+    known = graph.followed.get((before, lane))
+    if known is None:
+        line, end = graph.lines[lane], graph.lines[before][-1]
+        gap = float(np.hypot(*(line[0] - end)))
+        if gap > _JOINED:
+            aside = min(beside(line, end)[1], gap)
+            line = blend(line, end, _JOIN * aside)
+        known = graph.followed[before, lane] = line
+    return known
+
+
+def centre_line(graph: LaneGraph, lanes: Sequence[int], start: float = 0.0) -> Reals:
+    """The line [P, 2] along lanes, each the successor of the one before, from so many metres along the first one."""
+    first, arc = graph.lines[lanes[0]], graph.arc[lanes[0]]
+    start = min(max(start, 0.0), arc[-1])
+    parts = [at(first, arc, np.array([start])), first[arc > start]]
+    parts += [followed(graph, before, lane) for before, lane in pairwise(lanes)]
+    return distinct(np.concatenate(parts))
+
+
+def distinct(line: Reals) -> Reals:
+    """A line without points that lie on the one before, of two points at least."""
+    keep = np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > 1e-6))
+    return line[keep] if keep.sum() > 1 else np.concatenate([line[:1], line[:1]])
+
+
+def sharpest(line: Reals, spacing: float = 0.5) -> float:
+    """The largest change of direction, in radians, from one piece of :data:`CHORD` metres of a line to the next.
+
+    Pieces may begin anywhere. It is 0 for a line that is shorter than two of them.
+    """
+    arc = arc_lengths(line)
+    points = at(line, arc, np.arange(0.0, arc[-1], spacing))
+    apart = round(CHORD / spacing)
+    way = points[apart:] - points[:-apart]
+    if len(way) <= apart:
+        return 0.0
+    angle = np.arctan2(way[:, 1], way[:, 0])
+    return float(np.abs((angle[apart:] - angle[:-apart] + np.pi) % (2 * np.pi) - np.pi).max())
+
+
+def own_sharpest(graph: LaneGraph, lanes: Sequence[int]) -> float:
+    """The same of lanes themselves, were each to begin where the one before it ends."""
+    parts, end = [graph.lines[lanes[0]]], graph.lines[lanes[0]][-1]
+    for lane in lanes[1:]:
+        line = graph.lines[lane] - graph.lines[lane][0] + end
+        parts.append(line)
+        end = line[-1]
+    return sharpest(distinct(np.concatenate(parts)))
