@@ -1,7 +1,7 @@
 """Routes as tables of points: what a goal looks like to a policy.
 
-Legend: B scenes, G feasible routes of a vehicle, R points of all routes of a scene, K points of a route, W points of the
-part of it that is seen, N agents, M rows.
+Legend: B scenes, G feasible routes of a vehicle, R points of all routes of a scene, K points of a route, W points of
+the part of it that is seen, N agents, M rows.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from symphony import keys
 from symphony.data.segment import RunSegment
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import bicycle_step
+from symphony.envs.routes import ONWARD, SPACING
 from symphony.errors import ConfigError
 from symphony.simulation.planner import Planner, Traffic, checked_plan, fixed, scenario_of
 from symphony.simulation.planner_calls import SECONDS, answer, plans_of
@@ -123,7 +124,7 @@ class EgoPolicy(TensorDictModuleBase):
         keep_every: as of :meth:`EgoPlanners.begin`.
     """
 
-    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PLANNER]  # noqa: RUF012 - the type declared
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012 - the type declared
     out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
 
     def __init__(
@@ -137,7 +138,7 @@ class EgoPolicy(TensorDictModuleBase):
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
         stream = fold_in(fold_in(start.get(keys.STREAM), _PLANNERS), seed).flatten().tolist()
-        routes = [self._route(row) for row in range(len(egos.segments))]
+        self._routes = routes = [self._route(row) for row in range(len(egos.segments))]
         for number, row in enumerate(scene):
             made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))
             planner = answer(egos.make, seconds=egos.seconds)
@@ -150,16 +151,18 @@ class EgoPolicy(TensorDictModuleBase):
     def _route(self, row: int) -> NDArray[np.float32]:
         """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
         scenes, which = self.env.scenes, int(self.env.scenes.route_logged[row, 0])
-        if scenes.route.shape[2] == 0 or which < 0:
+        if which < 0:
             return np.zeros((0, 2), np.float32)
-        return scenes.route[row, 0, which, : int(scenes.route_count[row, 0, which])].cpu().numpy()
+        return scenes.whole_route(row, 0, which).cpu().numpy()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write planned states [..., 4] and numbers of planners [..., 1]."""
         scene, at, number = (tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP, keys.PLANNER))
-        state, valid = (
-            tensordict.get(key).flatten(0, tensordict.ndim - 1) for key in (keys.STATE, keys.VALID)
+        state, valid, progress = (
+            tensordict.get(key).flatten(0, tensordict.ndim - 1)
+            for key in (keys.STATE, keys.VALID, keys.PROGRESS)
         )
+        come = progress[:, 0].tolist()
         everyone = self.env.objects(scene, at, state, valid)
         rows, steps, driving = scene.tolist(), at.tolist(), valid[:, 0].tolist()
         # An ego that has left the map is over, too.
@@ -175,7 +178,8 @@ class EgoPolicy(TensorDictModuleBase):
         for m, row in enumerate(rows):
             planner = self._held[numbers[m]]
             if going[m] and not isinstance(planner, Failure):
-                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m])
+                ahead = route_from(self._routes[row], come[m])
+                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m], ahead)
                 asked.append((m, planner, seen))
         plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
         for (m, _, seen), given in zip(asked, plans, strict=True):
@@ -240,6 +244,7 @@ class EgoPolicy(TensorDictModuleBase):
         own: NDArray[np.float64],
         moves: NDArray[np.float64],
         there: NDArray[np.bool_],
+        route: NDArray[np.float64],
     ) -> Traffic:
         segment = self.egos.segments[row]
         moves, there = moves[: segment.num_agents], there[: segment.num_agents]
@@ -256,7 +261,20 @@ class EgoPolicy(TensorDictModuleBase):
             agent_type=fixed(segment.agent_type),
             valid=fixed(there),
             lights=fixed(segment.signal_state[:, step]),
+            route=fixed(route),
         )
+
+
+def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float64]:
+    """Points [K, 2] of a route from so many metres along on, at least 200 m of it or all there is."""
+    if not len(route):
+        return route.astype(np.float64)
+    piece = min(int(progress // SPACING), len(route) - 2)
+    later = route[piece + 1 : piece + 3 + round(ONWARD / SPACING)].astype(np.float64)
+    way = route[piece + 1] - route[piece]
+    # The last piece may be shorter than the others.
+    share = min((progress - SPACING * piece) / max(float(np.hypot(*way)), 1e-6), 1.0)
+    return np.concatenate([(route[piece] + share * way)[None], later])
 
 
 def _words(error: Exception) -> str:

@@ -72,6 +72,8 @@ class Traffic:
         agent_type: [A] :class:`symphony.data.segment.AgentType`.
         valid: [A] who is there.
         lights: [Q] :class:`symphony.data.segment.SignalState` of each light of the scenario.
+        route: [K, 2] points to follow from where the ego has come to, 3 m apart: 200 m of the scenario's route, or what
+            there is of it up to the end of the map.
     """
 
     step: int
@@ -85,6 +87,7 @@ class Traffic:
     agent_type: NDArray[np.uint8]
     valid: NDArray[np.bool_]
     lights: NDArray[np.uint8]
+    route: Reals
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +103,9 @@ class Scenario:
         ego: row of the ego in :class:`Traffic`.
         size: [2] its length and width.
         state: [4] its first x, y, heading and speed.
-        route: [P, 2] points to follow, from beside the ego on: the feasible route nearest to the log, up to 189 m or
-            where the lanes end; empty where the ego is on no lane.
+        route: [P, 2] points to follow, 3 m apart, from beside the ego on: the feasible route nearest to the log. It
+            reaches 200 m beyond what can be driven in the segment, or to where the lanes end; empty where the ego is
+            on no lane. Each :class:`Traffic` has the part ahead.
         goal: [2] where the ego's log ends.
         road: lanes with their successors and speed limits, boundary and marks.
         signal_lane: [Q] index of the lane each light controls.

@@ -77,7 +77,8 @@ class Observation:
         step: since the start, 0 at the first call.
         ego: the ego.
         agents: everyone else.
-        route: [K, 2] points to follow, as of :class:`~symphony.simulation.planner.Scenario`; may be empty.
+        route: [K, 2] points to follow from where the ego is, as of :class:`~symphony.simulation.planner.Traffic`; may
+            be empty.
         lanes: of the map.
         lights: traffic lights.
         segment_id: of the run segment.
@@ -134,7 +135,7 @@ def observation_of(scenario: Scenario, traffic: Traffic, lanes: tuple[Lane, ...]
             type=TYPES[traffic.agent_type[there]],
             id=scenario.agent_id[there],
         ),
-        route=scenario.route,
+        route=traffic.route,
         lanes=lanes,
         lights=Lights(
             x=scenario.signal_point[:, 0],
