@@ -39,7 +39,7 @@ _PRUNING = (1 << 40) + 1
 _RETRIES = (1 << 40) + 2
 """Numbers of the streams that prunings and repeats draw from, far above those of rollouts and agents."""
 OUTCOME: Sequence[keys.Key] = [
-    ("next", *key) for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
+    ("next", *key) for key in (keys.STATE, keys.VALID, keys.PROGRESS, keys.COLLISION, keys.OFFROAD)
 ]
 KEPT: Sequence[keys.Key] = [
     keys.SCENE,
@@ -47,6 +47,7 @@ KEPT: Sequence[keys.Key] = [
     keys.STREAM,
     keys.VALID,
     keys.GOAL,
+    keys.PROGRESS,
     keys.STATE,
     keys.ACTION,
     keys.NOISE,
