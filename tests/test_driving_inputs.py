@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
 from symphony.envs.observation import OBJECT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.points import observed_lights
-from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING, along_route
+from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING, RouteWindow, along_route
 from symphony.envs.scene import collate
 from symphony.envs.tables import Tables
 from symphony.geometry.frames import rotate
@@ -32,7 +32,7 @@ from symphony.recipes import train
 from symphony.simulation import SceneDataset
 
 
-def scene(seed: int, others: int = 6) -> tuple[Tensor, ...]:
+def scene(seed: int, others: int = 6) -> tuple[Any, ...]:
     """One agent on a winding route, some others around it, in double precision."""
     rng = torch.Generator().manual_seed(seed)
     turn = 0.1 * torch.randn(POINTS, generator=rng, dtype=torch.float64).cumsum(0)
@@ -45,19 +45,18 @@ def scene(seed: int, others: int = 6) -> tuple[Tensor, ...]:
     )
     motion = 10 * torch.randn(others, 3, generator=rng, dtype=torch.float64)
     size = torch.tensor([4.5, 2.0], dtype=torch.float64)
-    count = torch.tensor([[POINTS]])
+    exists = torch.ones(1, 1, POINTS, dtype=torch.bool)
     return (
         own[None, None],
         size[None, None],
         torch.cat([place, motion], -1)[None, None],
         size.expand(1, 1, others, 2),
-        points,
-        count,
+        RouteWindow(points, exists, torch.tensor([[8]])),
     )
 
 
-def moved(parts: tuple[Tensor, ...], angle: float, shift: Tensor) -> tuple[Tensor, ...]:
-    own, size, others, sizes, points, count = parts
+def moved(parts: tuple[Any, ...], angle: float, shift: Tensor) -> tuple[Any, ...]:
+    own, size, others, sizes, route = parts
     turned = torch.tensor(angle, dtype=torch.float64)
 
     def agents(state: Tensor) -> Tensor:
@@ -65,8 +64,8 @@ def moved(parts: tuple[Tensor, ...], angle: float, shift: Tensor) -> tuple[Tenso
         velocity = rotate(state[..., 3:], turned.expand(state.shape[:-1]))
         return torch.cat([place, state[..., 2:3] + turned, velocity], -1)
 
-    line = rotate(points, turned.expand(points.shape[:-1])) + shift
-    return agents(own), size, agents(others), sizes, line, count
+    line = rotate(route.points, turned.expand(route.points.shape[:-1])) + shift
+    return agents(own), size, agents(others), sizes, route._replace(points=line)
 
 
 @given(seed=st.integers(0, 10_000), angle=st.floats(-math.pi, math.pi))
@@ -106,8 +105,7 @@ def test_on_a_straight_route_it_is_what_can_be_computed_by_hand() -> None:
         size[None, None],
         others[None, None],
         size.expand(1, 1, 5, 2),
-        points[None, None],
-        torch.tensor([[POINTS]]),
+        RouteWindow(points[None, None], torch.ones(1, 1, POINTS, dtype=torch.bool), torch.tensor([[3]])),
     )[0, 0]
     gap, left, faster = (20.0 - 4.0, -6.0 + 4.0, 0.0), (0.0, -3.5, 3.0), (-6.0, 2.0, 0.0)
     brake = 36.0 / (2 * 16.0)
@@ -130,10 +128,11 @@ def test_on_a_straight_route_it_is_what_can_be_computed_by_hand() -> None:
 
 
 def test_beyond_the_end_of_the_route_and_without_one_nothing_is_said() -> None:
-    own, size, others, sizes, points, _ = scene(3)
-    assert (along_route(own, size, others, sizes, points, torch.tensor([[0]])) == 0).all()
-    short = torch.tensor([[4]])  # the agent is past the fourth point
-    assert (along_route(own, size, others, sizes, points, short) == 0).all()
+    own, size, others, sizes, route = scene(3)
+    for count, own_place in ((0, 0), (4, 2)):  # of four points the agent is past the last
+        exists = torch.arange(POINTS)[None, None] < count
+        seen = RouteWindow(route.points, exists, torch.tensor([[own_place]]))
+        assert (along_route(own, size, others, sizes, seen) == 0).all()
 
 
 @pytest.mark.parametrize(("method", "features"), [("bc", "gaps"), ("bc_ts_h", "road"), ("mgail_h", "road")])

@@ -27,7 +27,9 @@ from symphony.envs.routes import (
     SPACING,
     STRIDE,
     TURN_FEATURES,
-    pick_routes,
+    FollowedRoutes,
+    Routes,
+    RouteWindow,
     route_ahead,
     route_choices,
     route_table,
@@ -60,13 +62,26 @@ def bend(straight: int = 10, turn: float = 1.6, radius: float = 15.0) -> NDArray
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)])[:POINTS]
 
 
-def padded(line: NDArray[np.float64], points: int = POINTS) -> torch.Tensor:
-    return torch.from_numpy(np.concatenate([line, np.repeat(line[-1:], points - len(line), 0)]))
+def one_route(line: NDArray[np.float64]) -> FollowedRoutes:
+    return FollowedRoutes(torch.from_numpy(line), torch.tensor([[0]]), torch.tensor([[len(line)]]))
+
+
+def window(line: NDArray[np.float64], place: Any) -> RouteWindow:
+    """What is seen of a route by whoever has come to its point that is nearest to a place."""
+    here = SPACING * np.hypot(*(line - np.asarray(place)).T).argmin()
+    return one_route(line).window(torch.tensor([[here]], dtype=torch.float64))
 
 
 def see(x: float, y: float, heading: float, line: NDArray[np.float64]) -> torch.Tensor:
     state = torch.tensor([[[x, y, heading, 5.0]]], dtype=torch.float64)
-    return route_ahead(state, padded(line)[None, None], torch.tensor([[len(line)]]), SCALE)[0, 0]
+    return route_ahead(state, window(line, (x, y)), SCALE)[0, 0]
+
+
+def choices_of(state: torch.Tensor, *lines: NDArray[np.float64], turns: bool = False) -> torch.Tensor:
+    """Features [1, 1, G, F] of routes of one agent."""
+    count = torch.tensor([[[len(line) for line in lines]]])
+    point = torch.from_numpy(np.concatenate(lines))
+    return route_choices(state, point, count.cumsum(-1) - count, count, SCALE, turns=turns)[0]
 
 
 lines = st.builds(bend, st.integers(2, 20), st.floats(-2.5, 2.5), st.floats(10, 60))
@@ -135,27 +150,24 @@ def test_moving_the_world_changes_no_feature(
     a, b = see(*place, 0.2, line), see(*there(place), 0.2 + angle, there(line))
     torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
     state = [torch.tensor([[[*place, 0.2, 5.0]]]), torch.tensor([[[*there(place), 0.2 + angle, 5.0]]])]
-    choices = [padded(p)[None, None, None] for p in (line, there(line))]
-    count = torch.tensor([[[len(line)]]])
     for turns in (False, True):
         one, two = (
-            route_choices(s.double(), c, count, SCALE, turns=turns)[0]
-            for s, c in zip(state, choices, strict=True)
+            choices_of(at.double(), each, turns=turns)
+            for at, each in zip(state, (line, there(line)), strict=True)
         )
         torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
 
 
 def test_without_a_route_all_features_are_zero() -> None:
-    state = torch.randn(2, 3, 4)
-    for points in (torch.zeros(2, 3, POINTS, 2), 1e6 * torch.randn(2, 3, POINTS, 2)):
-        seen = route_ahead(state, points, torch.zeros(2, 3, dtype=torch.int64), SCALE)
+    state, none = torch.randn(2, 3, 4), torch.zeros(2, 3, dtype=torch.int64)
+    for point in (torch.zeros(0, 2), 1e6 * torch.randn(50, 2)):
+        seen = route_ahead(state, FollowedRoutes(point, none, none).window(torch.zeros(2, 3)), SCALE)
         assert seen.shape == (2, 3, ROUTE_FEATURES)
         assert (seen == 0).all()
     # Of a single point there is no direction; two are enough.
-    two = torch.tensor([[[[0.0, 0.0], [3.0, 0.0]]]])
-    assert (route_ahead(state[:1, :1], two, torch.tensor([[1]]), SCALE) == 0).all()
-    seen = route_ahead(torch.zeros(1, 1, 4), two, torch.tensor([[2]]), SCALE)
-    assert seen[0, 0, :4].tolist() == [1.0, 0.0, 1.0, 0.0]
+    two = np.array([[0.0, 0.0], [3.0, 0.0]])
+    assert (see(0.0, 0.0, 0.0, two[:1]) == 0).all()
+    assert see(0.0, 0.0, 0.0, two)[:4].tolist() == [1.0, 0.0, 1.0, 0.0]
     env = make_env(crossing())
     assert (env.start(torch.tensor([0]))[keys.ROUTE] == 0).all()
     route = env.with_goals(env.start(torch.tensor([0])))[keys.ROUTE]
@@ -164,38 +176,42 @@ def test_without_a_route_all_features_are_zero() -> None:
 
 
 @given(st.integers(2, 40), st.integers(0, 2**31 - 1))
-def test_padding_of_points_and_routes_changes_nothing(count: int, seed: int) -> None:
+def test_what_else_is_in_the_table_changes_nothing(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     line = np.cumsum(SPACING * np.array([1.0, 0.0]) + rng.normal(0, 0.4, (count, 2)), 0)
     state = torch.from_numpy(np.concatenate([rng.normal(0, 20, 2), rng.normal(0, 2, 2)]))[None, None]
-    number = torch.tensor([[count]])
-    short = route_ahead(state, torch.from_numpy(line)[None, None], number, SCALE)
-    for fill in (line[-1], np.full(2, 1e5)):
-        long = np.concatenate([line, np.tile(fill, (POINTS - count, 1))])
-        assert torch.equal(short, route_ahead(state, torch.from_numpy(long)[None, None], number, SCALE))
     # One route of one agent among others of a wider table.
-    table = torch.from_numpy(rng.normal(0, 50, (2, 2, 3, POINTS, 2)))
-    counts = torch.from_numpy(rng.integers(0, POINTS, (2, 2, 3)))
-    table[1, 0, 2], counts[1, 0, 2] = padded(line), count
-    points, exist = pick_routes(table, counts, torch.tensor([1]), torch.tensor([[2, -1]]))
-    assert torch.equal(points[0, 0], padded(line))
+    table = torch.from_numpy(rng.normal(0, 50, (2, 600, 2)))
+    first, length = (torch.from_numpy(rng.integers(0, 100, (2, 2, 3))) for _ in range(2))
+    table[1, 250 : 250 + count] = torch.from_numpy(line)
+    first[1, 0, 2], length[1, 0, 2] = 250, count
+    routes = Routes(table, first, length)
+    found = routes.of(torch.tensor([1]), torch.tensor([[2, -1]]))
+    points, exist = found.lines()
+    assert torch.equal(points[0, 0, :count], torch.from_numpy(line))
+    assert (points[0, 0, count:] == torch.from_numpy(line[-1])).all()
     assert exist.tolist() == [[count, 0]]
+    progress = torch.from_numpy(rng.uniform(0, 3 * count, (1, 2)))
+    for one, other in zip(found.window(progress), one_route(line).window(progress[:, :1]), strict=True):
+        assert torch.equal(one[:, :1], other)
+    place = state[..., :2].expand(1, 2, 2)
+    assert torch.equal(
+        found.progress(place, progress)[:, :1], one_route(line).progress(place[:, :1], progress[:, :1])
+    )
     for turns in (False, True):
-        features, mask = route_choices(state.expand(1, 2, 4), table[1:], counts[1:], SCALE, turns=turns)
-        alone, one = route_choices(
-            state, padded(line)[None, None, None], number[..., None], SCALE, turns=turns
+        features, mask = route_choices(
+            state.expand(1, 2, 4), table.flatten(0, 1), first[1:] + 600, length[1:], SCALE, turns=turns
         )
         assert features.shape == (1, 2, 3, CHOICE_FEATURES + TURN_FEATURES * turns)
-        assert torch.equal(mask, counts[1:] > 1)
-        assert torch.equal(features[0, 0, 2], alone[0, 0, 0])
-        assert one.all()
-        assert (features[counts[1:] == 0] == 0).all()
+        assert torch.equal(mask, length[1:] > 1)
+        assert torch.equal(features[0, 0, 2], choices_of(state, line, turns=turns)[0, 0, 0])
+        assert (features[length[1:] == 0] == 0).all()
 
 
 def test_choices_are_points_of_the_route_with_their_directions() -> None:
     line, heading, place = bend(straight=6, turn=1.2), 0.7, complex(3.0, -2.0)
     state = torch.tensor([[[place.real, place.imag, heading, 5.0]]], dtype=torch.float64)
-    features, _ = route_choices(state, padded(line)[None, None, None], torch.tensor([[[len(line)]]]), SCALE)
+    features = choices_of(state, line)
     rows = features[0, 0, 0].reshape(-1, 5).numpy()
     kept = np.arange(0, len(line), STRIDE)
     assert (rows[len(kept) :] == 0).all()
@@ -208,16 +224,14 @@ def test_choices_are_points_of_the_route_with_their_directions() -> None:
 
 
 @given(lines, st.integers(2, POINTS - 2), st.floats(-3.5, 3.5), headings)
-def test_turns_say_where_a_route_jumps(
+def test_turns_say_where_a_route_bends(
     line: NDArray[np.float64], where: int, aside: float, heading: float
 ) -> None:
-    """As it does where it changes lanes; else they are the sines of the angles between its steps."""
+    """They are the sines of the angles between its steps."""
     where = min(where, len(line) - 1)
     jumped = line + np.where(np.arange(len(line)) >= where, aside, 0.0)[:, None] * [0.0, 1.0]
     state = torch.tensor([[[*line[0], heading, 5.0]]], dtype=torch.float64)
-    count = torch.tensor([[[len(line), len(line)]]])
-    both = torch.stack([padded(line), padded(jumped)])[None, None]
-    features, _ = route_choices(state, both, count, SCALE, turns=True)
+    features = choices_of(state, line, jumped, turns=True)
     found = features[0, 0, :, CHOICE_FEATURES + 2 :].numpy()
     for turns, points in zip(found, (line, jumped), strict=True):
         step = (points[1:] - points[:-1]) @ [1.0, 1j]
@@ -232,8 +246,7 @@ def test_turns_say_where_a_route_jumps(
 
 def test_where_a_route_begins_is_told_to_the_decimetre() -> None:
     line, state = bend(), torch.tensor([[[0.0, 0.0, 0.0, 5.0]]], dtype=torch.float64)
-    beside = torch.stack([padded(line + np.array([0.0, y])) for y in (0.0, 0.1, 3.2)])[None, None]
-    features, _ = route_choices(state, beside, torch.full((1, 1, 3), len(line)), SCALE, turns=True)
+    features = choices_of(state, *(line + np.array([0.0, y]) for y in (0.0, 0.1, 3.2)), turns=True)
     _, left = features[0, 0, :, CHOICE_FEATURES : CHOICE_FEATURES + 2].unbind(-1)
     torch.testing.assert_close(3.0 * left.atanh(), torch.tensor([0.0, 0.1, 3.2], dtype=torch.float64))
 
@@ -246,8 +259,7 @@ def test_the_logged_route_is_where_the_vehicle_drove(seed: int) -> None:
         table = route_table(segment, graph, agent)
         path = shapely.points(segment.position[agent, :, :2].astype(float))
         away = [
-            shapely.distance(shapely.LineString(table.points[g, : table.count[g]]), path).mean()
-            for g in range(len(table.count))
+            shapely.distance(shapely.LineString(table.line(g)), path).mean() for g in range(len(table.count))
         ]
         # Chords of 3 m cut an arc of 10 m radius by at most 0.11 m.
         assert table.right[table.logged]
@@ -266,13 +278,13 @@ def test_routes_are_evenly_spaced_from_beside_the_vehicle() -> None:
     for agent in range(4):
         table = route_table(segment, graph, agent)
         start = segment.position[agent, 0, :2]
-        for line, count in zip(table.points, table.count, strict=True):
+        for route in range(len(table.count)):
+            line = table.line(route)
             assert np.hypot(*(line[0] - start)) < LATERAL
-            step = np.hypot(*np.diff(line[:count], axis=0).T)
+            step = np.hypot(*np.diff(line, axis=0).T)
             assert (step < SPACING + 1e-3).all()
             assert (step[:-1] > 0.9 * SPACING).all()
-            assert (line[count:] == line[count - 1]).all()
-        assert np.hypot(*(table.points[table.logged, 0] - start)) < 0.1
+        assert np.hypot(*(table.line(table.logged)[0] - start)) < 0.1
 
 
 def test_a_vehicle_on_no_lane_has_no_route() -> None:
@@ -281,7 +293,7 @@ def test_a_vehicle_on_no_lane_has_no_route() -> None:
     position[1, :, 1] += 60
     off = segment.replace(position=position)
     table = route_table(off, LaneGraph(off.road), 1)
-    assert table.points.shape == (0, POINTS, 2)
+    assert table.points.shape == (0, 2)
     assert table.logged == -1
     env = make_env(off)
     start = env.with_goals(env.start(torch.tensor([0])))
@@ -321,13 +333,16 @@ def test_a_rollout_with_goals_is_the_same_in_any_batch(dynamics: Any) -> None:
     segment = straight_road(5, num_lanes=2)
     alone = make_env(segment, dynamics=dynamics)
     among = make_env(crossing(7, seed=2), segment, straight_road(8, steps=61, seed=5), dynamics=dynamics)
-    assert among.scenes.route.shape[2] > alone.scenes.route.shape[2]
+    assert among.scenes.route_count.shape[2] > alone.scenes.route_count.shape[2]
     plan, goal = actions(alone, (1, 20)), torch.tensor([[1, 0]])
     one = run(alone, alone.with_goals(alone.start(torch.tensor([0]), 6), goal), plan)
     start = among.start(torch.tensor([[2, 1], [0, 0]]), torch.tensor([[1, 6], [7, 8]]))
     start = among.with_goals(start, goal.expand(2, 2, 2))
     wide = run(among, start, plan.expand(2, 2, 20, *plan.shape[2:]))[0, 1]
-    for key in (keys.STATE, keys.OWN, keys.ROUTE, keys.ROAD, keys.GOAL, keys.COLLISION, keys.OFFROAD):
+    for key in (
+        *(keys.STATE, keys.OWN, keys.ROUTE, keys.ROAD, keys.GOAL, keys.PROGRESS),
+        *(keys.COLLISION, keys.OFFROAD),
+    ):
         assert torch.equal(one[key][0], wide[key]), key
     assert torch.equal(one[keys.GAP][0].sort(-1).values, wide[keys.GAP].sort(-1).values)
 
@@ -346,11 +361,12 @@ def test_moving_the_world_changes_no_route_and_no_clearance() -> None:
 
 def test_the_gradient_of_what_is_seen_matches_finite_differences() -> None:
     line = bend(straight=4, turn=1.0, radius=20)
-    points, count = padded(line)[None, None].expand(1, 3, -1, -1), torch.tensor([[len(line)] * 3])
-    # Away from the middle between two points, where the nearest one changes.
+    point = torch.from_numpy(line)
+    routes = FollowedRoutes(point, torch.zeros(1, 3, dtype=torch.int64), torch.tensor([[len(line)] * 3]))
     state = [[1.0, 0.7, 0.1, 5.0], [13.0, -1.5, 0.4, 2.0], [20.5, 2.0, 1.3, 0.0]]
     start = torch.tensor([state], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda s: route_ahead(s, points, count, SCALE), (start,))
+    seen = routes.window(torch.tensor([[1.0, 13.0, 20.0]], dtype=torch.float64))
+    assert torch.autograd.gradcheck(lambda s: route_ahead(s, seen, SCALE), (start,))
 
 
 def test_gradient_flows_through_a_rollout_into_route_and_clearance() -> None:

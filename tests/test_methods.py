@@ -26,7 +26,6 @@ from symphony.config import AgentSpec, DiscriminatorConfig, SearchConfig, TrainC
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
-from symphony.envs.routes import POINTS
 from symphony.errors import ConfigError
 from symphony.recipes import train
 from symphony.render import curves
@@ -290,7 +289,9 @@ def searched(store: Path, out: Path, **changes: Any) -> tuple[dict[str, Tensor],
 def led_to(steps: TensorDictBase) -> TensorDictBase:
     """The states after steps."""
     after = steps.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL)
-    return after.set(keys.STEP, steps[keys.STEP] + 1).set(keys.STATE, steps[("next", *keys.STATE)])
+    for key in (keys.STATE, keys.PROGRESS):
+        after.set(key, steps[("next", *key)])
+    return after.set(keys.STEP, steps[keys.STEP] + 1)
 
 
 def test_searches_are_scored_up_to_the_end_of_each_scene(store: Path, tmp_path: Path) -> None:
@@ -390,7 +391,7 @@ def test_goal_batches_start_where_each_vehicle_comes_into_sight(store: Path, dat
 def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
     items = [2, 0, 1]
     scenes = dataset.scenes(items)
-    state, valid = dataset.fitted(items, scenes)
+    state, valid, progress = dataset.fitted(items, scenes)
     log, log_valid = logged(scenes)
     assert torch.equal(valid, log_valid)
     for b, item in enumerate(items):
@@ -399,6 +400,7 @@ def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
             row = found.agent.tolist().index(agent)
             steps = found.states.shape[1]
             assert torch.equal(state[b, :steps, n], found.states[row])
+            assert torch.equal(progress[b, :steps, n], found.progress[row])
             away = (state[b, :, n, :2] - log[b, :, n, :2]).norm(dim=-1)[valid[b, :, n]]
             assert away.max() < 0.5
     assert not torch.equal(state, log)
@@ -412,7 +414,6 @@ def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneD
         )
         assert (one == two).all()
     assert len(small.scene) == len(small.experts) == 1
-    assert small.scene(0).route.shape[3] == POINTS
 
 
 def test_one_search_serves_as_many_updates_as_configured(

@@ -107,6 +107,7 @@ class LaneGraph:
         regions: the branching regions, by parent, then by lane.
         followed: lines [P, 2] of pairs of a lane and its successor that were looked for already, see
             :func:`symphony.roadgraph.paths.followed`.
+        gentle: of lanes that were looked at already, see :func:`symphony.roadgraph.paths.gentle`.
     """
 
     def __init__(self, road: Road, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
@@ -125,6 +126,7 @@ class LaneGraph:
         self.curvature: Reals = np.array(turns, dtype=np.float64) / np.where(self.length > 0, self.length, 1)
         self.regions = self._branching()
         self.followed: dict[tuple[int, int], Reals] = {}
+        self.gentle: dict[int, bool] = {}
 
     def __len__(self) -> int:
         return len(self.lines)

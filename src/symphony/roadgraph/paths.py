@@ -15,10 +15,14 @@ from symphony.roadgraph.lines import Reals
 
 CHORD = 3.0
 """Metres of a piece of a line that has a direction, and over which a change of direction is measured."""
+GENTLE = 0.09
+"""Radians that a lane turns from one such piece to the next where its radius is 34 m."""
 _STEP = 1.0
 """Metres between the points of a blend."""
 _SMOOTH = 1.5
 """Metres to either side over which the direction of a line is taken when something is moved beside it."""
+_CLOSE = 1e-6
+"""Metres between points that are one."""
 _JOINED = 0.02
 """Metres between two lanes that meet."""
 _JOIN = 6.0
@@ -49,8 +53,7 @@ def blend(line: Reals, point: Reals, length: float) -> Reals:
     if begin >= arc[-1]:
         return point[None]
     end = min(begin + max(length, _STEP), arc[-1])
-    own = arc[(arc > begin) & (arc < end)]
-    places = np.unique(np.concatenate([np.arange(begin, end, _STEP), own, [end]]))
+    places = np.append(np.arange(begin, end - _CLOSE, _STEP), end)
     ahead, behind = (at(line, arc, places + shift) for shift in (_SMOOTH, -_SMOOTH))
     way = ahead - behind
     normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.hypot(*way.T)[:, None]
@@ -84,16 +87,21 @@ def beside(line: Reals, point: Reals) -> tuple[float, float]:
 
 def at(line: Reals, arc: Reals, places: Reals) -> Reals:
     """Points [Q, 2] so many metres along a line [P, 2] with arc lengths [P]; past its ends, those."""
-    return np.stack([np.interp(places, arc, line[:, axis]) for axis in (0, 1)], -1)
+    found = np.empty((len(places), 2))
+    found[:, 0], found[:, 1] = np.interp(places, arc, line[:, 0]), np.interp(places, arc, line[:, 1])
+    return found
 
 
 def arc_lengths(line: Reals) -> Reals:
     """Metres [P] from the beginning of a line to each of its points."""
-    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
+    way = line[1:] - line[:-1]
+    arc = np.zeros(len(line))
+    np.cumsum(np.hypot(way[:, 0], way[:, 1]), out=arc[1:])
+    return arc
 
 
 def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
-    """The centre line of a lane as one follows it from the end of the lane before.
+    """The centre line of a lane as one follows it from the end of the lane before, without that end itself.
 
     It is the lane's own line where the two meet. Where they do not, what overlaps is left out, and what lies aside is
     made up for by a short blend.
@@ -105,23 +113,21 @@ def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
         if gap > _JOINED:
             aside = min(beside(line, end)[1], gap)
             line = blend(line, end, _JOIN * aside)
-        known = graph.followed[before, lane] = line
+        known = graph.followed[before, lane] = distinct(np.concatenate([end[None], line]))[1:]
     return known
 
 
 def centre_line(graph: LaneGraph, lanes: Sequence[int], start: float = 0.0) -> Reals:
     """The line [P, 2] along lanes, each the successor of the one before, from so many metres along the first one."""
     first, arc = graph.lines[lanes[0]], graph.arc[lanes[0]]
-    start = min(max(start, 0.0), arc[-1])
-    parts = [at(first, arc, np.array([start])), first[arc > start]]
-    parts += [followed(graph, before, lane) for before, lane in pairwise(lanes)]
-    return distinct(np.concatenate(parts))
+    start = min(max(start, 0.0), float(arc[-1]))
+    parts = [at(first, arc, np.array([start])), first[arc > start + _CLOSE]] if start > 0.0 else [first]
+    return np.concatenate([*parts, *(followed(graph, before, lane) for before, lane in pairwise(lanes))])
 
 
 def distinct(line: Reals) -> Reals:
-    """A line without points that lie on the one before, of two points at least."""
-    keep = np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > 1e-6))
-    return line[keep] if keep.sum() > 1 else np.concatenate([line[:1], line[:1]])
+    """A line without points that lie on the one before."""
+    return line[np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > _CLOSE))]
 
 
 def sharpest(line: Reals, spacing: float = 0.5) -> float:
@@ -137,6 +143,13 @@ def sharpest(line: Reals, spacing: float = 0.5) -> float:
         return 0.0
     angle = np.arctan2(way[:, 1], way[:, 0])
     return float(np.abs((angle[apart:] - angle[:-apart] + np.pi) % (2 * np.pi) - np.pi).max())
+
+
+def gentle(graph: LaneGraph, lane: int) -> bool:
+    """Whether a lane nowhere turns by more than :data:`GENTLE`, so that a change beside it cannot be too sharp."""
+    if lane not in graph.gentle:
+        graph.gentle[lane] = sharpest(graph.lines[lane]) < GENTLE
+    return graph.gentle[lane]
 
 
 def own_sharpest(graph: LaneGraph, lanes: Sequence[int]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,17 @@ from symphony.geometry.stations import stations_along, to_pieces
 from symphony.roadgraph.assign import starting_lanes
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Reals, turn_between
-from symphony.roadgraph.paths import arc_lengths, at, beside, blend, centre_line, distinct, sharpest
+from symphony.roadgraph.paths import (
+    CHORD,
+    arc_lengths,
+    at,
+    beside,
+    blend,
+    centre_line,
+    followed,
+    gentle,
+    sharpest,
+)
 
 HORIZON = 240.0
 """Metres ahead up to which routes take every branch: 10 s at 20 m/s and a margin."""
@@ -47,11 +58,13 @@ class Route(NamedTuple):
         lanes: each a successor of the one before, but for the one that the change leads to.
         change: place in ``lanes`` of the lane that the change leads to; 0 for none.
         begins: metres along the lane before that one at which the change begins.
+        beside: metres along the lane it leads to of the place beside that.
     """
 
     lanes: tuple[int, ...]
     change: int = 0
     begins: float = 0.0
+    beside: float = 0.0
 
 
 Path = tuple[float, Route]
@@ -156,6 +169,7 @@ def _straightest(graph: LaneGraph, lanes: Sequence[int]) -> int:
 def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], horizon: float) -> list[Path]:
     """Paths up to and including the lane that a change leads to."""
     found: dict[Route, float] = {}
+    known: dict[tuple[int, int, float], tuple[float, float] | None] = {}
     for route in plain:
         first = along[route.lanes[0]]
         reach, offered = -first, set(along)
@@ -163,18 +177,20 @@ def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], 
             if reach >= horizon:
                 break
             here: set[int] = set(along) if k == 0 else set()
+            start = first if k == 0 else 0.0
             for other in {*graph.left[lane], *graph.right[lane]} - here:
                 # Where the neighbour continues one that was offered already, the change came earlier; where it is a
                 # branch of the route itself, it takes no change.
                 if k and not offered.union(route.lanes[k - 1 : k]).isdisjoint(graph.predecessors[other]):
                     here.add(other)
                     continue
-                place = _change_at(graph, lane, other, first if k == 0 else 0.0)
+                if (lane, other, start) not in known:
+                    known[lane, other, start] = _change_at(graph, lane, other, start)
+                place = known[lane, other, start]
                 if place is not None:
                     here.add(other)
-                    begins, onto = place
-                    path = Route((*route.lanes[: k + 1], other), k + 1, begins)
-                    found[path] = reach + begins + float(graph.length[other]) - onto
+                    path = Route((*route.lanes[: k + 1], other), k + 1, *place)
+                    found[path] = reach + path.begins + float(graph.length[other]) - path.beside
             reach += float(graph.length[lane])
             offered = here
     return [(reach, path) for path, reach in found.items()]
@@ -222,27 +238,52 @@ def route_line(graph: LaneGraph, route: Route, start: float = 0.0, speed: float 
     Returns:
         None for a route that nobody can drive.
     """
+    return _line(graph, route, start, speed, {})
+
+
+def _line(
+    graph: LaneGraph,
+    route: Route,
+    start: float,
+    speed: float,
+    changes: dict[Route, Reals | None],
+) -> Reals | None:
+    """The line of a route. Changes up to where they are over are kept, as many routes have the same."""
     if not route.change:
         return centre_line(graph, route.lanes, start)
+    reach, end = change_length(speed) + CHORD, route.change + 1
+    beyond = float(graph.length[route.lanes[route.change]]) - route.beside
+    while end < len(route.lanes) and beyond < reach:
+        beyond += float(graph.length[route.lanes[end]])
+        end += 1
+    near = route._replace(lanes=route.lanes[:end])
+    if near not in changes:
+        changes[near] = _changed(graph, near, start, speed)
+    line = changes[near]
+    if line is None:
+        return None
+    return np.concatenate([line, *(followed(graph, *pair) for pair in pairwise(route.lanes[end - 1 :]))])
+
+
+def _changed(graph: LaneGraph, route: Route, start: float, speed: float) -> Reals | None:
+    """The line of a route with a change; None if nobody can drive it."""
     before, after = route.lanes[: route.change], route.lanes[route.change :]
-    left = graph.lines[before[-1]], graph.arc[before[-1]]
-    point = at(*left, np.array([route.begins]))[0]
+    left, arc = graph.lines[before[-1]], graph.arc[before[-1]]
+    point = at(left, arc, np.array([route.begins]))[0]
     kept = centre_line(graph, before, start)
-    arc = arc_lengths(kept)
-    kept = kept[arc < arc[-1] - (left[1][-1] - route.begins) - 1e-6]
-    onto = beside(graph.lines[after[0]], point)[0]
-    target = centre_line(graph, after, onto)
-    arc = arc_lengths(target)
+    along = arc_lengths(kept)
+    kept = kept[along < along[-1] - (arc[-1] - route.begins) - 1e-3]
+    target = centre_line(graph, after, route.beside)
+    along = arc_lengths(target)
     for length in (change_length(speed), change_length(speed) / 2):
-        if arc[-1] < length:
+        if along[-1] < length:
             continue
         way = blend(target, point, length)
-        part = way[arc_lengths(way) <= length + 3.0]
-        if (
-            sharpest(distinct(np.concatenate([kept[-1:], part])))
-            <= sharpest(target[arc <= length + 3.0]) + CHANGE_TURN
-        ):
-            return distinct(np.concatenate([kept, way]))
+        if all(gentle(graph, lane) for lane in (before[-1], *after)):
+            return np.concatenate([kept, way])
+        part = np.concatenate([kept[-1:], way[arc_lengths(way) <= length + CHORD]])
+        if sharpest(part) <= sharpest(target[along <= length + CHORD]) + CHANGE_TURN:
+            return np.concatenate([kept, way])
     return None
 
 
@@ -268,8 +309,9 @@ def route_lines(
     kept: list[Route] = []
     lines: list[Reals] = []
     ends: dict[tuple[int, int, int], list[int]] = {}
+    changes: dict[Route, Reals | None] = {}
     for route in found:
-        line = route_line(graph, route, along[route.lanes[0]], speed)
+        line = _line(graph, route, along[route.lanes[0]], speed, changes)
         if line is None:
             continue
         points = resampled(line, spacing, length)
@@ -314,10 +356,12 @@ def route_errors(
     spacing = max(np.hypot(*(lines[0][1] - lines[0][0])), _TIE)
     most = min(max(map(len, lines)), int((1.5 * way + _SLACK) / spacing) + 2)
     # Shorter ones end with their last point again. Routes that part farther on are one here.
-    padded = np.stack(
-        [np.pad(line[:most], ((0, max(0, most - len(line))), (0, 0)), "edge") for line in lines]
-    )
-    padded, number = np.unique(padded, axis=0, return_inverse=True)
+    different: dict[bytes, int] = {}
+    number = [different.setdefault(line[:most].tobytes(), len(different)) for line in lines]
+    padded = np.empty((len(different), most, 2))
+    for row, line in zip(number, lines, strict=True):
+        padded[row, : len(line)] = line[:most]
+        padded[row, len(line) :] = line[-1]
     twice = _returns(padded, spacing)
     errors = np.empty(len(padded))
     for block in np.array_split(np.flatnonzero(~twice), max(1, len(padded) // 16)):
@@ -327,7 +371,7 @@ def route_errors(
         places = stations_along(padded[twice], same, np.ones(same.shape[:2], bool))
         on = [at(line, arc_lengths(line), place) for line, place in zip(padded[twice], places, strict=True)]
         errors[twice] = np.linalg.norm(np.stack(on) - same, axis=-1).mean(-1)
-    return errors[number.reshape(-1)]
+    return errors[number]
 
 
 def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool[NDArray[np.bool_], " R"]:
