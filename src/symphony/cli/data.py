@@ -275,6 +275,8 @@ def _print_report(report: Any, out: Path) -> None:
         table.add_row(f"odd: {_shown(reason)}", str(count))
     if report.overlaps:
         table.add_row("converted with boxes that overlap in the log", str(report.overlaps))
+    if report.joined_gaps:
+        table.add_row("gaps between lanes joined", str(report.joined_gaps))
     print_table(table, Console())
     if report.warning:
         Console(stderr=True).print(f"[yellow]warning:[/] {_shown(report.warning)}", soft_wrap=True)
@@ -326,6 +328,7 @@ def _print_info(found: dict[str, Any]) -> None:
         *((f"  {reason}", str(count)) for reason, count in found["problems"].items()),
         *(("odd: " + what, str(count)) for what, count in found["odd"].items()),
         *([("boxes overlap in the log of", str(found["overlaps"]))] if found["overlaps"] else []),
+        *([("gaps between lanes joined", str(found["joined_gaps"]))] if found["joined_gaps"] else []),
         *_unfinished_row(found["unfinished"]),
         *([("unfinished", found["unfinished_generation"])] if found["unfinished_generation"] else []),
     ]

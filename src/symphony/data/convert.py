@@ -14,10 +14,9 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from symphony.data import store_format
+from symphony.data import joins, overlaps, store_format
 from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.engine import Engine
-from symphony.data.overlaps import TAG
 from symphony.data.parts import (
     ODD,
     Outcome,
@@ -254,16 +253,15 @@ class _Run:
         else:
             try:
                 if isinstance(outcome, Stored):
-                    odd = outcome.store.tags(outcome.index).get(ODD, [])
+                    found = outcome.tags
                     writer.copy(outcome.store, outcome.index)
-                    overlaps = outcome.overlaps
                 else:
                     found = tags_of(outcome)
-                    odd, overlaps = found.get(ODD, []), TAG in found
                     writer.append(outcome, tags=found or None)
                 self.report.converted += 1
-                self.report.odd = dict(Counter(self.report.odd) + Counter(odd))
-                self.report.overlaps += overlaps
+                self.report.odd = dict(Counter(self.report.odd) + Counter(found.get(ODD, [])))
+                self.report.overlaps += overlaps.TAG in found
+                self.report.joined_gaps += found.get(joins.TAG, 0)
             except DataError as error:
                 self.report.skipped.append(skip(error, path, outcome.segment_id))
 
@@ -317,8 +315,9 @@ def info(path: str | Path) -> dict[str, Any]:
         ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
         many of these under each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is
         unusual about how many of the segments), ``groups`` (recordings the segments are of), ``overlaps`` (segments
-        in whose log boxes overlap), ``unfinished`` (None, or how far a conversion is that will add to the store) and
-        ``unfinished_generation`` (None, or how many segments are there, of how many).
+        in whose log boxes overlap), ``joined_gaps`` (links between lanes that conversion has added, summed over
+        segments; see :mod:`symphony.data.joins`), ``unfinished`` (None, or how far a conversion is that will add to
+        the store) and ``unfinished_generation`` (None, or how many segments are there, of how many).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -339,6 +338,7 @@ def info(path: str | Path) -> dict[str, Any]:
         "problems": report.problems,
         "odd": report.odd,
         "overlaps": report.overlaps,
+        "joined_gaps": report.joined_gaps,
         "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from symphony.data import overlaps
+from symphony.data import joins, overlaps
 from symphony.data import resample as resampling
 from symphony.data.bounds import oddities
 from symphony.data.crop import crop
@@ -49,9 +49,9 @@ class Stored:
         return self.store.ids[self.index]
 
     @property
-    def overlaps(self) -> bool:
-        """Whether boxes overlap in its log."""
-        return overlaps.TAG in self.store.tags(self.index)
+    def tags(self) -> dict[str, Any]:
+        """What it is tagged with."""
+        return self.store.tags(self.index)
 
 
 Outcome = RunSegment | Stored | Skip | None
@@ -95,6 +95,8 @@ class Preparation:
 
     def _prepared(self, segment: RunSegment, path: str) -> RunSegment | Skip:
         try:
+            road, gaps = joins.joined(segment.road)
+            segment = segment.replace(road=road, joined_gaps=gaps)
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
             if self.hold_lights:
@@ -118,9 +120,10 @@ class Preparation:
 
 
 def tags_of(segment: RunSegment) -> dict[str, Any]:
-    """What a segment is tagged with that has something unusual, or in whose log boxes overlap."""
+    """What a segment is tagged with that has something unusual, boxes that overlap, or lanes that were joined."""
     odd = oddities(segment)
-    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {})
+    gaps = {joins.TAG: segment.joined_gaps} if segment.joined_gaps else {}
+    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {}) | gaps
 
 
 def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:

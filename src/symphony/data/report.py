@@ -67,6 +67,7 @@ class Report:
         odd: what is unusual, and about how many of the segments added.
         overlaps: segments added in whose log a moving vehicle's box overlaps another (see
             :mod:`symphony.data.overlaps`).
+        joined_gaps: links between lanes that were added, summed over the segments (see :mod:`symphony.data.joins`).
     """
 
     converted: int = 0
@@ -76,6 +77,7 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     odd: dict[str, int] = field(default_factory=dict)
     overlaps: int = 0
+    joined_gaps: int = 0
 
     @property
     def warning(self) -> str:
@@ -121,6 +123,7 @@ class Report:
             "settings": dict,
             "odd": dict,
             "overlaps": int,
+            "joined_gaps": int,
         }
         known = {key: value[key] for key in kinds if key in value}
         for key, found in known.items():
@@ -142,6 +145,7 @@ class Report:
             settings=self.settings,
             odd=dict(Counter(earlier.odd) + Counter(self.odd)),
             overlaps=earlier.overlaps + self.overlaps,
+            joined_gaps=earlier.joined_gaps + self.joined_gaps,
         )
 
 

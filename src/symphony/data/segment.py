@@ -164,6 +164,8 @@ class RunSegment:
         file: name of the file it was read from, without folder.
         group: the recording it is part of. Segments of one recording share it, may overlap in time and are no
             independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
+        joined_gaps: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it
+            as a tag. No part of the content hash.
     """
 
     segment_id: str
@@ -187,6 +189,7 @@ class RunSegment:
     predict: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     file: str = ""
     group: str = field(default="", metadata={"hashed": False})
+    joined_gaps: int = field(default=0, metadata={"hashed": False})
 
     @property
     def num_agents(self) -> int:
