@@ -183,7 +183,7 @@ class Draft:
         """Put on record that ``report.files`` files are done; this survives whatever comes."""
         writer.sync()
         skipped = [skip.to_json() for skip in report.skipped[self._told :]]
-        names = ("files", "converted", "present", "odd", *_LATER)
+        names = ("files", "converted", "present", "odd", "odd_examples", *_LATER)
         counts = {name: getattr(report, name) for name in names}
         self._write(counts | {"segments": len(writer), "skipped": skipped})
         self._told = len(report.skipped)
@@ -276,7 +276,7 @@ def read_journal(folder: Path) -> Begun | None:
                 raise ValueError(f"{counts} are no counts of {len(job.files)} files")
             report.files, report.converted, report.present, segments, *later = counts
             report.overlaps, report.joined_gaps = later
-            report.odd = dict(line.get("odd", {}))
+            report.odd, report.odd_examples = (dict(line.get(n, {})) for n in ("odd", "odd_examples"))
             report.skipped += [Skip(**skip) for skip in line["skipped"]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(f"not the journal of a conversion: {error}", file=path) from error
