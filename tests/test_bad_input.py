@@ -162,14 +162,14 @@ def test_womd_records_of_something_else(payload: bytes, tmp_path: Path) -> None:
 
 def test_womd_one_bad_record_among_good_ones(tmp_path: Path) -> None:
     bad = womd_scenario("bad")
-    bad.tracks[0].states[2].heading = float("nan")
+    bad.tracks[2].states[0].center_x = float("nan")  # of the ego, from whose first place all is counted
     payloads = [womd_scenario("a"), bad, womd_scenario("c")]
     write_records(tmp_path / "a", [scenario.SerializeToString() for scenario in payloads])
     first, error, last = read_all("womd", tmp_path / "a")
     assert isinstance(first, RunSegment)
     assert isinstance(last, RunSegment)
     assert isinstance(error, DataError)
-    assert str(error).startswith(f"file {tmp_path / 'a'}, segment bad, field heading: ")
+    assert str(error).startswith(f"file {tmp_path / 'a'}, segment bad, field position: ")
 
 
 @pytest.mark.samples

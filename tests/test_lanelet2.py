@@ -16,7 +16,7 @@ from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, PARKING
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.geodesy import mercator, utm
-from symphony.data.sources.lanelet2 import LaneletMap, read_lanelet2
+from symphony.data.sources.lanelet2 import NO_AREA, NO_LANELET, NO_NODE, LaneletMap, read_lanelet2
 from symphony.data.sources.lanelet2_road import lane_lanelets, middle, road_map, stop_line
 from symphony.data.sources.lines import cut_ends, opened
 from symphony.errors import DataError
@@ -232,20 +232,11 @@ BROKEN: dict[str, tuple[str, str]] = {
     ),
     "no lanelets": (osm(lanelets={}), "has no lanelets"),
     "only crosswalks": (osm(lanelets={105: LANELETS[105]}), "has no lanes"),
-    "one bound": (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), "0 ways, expected one"),
     "an unknown way": (osm(lanelets={101: (22, 99, ROAD, ())}), "there is no way 99"),
-    "an unknown node": (osm(ways=WAYS | {21: ((1, 77), BORDER)}), "there is no node 77"),
-    "a bound of one point": (osm(ways=WAYS | {21: ((1,), BORDER)}), "fewer than 2 points"),
     "no number": (osm().replace("x='50'", "x='fifty'", 1), "is not a number"),
     "infinity": (osm().replace("x='50'", "x='inf'", 1), "not finite"),
     "no place": (osm().replace("x='50'", "", 1), "is not a number"),
     "a pole": (osm("degrees").replace("lat='49.", "lat='89.", 1), "outside latitudes"),
-    "an open area": (with_area(PARKING, members="61o 62o"), "is not closed"),
-    "an area in pieces": (with_area(PARKING, members="61o 64o"), "does not go on"),
-    "an area without an outline": (with_area(PARKING, members="64i 65i"), "0 outlines"),
-    "an area of two outlines": (with_area(PARKING, members="61o 62o 63o 64o 65o"), "2 outlines"),
-    "an area with a way missing": (with_area(PARKING, members="61o 99o"), "there is no way 99"),
-    "an area round one way twice": (with_area(PARKING, members="61o 61o"), "one way twice"),
     "two of one id": (
         osm().replace("<relation id='102'", "<relation id='101'"),
         "two lanelets of one id",
@@ -260,6 +251,47 @@ def test_broken_maps_are_refused_by_name(name: str, tmp_path: Path) -> None:
     assert message in error.message
     if name not in {"only crosswalks", "two of one id"}:
         assert error.file == tmp_path / "made.osm"
+
+
+ODD: dict[str, tuple[str, str, str]] = {
+    "one bound": (
+        osm().replace("<member type='way' ref='21' role='right'/>", "", 1),
+        NO_LANELET,
+        "0 ways, expected one",
+    ),
+    "an unknown node": (osm(ways=WAYS | {21: ((1, 77), BORDER)}), NO_NODE, "node 77"),
+    "a bound of one point": (osm(ways=WAYS | {21: ((1,), BORDER)}), NO_LANELET, "fewer than 2 points"),
+    "an open area": (with_area(PARKING, members="61o 62o"), NO_AREA, "is not closed"),
+    "an area in pieces": (with_area(PARKING, members="61o 64o"), NO_AREA, "does not go on"),
+    "an area without an outline": (with_area(PARKING, members="64i 65i"), NO_AREA, "0 outlines"),
+    "an area of two outlines": (with_area(PARKING, members="61o 62o 63o 64o 65o"), NO_AREA, "2 outlines"),
+    "an area with a way missing": (with_area(PARKING, members="61o 99o"), NO_AREA, "there is no way 99"),
+    "an area round one way twice": (with_area(PARKING, members="61o 61o"), NO_AREA, "one way twice"),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_what_a_map_lacks_is_left_out(name: str, tmp_path: Path) -> None:
+    content, kind, example = ODD[name]
+    path = tmp_path / "made.osm"
+    path.write_text(content)
+    source = read_lanelet2(path, FROM_ORIGIN)
+    assert example in source.odd[kind]
+    left = {lanelet.lanelet_id for lanelet in source.lanelets}
+    assert left == set(LANELETS) - ({101} if kind != NO_AREA else set())
+    assert not source.areas
+
+
+def test_a_node_less_is_a_point_less(tmp_path: Path) -> None:
+    path = tmp_path / "made.osm"
+    nodes = (*WAYS[21][0][:1], 77, *WAYS[21][0][1:])
+    path.write_text(osm(ways=WAYS | {21: (nodes, BORDER)}))
+    source = read_lanelet2(path, FROM_ORIGIN)
+    assert source.odd == {NO_NODE: "way 21: node 77"}
+    (tmp_path / "whole.osm").write_text(osm())
+    np.testing.assert_array_equal(
+        source.ways[21].line, read_lanelet2(tmp_path / "whole.osm", FROM_ORIGIN).ways[21].line
+    )
 
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:

@@ -199,7 +199,9 @@ def test_what_is_odd_is_counted(workers: int, tmp_path: Path) -> None:
     report = convert(Odd(), [tmp_path / "0.scene", tmp_path / "1.scene"], tmp_path / "out", workers=workers)
     assert report.odd == {"an agent faster than 70 m/s": 2}
     assert converting.info(tmp_path / "out")["odd"] == report.odd
-    assert SegmentStore(tmp_path / "out").tags(0) == {"odd": ["an agent faster than 70 m/s"]}
+    found = converting.info(tmp_path / "out")["odd_examples"]
+    assert found == report.odd_examples == {"an agent faster than 70 m/s": "crossing-0"}
+    assert SegmentStore(tmp_path / "out").tags(0) == {"odd": {"an agent faster than 70 m/s": ""}}
 
 
 class Odd(FakeReader):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers_sources import FAR, read_error, read_one, womd_scenario
+from symphony.data.odd import NO_LINE, NO_SIZE, WILD
 from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, content_hash
 from symphony.data.sources import get_reader, readers, womd_pb2
 from symphony.data.sources.tfrecord import write_records
@@ -284,19 +285,10 @@ def test_what_the_format_forbids_is_named(path: Path, change: Any, field: str, m
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        (lambda s: setattr(s.tracks[0].states[2], "center_x", np.nan), "position"),
-        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e300), "position"),
-        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e6), "position"),
         (lambda s: setattr(s.tracks[2].states[0], "center_x", np.nan), "position"),
-        (lambda s: setattr(s.tracks[0].states[2], "heading", np.inf), "heading"),
-        (lambda s: setattr(s.tracks[0].states[2], "velocity_y", np.nan), "velocity"),
-        (lambda s: setattr(s.tracks[0].states[1], "length", 0), "size"),
-        (lambda s: setattr(s.tracks[0].states[1], "width", np.nan), "size"),
         (lambda s: setattr(s.tracks[1], "id", 100), "agent_id"),
         (lambda s: setattr(s, "scenario_id", "a/b"), "segment_id"),
         (lambda s: s.ClearField("map_features"), "road.lanes"),
-        (lambda s: setattr(s.map_features[0].lane.polyline[1], "z", np.nan), "road.lanes"),
-        (lambda s: setattr(s.map_features[4].road_edge.polyline[0], "x", np.inf), "road.boundary"),
         (lambda s: setattr(s.map_features[1], "id", 10), "road.lane_id"),
         (lambda s: setattr(s.map_features[0].lane, "speed_limit_mph", -5), "road.speed_limit"),
     ],
@@ -306,6 +298,37 @@ def test_what_the_schema_forbids_is_named(path: Path, change: Any, field: str) -
     change(scenario)
     error = refuse(path, scenario)
     assert (error.file, error.segment, error.field) == (path, scenario.scenario_id, field)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (lambda s: setattr(s.tracks[0].states[2], "center_x", np.nan), WILD),
+        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e300), WILD),
+        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e6), WILD),
+        (lambda s: setattr(s.tracks[0].states[2], "heading", np.inf), WILD),
+        (lambda s: setattr(s.tracks[0].states[2], "velocity_y", np.nan), WILD),
+        (lambda s: setattr(s.tracks[0].states[1], "length", 0), NO_SIZE),
+        (lambda s: setattr(s.tracks[0].states[1], "width", np.nan), NO_SIZE),
+        (lambda s: setattr(s.map_features[0].lane.polyline[1], "z", np.nan), NO_LINE),
+        (lambda s: setattr(s.map_features[4].road_edge.polyline[0], "x", np.inf), NO_LINE),
+    ],
+)
+def test_single_odd_things_are_left_out(path: Path, change: Any, kind: str) -> None:
+    scenario = womd_scenario()
+    write_records(path, [scenario.SerializeToString()])
+    whole = read_one("womd", path)
+    change(scenario)
+    write_records(path, [scenario.SerializeToString()])
+    found = read_one("womd", path)
+    assert list(found.odd) == [kind]
+    lines = [len(lines) for lines in (whole.road.lanes, whole.road.boundary)]
+    left = [len(lines) for lines in (found.road.lanes, found.road.boundary)]
+    assert sum(lines) - sum(left) == (kind == NO_LINE)
+    assert whole.num_agents - found.num_agents == (kind == NO_SIZE)
+    if kind == WILD:
+        assert whole.valid.sum() - found.valid.sum() == 1
+        assert not found.valid[0, 2]
 
 
 def test_a_name_that_is_no_text_is_refused(path: Path) -> None:

@@ -201,7 +201,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def test_logs_too_short_for_the_score_are_refused_before_the_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fill(tmp_path / "store", [straight_road(2), straight_road(2, seed=1, steps=12)])
+    fill(tmp_path / "store", [straight_road(2, steps=12), straight_road(2, seed=1, steps=12)])
     assert main(["evaluate", "playback", "--data", str(tmp_path / "store"), "--metrics", "wosac"]) == 1
     said = capsys.readouterr()
     assert "the score needs 8" in said.err
@@ -291,6 +291,31 @@ def test_words() -> None:
     tree = {"search": "tree", "branches": 4, "rule": "best", "prune_every": 10, "logged_goals": True}
     assert how_in_words(tree) == "32 trees of 4, best every 10, logged goals"
     assert how_in_words({"search": "best", "branches": 8}) == "the best of 8"
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_segment_that_cannot_be_scored_ends_no_others(workers: int, tmp_path: Path) -> None:
+    whole = [crossing(num_agents=2, seed=k) for k in range(2)]
+    bare = whole[0].replace(
+        segment_id="bare", road=replace(whole[0].road, boundary=whole[0].road.boundary.of([]))
+    )
+    walkers = whole[0].replace(
+        segment_id="walkers", agent_type=np.full_like(whole[0].agent_type, AgentType.PEDESTRIAN)
+    )
+    short = straight_road(2, steps=12)
+    fill(tmp_path / "store", [bare, whole[0], walkers, short, whole[1]])
+    agent, store = load_agent("constant_velocity"), SegmentStore(tmp_path / "store")
+    settings = replace(PLAIN, workers=workers)
+    found = evaluate_wosac(agent, store, range(5), settings, baselines=False)
+    assert found.segments == [whole[0].segment_id, whole[1].segment_id]
+    assert [skip.segment for skip in found.left_out] == ["bare", "walkers", short.segment_id]
+    alone = evaluate_wosac(agent, store, [1, 4], settings, baselines=False)
+    assert found.numbers("constant_velocity") == alone.numbers("constant_velocity")
+    assert [entry["segment"] for entry in found.record()["left_out"]] == ["bare", "walkers", short.segment_id]
+    with pytest.raises(DataError, match="no road edge"):
+        evaluate_wosac(agent, store, range(5), settings, baselines=False, strict=True)
+    with pytest.raises(DataError, match="time_to_collision"):
+        evaluate_wosac(agent, store, [2, 0], settings, baselines=False)
 
 
 def test_processes_change_nothing(tmp_path: Path) -> None:

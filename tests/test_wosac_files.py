@@ -95,6 +95,54 @@ def test_many_scenarios(many: tuple[Path, Path], tmp_path: Path) -> None:
         assert again.read_text() == out.read_text()
 
 
+def _without_edges(record: pb.Scenario) -> None:
+    kept = [feature for feature in record.map_features if feature.WhichOneof("feature_data") != "road_edge"]
+    del record.map_features[:]
+    record.map_features.extend(kept)
+
+
+def _without_vehicles(record: pb.Scenario) -> None:
+    for each in record.tracks:
+        each.object_type = 2
+
+
+def _without_future(record: pb.Scenario) -> None:
+    for each in record.tracks:
+        for state in each.states[11:]:
+            state.valid = False
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (_without_edges, "no road edge"),
+        (_without_vehicles, "time_to_collision"),
+        (_without_future, "valid at no step that could be scored"),
+    ],
+)
+def test_a_scenario_that_cannot_be_scored_ends_no_others(
+    change: Any, why: str, many: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = list(map(womd_record, NAMES))
+    change(records[1])
+    write(tmp_path, *records)
+    out = tmp_path / "scores.json"
+    assert run(*many, "--json", str(out)) == 0
+    assert "left out: 1 x " in (said := capsys.readouterr().err)
+    assert why in said
+    assert "(first: bbbb)" in said
+    found = json.loads(out.read_text())
+    assert [part["scenario_id"] for part in found["scenarios"]] == ["aaaa", "cccc"]
+    assert found["scenario_count"] == 2
+    assert [part["segment"] for part in found["left_out"]] == ["bbbb"]
+    assert found["min_ade"] == pytest.approx(np.mean([part["min_ade"] for part in found["scenarios"]]))
+    assert run(*many, "--strict") == 1
+    assert "segment bbbb" in capsys.readouterr().err
+    for record in records:
+        change(record)
+    refused(capsys, write(tmp_path, *records), many[1], "segment aaaa", why.partition(" ")[0])
+
+
 def test_scenarios_are_read_as_they_are_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = [f"scenario{k:02d}" for k in range(12)]
     write_records(tmp_path / "all.tfrecord", [womd_record(n, tracks=2).SerializeToString() for n in names])
@@ -112,13 +160,14 @@ def test_scenarios_are_read_as_they_are_scored(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr("symphony.data.sources.wosac.read_scenario_payloads", counted)
     ahead = []
-    found = score_files(
+    found, left_out = score_files(
         tmp_path / "all.tfrecord",
         tmp_path / "rollouts",
         progress=lambda done, total: ahead.append((drawn - done, total)),
     )
     assert ahead == [(0, 12)] * 12
     assert [one.scenario_id for one in found] == names
+    assert not left_out
     # What a scenario scores does not depend on those before it: the first three come again and again.
     assert [one.scores for one in found] == [found[k % 3].scores for k in range(12)]
 

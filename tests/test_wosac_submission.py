@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 
 from helpers_wosac import record_rollouts, womd_record
+from symphony.agents import load_agent
 from symphony.cli import main
+from symphony.cli.wosac_submit import simulated_scenarios
+from symphony.config import WosacSettings
 from symphony.data.rollouts import RolloutArrays, read_rollouts
 from symphony.data.sources import wosac_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
@@ -134,6 +137,23 @@ def test_the_command(written: Path, scenarios: Path, capsys: pytest.CaptureFixtu
     assert "3 scenarios in 2 shards, all well" in capsys.readouterr().out
     assert main(["wosac", "validate", str(written)]) == 0
     assert "Not checked" in capsys.readouterr().out
+
+
+def test_an_odd_box_is_in_the_submission_nevertheless(tmp_path: Path) -> None:
+    record = womd_record()
+    for state in record.tracks[1].states:
+        state.length = 0
+    write_records(tmp_path / "a", [record.SerializeToString()])
+    agent = load_agent("constant_velocity")
+    ((name, found),) = simulated_scenarios(agent, tmp_path / "a", WosacSettings())
+    write_records(tmp_path / "b", [womd_record().SerializeToString()])
+    ((_, whole),) = simulated_scenarios(agent, tmp_path / "b", WosacSettings())
+    assert name == record.scenario_id
+    order = np.argsort(found.object_id)
+    assert found.object_id[order].tolist() == whole.object_id.tolist()
+    for values in ("x", "y", "z", "heading"):
+        # Who is left out goes on exactly at its velocity, who is driven as closely as the dynamics can.
+        np.testing.assert_allclose(getattr(found, values)[:, order], getattr(whole, values), atol=0.05)
 
 
 def test_the_command_refuses(scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,6 +64,9 @@ class Convert:
     hold_lights: bool = False
     """Give lights the last state that the log knows (before the first: the first) where it knows none, instead of
     `unknown`: for scenes that show their lights at a single step (see docs/datasets.md)."""
+    strict: bool = False
+    """Skip a record of which something odd would be left out (an agent without a size, a state that no car can have,
+    a node that the map lacks), instead of reading the rest of it."""
     append: bool = False
     """Add to a store that exists; what it holds already is left as it is."""
     workers: int = 1
@@ -130,6 +133,7 @@ class Convert:
                     exclude_overlaps=self.exclude_overlaps,
                     radius=self.radius,
                     hold_lights=self.hold_lights,
+                    strict=self.strict,
                     reader_options=self._options(),
                     progress=show,
                 )
@@ -272,9 +276,12 @@ def _print_report(report: Any, out: Path) -> None:
     for reason, count in report.problems.items():
         table.add_row(f"skipped: {_shown(reason)}", str(count))
     for reason, count in report.odd.items():
-        table.add_row(f"odd: {_shown(reason)}", str(count))
+        example = report.odd_examples.get(reason)
+        table.add_row(_shown(f"odd: {reason}" + (f" (first: {example})" if example else "")), str(count))
     if report.overlaps:
         table.add_row("converted with boxes that overlap in the log", str(report.overlaps))
+    if report.joined_gaps:
+        table.add_row("gaps between lanes joined", str(report.joined_gaps))
     print_table(table, Console())
     if report.warning:
         Console(stderr=True).print(f"[yellow]warning:[/] {_shown(report.warning)}", soft_wrap=True)
@@ -326,6 +333,7 @@ def _print_info(found: dict[str, Any]) -> None:
         *((f"  {reason}", str(count)) for reason, count in found["problems"].items()),
         *(("odd: " + what, str(count)) for what, count in found["odd"].items()),
         *([("boxes overlap in the log of", str(found["overlaps"]))] if found["overlaps"] else []),
+        *([("gaps between lanes joined", str(found["joined_gaps"]))] if found["joined_gaps"] else []),
         *_unfinished_row(found["unfinished"]),
         *([("unfinished", found["unfinished_generation"])] if found["unfinished_generation"] else []),
     ]

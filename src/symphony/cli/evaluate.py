@@ -104,11 +104,10 @@ class Evaluate:
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         chosen = segment_indices(store, self.segments)
         if self.metrics:
-            from symphony.evaluation.wosac_segments import wosac_scenario
+            from symphony.evaluation.wosac import scorable
 
             future = WosacSettings.of(config).future
-            for item in chosen or range(len(store)):
-                wosac_scenario(store[item], future)  # or complain now, not after the work
+            scorable(store, chosen or range(len(store)), future)  # or complain now, not after the work
         clips: ClipKeeper | None = None
         keepers: list[Callable[[EvaluatedBatch], None]] = []
         if self.figure is not None:

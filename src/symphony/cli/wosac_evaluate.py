@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from symphony.cli.tables import write_numbers
+from symphony.cli.wosac_score import print_left_out
 from symphony.config import WosacSettings
 
 if TYPE_CHECKING:
@@ -36,6 +37,9 @@ class Evaluate:
     """Ids of the run segments, or their numbers in the store; by default all."""
     baselines: bool = True
     """Score the agent alone."""
+    strict: bool = False
+    """Stop at a run segment that can't be scored (without road edges, vehicles or a future) instead of leaving it
+    out."""
     settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
 
     def run(self) -> None:
@@ -50,7 +54,14 @@ class Evaluate:
         items = segment_indices(store, self.segments) or list(range(len(store)))
         with segments_bar(f"scoring {agent.name}") as advance:
             found = evaluate_wosac(
-                agent, store, items, self.settings, self.config, advance, baselines=self.baselines
+                agent,
+                store,
+                items,
+                self.settings,
+                self.config,
+                advance,
+                baselines=self.baselines,
+                strict=self.strict,
             )
         print_wosac(found, aside=str(self.json) == "-")
         if self.json is not None:
@@ -79,6 +90,7 @@ def print_wosac(found: WosacEvaluation, *, aside: bool = False) -> None:
         table.add_row(f"order {share}, of {pairs} pairs", *cells)
     table.add_row("CPU seconds", *(f"{result.seconds:.1f}" for result in found.results.values()))
     Console(stderr=aside).print(table)
+    print_left_out(found.left_out)
 
 
 def _shown(mean: float, error: float) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from symphony.errors import DataError
 
 if TYPE_CHECKING:
+    from symphony.data.report import Skip
     from symphony.metrics.wosac import WosacFeatures, WosacScores
 
 _NAMED = 5
@@ -26,6 +27,7 @@ class ScoreTask:
     config: str
     per_object: bool
     features: Path | None
+    strict: bool
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,13 @@ def score_files(
     partial: bool = False,
     per_object: bool = False,
     features: Path | None = None,
+    strict: bool = False,
     progress: Callable[[int, int | None], None] = lambda done, total: None,
-) -> list[ScenarioScore]:
+) -> tuple[list[ScenarioScore], list[Skip]]:
     """Score the rollouts of one or many scenarios, in the order of the scenario files.
 
-    One scenario is in memory at a time, a few for each worker.
+    One scenario is in memory at a time, a few for each worker. Scenarios that can't be scored, such as one without
+    road edges, vehicles or a future, are left out.
 
     Args:
         scenarios: WOMD scenario file, folder of them, or pattern.
@@ -71,10 +75,14 @@ def score_files(
         partial: leave out scenarios without rollouts, instead of an error.
         per_object: with the scores of each object.
         features: folder to write each scenario's features to, as ``SCENARIO_ID.npz``.
+        strict: a scenario that can't be scored is an error.
         progress: called with the scenarios done and, where known, all there are.
 
+    Returns:
+        The scores, and the scenarios that were left out.
+
     Raises:
-        DataError: something can't be scored; names file, scenario, agent and field.
+        DataError: rollouts don't fit, or no scenario can be scored; names file, scenario, agent and field.
     """
     from symphony.data.engine import ordered_map
 
@@ -82,48 +90,53 @@ def score_files(
         features.mkdir(parents=True, exist_ok=True)
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     pairs = _pairs(scenarios, rollouts, partial)
-    tasks = (ScoreTask(*pair, config, per_object, features) for pair in pairs)
-    results = []
+    tasks = (ScoreTask(*pair, config, per_object, features, strict) for pair in pairs)
+    results: list[ScenarioScore] = []
+    skipped: list[Skip] = []
     for result in ordered_map(score_task, tasks, workers=workers):
-        results.append(result)
-        progress(len(results), total)
+        if isinstance(result, ScenarioScore):
+            results.append(result)
+        else:
+            skipped.append(result)
+        progress(len(results) + len(skipped), total)
     if not results:
-        raise DataError("no scenario has rollouts", file=scenarios)
-    return results
+        raise skipped[0].error if skipped else DataError("no scenario has rollouts", file=scenarios)
+    return results, skipped
 
 
-def score_task(task: ScoreTask) -> ScenarioScore:
-    """Score one scenario."""
+def score_task(task: ScoreTask) -> ScenarioScore | Skip:
+    """Score one scenario, or say why it can't be."""
+    from symphony.data.report import Skip
     from symphony.data.rollouts import read_rollouts
     from symphony.data.sources.wosac import parse_scenario, scenario_arrays
     from symphony.metrics.wosac import (
         CHALLENGES,
         SimulatedRollouts,
         WosacScenario,
+        check_scored,
         compute_features,
         object_scores,
         score_features,
     )
     from symphony.metrics.wosac.config import ROLLOUTS
 
-    scenario_id = None
+    record = parse_scenario(task.payload, task.file, task.record)
+    scenario_id = record.scenario_id
+    config = CHALLENGES[task.config]
     try:
-        record = parse_scenario(task.payload, task.file, task.record)
-        scenario_id = record.scenario_id
         scenario = WosacScenario.of(**scenario_arrays(record))
+        check_scored(scenario, config)
     except DataError as error:
-        raise error.at(file=task.file, segment=scenario_id) from None
+        if task.strict:
+            raise error.at(file=task.file, segment=scenario_id) from None
+        return Skip.of(error, task.file, scenario_id)
     try:
         rollouts = SimulatedRollouts.of(**vars(read_rollouts(task.rollouts)))
         rollouts.check(scenario, ROLLOUTS)
         found = compute_features(scenario, rollouts)
     except DataError as error:
         raise error.at(file=task.rollouts, segment=scenario_id) from None
-    config = CHALLENGES[task.config]
-    try:
-        scores = score_features(found, config)
-    except DataError as error:
-        raise error.at(file=task.file, segment=scenario_id) from None
+    scores = score_features(found, config)
     if task.features is not None:
         write_features(task.features / f"{scenario_id}.npz", found)
     return ScenarioScore(
@@ -131,8 +144,8 @@ def score_task(task: ScoreTask) -> ScenarioScore:
     )
 
 
-def summary(results: list[ScenarioScore], config: str) -> dict[str, Any]:
-    """The mean over scenarios and every scenario's own scores, as JSON can hold it."""
+def summary(results: list[ScenarioScore], skipped: list[Skip], config: str) -> dict[str, Any]:
+    """The mean over scenarios, every scenario's own scores, and what was left out, as JSON can hold it."""
     from symphony.metrics.wosac import mean_scores
 
     return {
@@ -140,6 +153,7 @@ def summary(results: list[ScenarioScore], config: str) -> dict[str, Any]:
         "scenario_count": len(results),
         **mean_scores(result.scores for result in results).to_dict(),
         "scenarios": [result.record() for result in results],
+        "left_out": [skip.to_json() for skip in skipped],
     }
 
 

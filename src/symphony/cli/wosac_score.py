@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from symphony.cli.tables import write_numbers
 from symphony.cli.wosac_files import ScenarioScore, score_files, summary
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, printable
+
+if TYPE_CHECKING:
+    from symphony.data.report import Skip
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,9 @@ class Score:
     """Folder to write what is compared to, per object and step, as SCENARIO_ID.npz."""
     partial: bool = False
     """Leave out scenarios without rollouts; otherwise each must have some."""
+    strict: bool = False
+    """Stop at a scenario that can't be scored (without road edges, vehicles or a future), instead of leaving it
+    out."""
     workers: int = 1
     """Processes that score."""
 
@@ -47,13 +54,14 @@ class Score:
 
     def run(self) -> None:
         """Score, showing how far it is, and report."""
-        results = self._score()
-        found = summary(results, self.config)
+        results, skipped = self._score()
+        found = summary(results, skipped, self.config)
         _print(found, aside=str(self.json) == "-")
+        print_left_out(skipped)
         if self.json is not None:
             write_numbers(self.json, found)
 
-    def _score(self) -> list[ScenarioScore]:
+    def _score(self) -> tuple[list[ScenarioScore], list[Skip]]:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -68,8 +76,17 @@ class Score:
                 partial=self.partial,
                 per_object=self.per_object,
                 features=self.features,
+                strict=self.strict,
                 progress=lambda done, total: bar.update(task, completed=done, total=total),
             )
+
+
+def print_left_out(skipped: list[Skip]) -> None:
+    """Print why scenarios have no score, on standard error."""
+    from symphony.data.report import left_out
+
+    for line in left_out(skipped):
+        sys.stderr.write(f"left out: {printable(line)}\n")
 
 
 def _print(found: dict[str, object], *, aside: bool) -> None:

@@ -102,15 +102,18 @@ class _Simulation:
 
     def __call__(self, packed: tuple[Path, int, bytes]) -> tuple[str, RolloutArrays]:
         """Id and rollouts."""
+        from symphony.data.odd import mended
         from symphony.data.segment import validate
         from symphony.data.sources.womd import scenario_to_segment
         from symphony.data.sources.wosac import parse_scenario
-        from symphony.simulation.wosac import wosac_rollouts
+        from symphony.simulation.wosac import with_the_rest, wosac_rollouts
 
         file, record, payload = packed
         scenario = parse_scenario(payload, file, record)
         try:
-            segment = validate(scenario_to_segment(scenario, file=file.name))
+            whole = scenario_to_segment(scenario, file=file.name)
+            segment = validate(mended(whole))
+            found = wosac_rollouts(self.agent, segment, self.settings)
+            return scenario.scenario_id, with_the_rest(found, whole)
         except DataError as error:
             raise error.at(file=file, segment=scenario.scenario_id) from None
-        return scenario.scenario_id, wosac_rollouts(self.agent, segment, self.settings)

@@ -7,17 +7,15 @@ import json
 import math
 import shutil
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from symphony.data import store_format
+from symphony.data import joins, overlaps, store_format
 from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.engine import Engine
-from symphony.data.overlaps import TAG
 from symphony.data.parts import (
     ODD,
     Outcome,
@@ -27,7 +25,6 @@ from symphony.data.parts import (
     divide,
     elsewhere,
     here,
-    skip,
     tags_of,
 )
 from symphony.data.report import Report, Skip
@@ -66,6 +63,7 @@ def convert(
     exclude_overlaps: bool = False,
     radius: float | None = None,
     hold_lights: bool = False,
+    strict: bool = False,
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
@@ -91,6 +89,8 @@ def convert(
             are counted either way.
         radius: metres around the ego's path that are kept, of map and agents; None for all.
         hold_lights: give lights the last state that the log knows (before the first: the first) where it knows none.
+        strict: skip a record of which something odd would be left out, such as an agent without a size (see
+            :mod:`symphony.data.odd`).
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
             depend on it.
@@ -122,6 +122,7 @@ def convert(
     settings |= {"exclude_overlaps": True} if exclude_overlaps else {}
     settings |= {} if radius is None else {"radius": radius}
     settings |= {"hold_lights": True} if hold_lights else {}
+    settings |= {"strict": True} if strict else {}
     paths = expand(files, reader.patterns)
     changed = {
         str(file.absolute()): file.stat().st_mtime_ns
@@ -135,7 +136,15 @@ def convert(
         try:
             if not draft.finished:
                 recipe = Preparation(
-                    reader, 1 / rate, smooth, interactive, draft.before, exclude_overlaps, radius, hold_lights
+                    reader,
+                    1 / rate,
+                    smooth,
+                    interactive,
+                    draft.before,
+                    exclude_overlaps,
+                    radius,
+                    hold_lights,
+                    strict,
                 )
                 _Run(draft, list(map(str, paths)), recipe, progress)(workers, engine)
             if report.converted or report.present:
@@ -254,18 +263,17 @@ class _Run:
         else:
             try:
                 if isinstance(outcome, Stored):
-                    odd = outcome.store.tags(outcome.index).get(ODD, [])
+                    found = outcome.tags
                     writer.copy(outcome.store, outcome.index)
-                    overlaps = outcome.overlaps
                 else:
                     found = tags_of(outcome)
-                    odd, overlaps = found.get(ODD, []), TAG in found
                     writer.append(outcome, tags=found or None)
                 self.report.converted += 1
-                self.report.odd = dict(Counter(self.report.odd) + Counter(odd))
-                self.report.overlaps += overlaps
+                self.report.note(found.get(ODD, {}), outcome.segment_id)
+                self.report.overlaps += overlaps.TAG in found
+                self.report.joined_gaps += found.get(joins.TAG, 0)
             except DataError as error:
-                self.report.skipped.append(skip(error, path, outcome.segment_id))
+                self.report.skipped.append(Skip.of(error, path, outcome.segment_id))
 
     def _tell(self) -> None:
         if self.progress is not None:
@@ -313,12 +321,13 @@ def info(path: str | Path) -> dict[str, Any]:
     """What a store holds, as JSON can hold it.
 
     Returns:
-        Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each),
-        ``skipped`` (how many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how
-        many of these under each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is
-        unusual about how many of the segments), ``groups`` (recordings the segments are of), ``overlaps`` (segments
-        in whose log boxes overlap), ``unfinished`` (None, or how far a conversion is that will add to the store) and
-        ``unfinished_generation`` (None, or how many segments are there, of how many).
+        Among others ``segments``, ``agents`` (in all), ``checksum``, ``sources`` (segments of each), ``skipped`` (how
+        many; ``skipped_details`` says which, ``reasons`` counts like cases), ``exclusions`` (how many of these under
+        each of the paper's), ``problems`` (the reasons of the others), ``odd`` (what is unusual about how many of the
+        segments; ``odd_examples`` the first of each), ``groups`` (recordings the segments are of), ``overlaps``
+        (segments in whose log boxes overlap), ``joined_gaps`` (links between lanes that conversion has added, summed
+        over segments; see :mod:`symphony.data.joins`), ``unfinished`` (None, or how far a conversion is that will add
+        to the store) and ``unfinished_generation`` (None, or how many segments are there, of how many).
 
     Raises:
         DataError: not a segment store, or a damaged one.
@@ -338,7 +347,9 @@ def info(path: str | Path) -> dict[str, Any]:
         "reasons": report.reasons,
         "problems": report.problems,
         "odd": report.odd,
+        "odd_examples": report.odd_examples,
         "overlaps": report.overlaps,
+        "joined_gaps": report.joined_gaps,
         "groups": len(set(store.groups.tolist())),
         "skipped_details": [skip.to_json() for skip in report.skipped],
         "unfinished": _unfinished(store.path),

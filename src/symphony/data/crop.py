@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from itertools import pairwise
 from typing import Any
 
@@ -10,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from symphony.data.segment import Polylines, RoadMap, RunSegment, validate
+from symphony.data.subset import with_agents, with_lanes
 from symphony.errors import ConfigError
 
 MARGIN = 10.0
@@ -41,54 +43,24 @@ def crop(segment: RunSegment, radius: float) -> RunSegment:
     agents = close.any(axis=1)
     agents[segment.ego] = True
     road, lanes = _road(segment.road, near)
-    lights = lanes[segment.signal_lane]
-    return validate(
-        segment.replace(
-            ego=int(agents[: segment.ego].sum()),
-            **{
-                name: getattr(segment, name)[agents]
-                for name in ("agent_id", "agent_type", "size", "position", "heading", "velocity", "valid")
-            },
-            road=road,
-            signal_lane=_renumbered(segment.signal_lane[lights], lanes),
-            signal_point=segment.signal_point[lights],
-            signal_state=segment.signal_state[lights],
-            interest=_renumbered(segment.interest[agents[segment.interest]], agents),
-            predict=_renumbered(segment.predict[agents[segment.predict]], agents),
-        )
-    )
+    return validate(with_agents(with_lanes(segment.replace(road=road), lanes), agents))
 
 
 def _geometry(points: NDArray[Any]) -> Any:
     return shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
 
 
-def _renumbered(index: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Indices into what is kept, all of which are."""
-    return (np.cumsum(kept) - 1).astype(np.int32)[index]
-
-
 def _road(road: RoadMap, near: Any) -> tuple[RoadMap, NDArray[np.bool_]]:
-    """(the map, which lanes [L] are kept)."""
+    """(the map with boundary and marks cut, which of its lanes [L] are kept)."""
     shapes = [_geometry(road.lanes[k][:, :2].astype(np.float64)) for k in range(len(road.lanes))]
     kept = shapely.intersects(near, np.array(shapes, object))
     lanes = [shape.buffer(MARGIN) for shape, keep in zip(shapes, kept, strict=True) if keep]
     beside = shapely.union_all([near, *lanes])
     shapely.prepare(beside)
 
-    def links(pairs: NDArray[Any]) -> NDArray[np.int32]:
-        return _renumbered(pairs[kept[pairs].all(axis=1)], kept)
-
     marks = [_pieces(road.marks[k], beside) for k in range(len(road.marks))]
-    return RoadMap(
-        lanes=Polylines.of([road.lanes[k] for k in np.flatnonzero(kept).tolist()]),
-        lane_id=road.lane_id[kept],
-        lane_type=road.lane_type[kept],
-        speed_limit=road.speed_limit[kept],
-        lane_width=road.lane_width[kept],
-        successors=links(road.successors),
-        left_neighbors=links(road.left_neighbors),
-        right_neighbors=links(road.right_neighbors),
+    return dataclasses.replace(
+        road,
         boundary=Polylines.of(
             [p for k in range(len(road.boundary)) for p in _pieces(road.boundary[k], beside)]
         ),

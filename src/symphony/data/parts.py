@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from symphony.data import overlaps
+from symphony.data import joins, overlaps
 from symphony.data import resample as resampling
 from symphony.data.bounds import oddities
 from symphony.data.crop import crop
 from symphony.data.engine import Engine, ordered_map
+from symphony.data.odd import from_ego
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
@@ -33,7 +34,7 @@ PART_BYTES, PART_FILES = 8 << 20, 64
 """Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""
 PRESENT = "present"
 ODD = "odd"
-"""Tag of a segment with something unusual: the list of what it is."""
+"""Tag of a segment with something unusual: what it is -> an example (a list of what it is in older stores)."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ class Stored:
         return self.store.ids[self.index]
 
     @property
-    def overlaps(self) -> bool:
-        """Whether boxes overlap in its log."""
-        return overlaps.TAG in self.store.tags(self.index)
+    def tags(self) -> dict[str, Any]:
+        """What it is tagged with."""
+        return self.store.tags(self.index)
 
 
 Outcome = RunSegment | Stored | Skip | None
@@ -71,6 +72,7 @@ class Preparation:
         exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
         radius: metres around the ego's path that are kept (see :mod:`symphony.data.crop`); None for all.
         hold_lights: keep the state of lights where the log has none.
+        strict: leave out records of which something odd would be (see :mod:`symphony.data.odd`).
     """
 
     reader: Reader
@@ -81,13 +83,14 @@ class Preparation:
     exclude_overlaps: bool = False
     radius: float | None = None
     hold_lights: bool = False
+    strict: bool = False
 
     def outcomes(self, path: str) -> Iterator[Outcome]:
         """One for each record of a file, in its order."""
         before = frozenset[str]() if self.before is None else _ids(*self.before)
         for record in self.reader.read(path):
             if isinstance(record, DataError):
-                yield skip(record, path)
+                yield Skip.of(record, path)
             elif record.segment_id in before:
                 yield None
             else:
@@ -95,6 +98,12 @@ class Preparation:
 
     def _prepared(self, segment: RunSegment, path: str) -> RunSegment | Skip:
         try:
+            segment = from_ego(segment)
+            if self.strict and segment.odd:
+                kind, example = next(iter(segment.odd.items()))
+                raise DataError(f"{kind} ({example})", field="strict")
+            road, gaps = joins.joined(segment.road)
+            segment = segment.replace(road=road, joined_gaps=gaps)
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
             if self.hold_lights:
@@ -104,32 +113,24 @@ class Preparation:
                 segment = crop(segment, self.radius)
             excluded = exclusion(segment, self.interactive)
         except DataError as error:
-            return skip(error, path, segment.segment_id)
+            return Skip.of(error, path, segment.segment_id)
         except (OSError, ConfigError):  # the machine's fault or the caller's, not the record's
             raise
         except Exception as error:  # one bad record must not end a conversion
-            return skip(unexpected(error), path, segment.segment_id)
+            return Skip.of(unexpected(error), path, segment.segment_id)
         if excluded is not None:
-            return skip(excluded[1], path, segment.segment_id, excluded[0])
+            return Skip.of(excluded[1], path, segment.segment_id, excluded[0])
         if self.exclude_overlaps and (pairs := len(overlaps.overlapping(segment))):
             found = DataError(f"the boxes of {pairs} pairs of agents overlap in the log", field="agents")
-            return skip(found, path, segment.segment_id, overlaps.TAG)
+            return Skip.of(found, path, segment.segment_id, overlaps.TAG)
         return segment
 
 
 def tags_of(segment: RunSegment) -> dict[str, Any]:
-    """What a segment is tagged with that has something unusual, or in whose log boxes overlap."""
-    odd = oddities(segment)
-    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {})
-
-
-def skip(error: DataError, path: str, segment: str = "", exclusion: str = "") -> Skip:
-    """What the report says of a record that failed."""
-    found = Skip(error.message, path, error.segment or segment, error.field or "", exclusion)
-    # Half a character, as damaged text may hold, could not be written, and would end the conversion.
-    return Skip(
-        **{name: text.encode(errors="backslashreplace").decode() for name, text in vars(found).items()}
-    )
+    """What a segment is tagged with that has something unusual, boxes that overlap, or lanes that were joined."""
+    odd = {**segment.odd, **dict.fromkeys(oddities(segment), "")}
+    gaps = {joins.TAG: segment.joined_gaps} if segment.joined_gaps else {}
+    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {}) | gaps
 
 
 @functools.lru_cache(maxsize=1)
@@ -203,7 +204,7 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
         try:
             return writer.append(outcome, tags=tags_of(outcome) or None)
         except DataError as error:
-            outcome = skip(error, file, outcome.segment_id)
+            outcome = Skip.of(error, file, outcome.segment_id)
     return outcome.to_json() if isinstance(outcome, Skip) else PRESENT
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -38,20 +38,28 @@ class Skip:
         text = re.sub(r"-?\d+(\.\d+)?", "#", self.message)
         return f"{self.field}: {text}" if self.field else text
 
+    @classmethod
+    def of(cls, error: DataError, path: object = "", segment: str = "", exclusion: str = "") -> Skip:
+        """What a report says of an error."""
+        found = cls(error.message, str(path), error.segment or segment, error.field or "", exclusion)
+        # Half a character, as damaged text may hold, could not be written, and would end the conversion.
+        return cls(
+            **{name: text.encode(errors="backslashreplace").decode() for name, text in vars(found).items()}
+        )
+
     def to_json(self) -> dict[str, str]:
         """Without ``exclusion`` where there is none."""
         found = asdict(self)
         return found if self.exclusion else {k: v for k, v in found.items() if k != "exclusion"}
 
+    @property
+    def error(self) -> DataError:
+        """The error it was."""
+        places = {"file": self.file or None, "segment": self.segment or None, "field": self.field or None}
+        return DataError(self.message, **places)
+
     def __str__(self) -> str:
-        return str(
-            DataError(
-                self.message,
-                file=self.file or None,
-                segment=self.segment or None,
-                field=self.field or None,
-            )
-        )
+        return str(self.error)
 
 
 @dataclass
@@ -64,9 +72,11 @@ class Report:
         files: files read.
         skipped: what was left out, the paper's exclusions included.
         settings: arguments of the conversion.
-        odd: what is unusual, and about how many of the segments added.
+        odd: what is unusual or was left out, and about how many of the segments added.
+        odd_examples: the first of each.
         overlaps: segments added in whose log a moving vehicle's box overlaps another (see
             :mod:`symphony.data.overlaps`).
+        joined_gaps: links between lanes that were added, summed over the segments (see :mod:`symphony.data.joins`).
     """
 
     converted: int = 0
@@ -76,6 +86,14 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     odd: dict[str, int] = field(default_factory=dict)
     overlaps: int = 0
+    joined_gaps: int = 0
+    odd_examples: dict[str, str] = field(default_factory=dict)
+
+    def note(self, odd: Mapping[str, str] | list[str], segment: str) -> None:
+        """Count what is odd about a segment: kind -> example, or a list of kinds as older stores have them."""
+        for kind, example in (odd if isinstance(odd, Mapping) else dict.fromkeys(odd, "")).items():
+            self.odd[kind] = self.odd.get(kind, 0) + 1
+            self.odd_examples.setdefault(kind, f"{segment}: {example}" if example else segment)
 
     @property
     def warning(self) -> str:
@@ -121,6 +139,8 @@ class Report:
             "settings": dict,
             "odd": dict,
             "overlaps": int,
+            "joined_gaps": int,
+            "odd_examples": dict,
         }
         known = {key: value[key] for key in kinds if key in value}
         for key, found in known.items():
@@ -142,7 +162,19 @@ class Report:
             settings=self.settings,
             odd=dict(Counter(earlier.odd) + Counter(self.odd)),
             overlaps=earlier.overlaps + self.overlaps,
+            joined_gaps=earlier.joined_gaps + self.joined_gaps,
+            odd_examples={**self.odd_examples, **earlier.odd_examples},
         )
+
+
+def left_out(skipped: Iterable[Skip]) -> list[str]:
+    """A line for each reason: how often, why, and the first segment."""
+    first: dict[str, Skip] = {}
+    counts = Counter[str]()
+    for skip in skipped:
+        counts[skip.reason] += 1
+        first.setdefault(skip.reason, skip)
+    return [f"{count} x {reason} (first: {first[reason].segment})" for reason, count in counts.most_common()]
 
 
 def _text(value: Any) -> str:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_DT, MIN_DT, check_counts
-from symphony.data.segment import RunSegment, SignalState, validate
+from symphony.data.odd import noted
+from symphony.data.segment import Ints, RunSegment, SignalState, validate
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]
@@ -20,6 +21,14 @@ Doubles = NDArray[np.float64]
 MAX_SIGMA = 10.0
 """Seconds of smoothing; a window that is much longer leaves nothing of the motion."""
 BLOCK = 1_000_000
+
+EVEN = 0.1
+"""Share of a time step by which a frame may come early or late without being moved."""
+MAX_GAP = 1.0
+"""Seconds between two frames of a log that are filled in between; a longer gap stays open."""
+LOST = "frames lost in the recording, filled in between"
+UNEVEN = "frames at uneven times, brought to even ones"
+REPEATED = "frames left out: not after those before them"
 
 SLOW, FAST = 1.0, 2.0
 """m/s between which the heading goes over from the logged one to the direction of motion when smoothing."""
@@ -99,6 +108,55 @@ def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
     share[share < 1e-6] = 0
     # A moment that coincides with a logged step needs no second neighbour.
     after = np.where(share > 0, np.minimum(before + 1, last), before)
+    current = max(int(np.searchsorted(where, segment.current_step + 1e-6, side="right")) - 1, 0)
+    return _between(segment.replace(dt=dt, current_step=current), before, after, share)
+
+
+def evened(segment: RunSegment, times: Doubles) -> RunSegment:
+    """A segment whose steps were logged at uneven times, brought to steps of its ``dt`` from the first on.
+
+    Frames within a tenth of a step are taken as they are. What lies between two frames is interpolated as in
+    :func:`resample`; inside a gap of more than :data:`MAX_GAP` seconds nobody is seen. Frames that do not come after
+    those before them are left out. What was done is noted (see :mod:`symphony.data.odd`).
+
+    Args:
+        segment: not validated yet; its ``dt`` is the usual time between two frames.
+        times: [T] of its steps, in seconds.
+    """
+    dt = segment.dt
+    if (np.abs(np.diff(times) - dt) <= EVEN * dt).all():
+        return segment
+    frames = np.flatnonzero(np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0)
+    logged = times[frames]
+    steps = int(np.floor((logged[-1] - logged[0]) / dt + EVEN)) + 1
+    check_counts(segment.num_agents, steps, "valid")
+    where = logged[0] + dt * np.arange(steps)
+    last = np.clip(np.searchsorted(logged, where + EVEN * dt, side="right") - 1, 0, None)
+    near = where - logged[last] <= EVEN * dt
+    following = np.where(near, last, np.minimum(last + 1, len(logged) - 1))
+    gap = logged[following] - logged[last]
+    share = np.where(near, 0.0, (where - logged[last]) / np.where(near, 1.0, gap))
+    current = max(int(np.searchsorted(where, times[segment.current_step] + EVEN * dt, side="right")) - 1, 0)
+    found = _between(segment.replace(current_step=current), frames[last], frames[following], share)
+    found.valid[:, gap > MAX_GAP] = False
+    found.signal_state[:, gap > MAX_GAP] = SignalState.UNKNOWN
+    lost, uneven = gap > 1.5 * dt, (gap > 0) & (gap <= 1.5 * dt)
+    kinds = (
+        (LOST, int(lost.sum()), steps),
+        (UNEVEN, int(uneven.sum()), steps),
+        (REPEATED, len(times) - len(frames), len(times)),
+    )
+    return noted(_cleared(found), {kind: f"{count} of {of}" for kind, count, of in kinds if count})
+
+
+def _cleared(segment: RunSegment) -> RunSegment:
+    """The same with 0 for all states that are not valid."""
+    masked = {n: _masked(getattr(segment, n), segment.valid) for n in ("position", "heading", "velocity")}
+    return segment.replace(**masked)
+
+
+def _between(segment: RunSegment, before: Ints, after: Ints, share: Doubles) -> RunSegment:
+    """States and lights at moments [U] between two steps each; an agent is valid where it is at both."""
     valid = segment.valid[:, before] & segment.valid[:, after]
 
     def between(array: NDArray[Any]) -> Doubles:
@@ -109,13 +167,11 @@ def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
     heading = segment.heading.astype(np.float64)
     turn = wrap(heading[:, after] - heading[:, before])
     return segment.replace(
-        dt=dt,
         position=_masked(between(segment.position), valid),
         heading=_masked(heading[:, before] + share * turn, valid),
         velocity=_masked(between(segment.velocity), valid),
         valid=valid,
         signal_state=segment.signal_state[:, before],
-        current_step=max(int(np.searchsorted(where, segment.current_step + 1e-6, side="right")) - 1, 0),
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -164,6 +164,10 @@ class RunSegment:
         file: name of the file it was read from, without folder.
         group: the recording it is part of. Segments of one recording share it, may overlap in time and are no
             independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
+        joined_gaps: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it
+            as a tag. No part of the content hash.
+        odd: what is unusual, or was left out of the record (see :mod:`symphony.data.odd`): kind -> example. Kept and
+            hashed likewise.
     """
 
     segment_id: str
@@ -187,6 +191,8 @@ class RunSegment:
     predict: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     file: str = ""
     group: str = field(default="", metadata={"hashed": False})
+    joined_gaps: int = field(default=0, metadata={"hashed": False})
+    odd: Mapping[str, str] = field(default_factory=dict, metadata={"hashed": False})
 
     @property
     def num_agents(self) -> int:

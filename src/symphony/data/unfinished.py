@@ -30,6 +30,8 @@ from symphony.files import locating
 
 FORMAT, VERSION = "symphony conversion", 1
 JOURNAL, STORE, PARTS = "journal.jsonl", "store", "parts"
+_LATER = ("overlaps", "joined_gaps")
+"""Counts that older journals do not have."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ class Draft:
         """Put on record that ``report.files`` files are done; this survives whatever comes."""
         writer.sync()
         skipped = [skip.to_json() for skip in report.skipped[self._told :]]
-        names = ("files", "converted", "present", "odd", "overlaps")
+        names = ("files", "converted", "present", "odd", "odd_examples", *_LATER)
         counts = {name: getattr(report, name) for name in names}
         self._write(counts | {"segments": len(writer), "skipped": skipped})
         self._told = len(report.skipped)
@@ -268,12 +270,13 @@ def read_journal(folder: Path) -> Begun | None:
             if "finished" in line:
                 finished = True
                 continue
-            names = ("files", "converted", "present", "segments", "overlaps")
-            counts = [line.get(name, 0) if name == "overlaps" else line[name] for name in names]
+            names = ("files", "converted", "present", "segments")
+            counts = [line[name] for name in names] + [line.get(name, 0) for name in _LATER]
             if not all(type(count) is int and count >= 0 for count in counts) or counts[0] > len(job.files):
                 raise ValueError(f"{counts} are no counts of {len(job.files)} files")
-            report.files, report.converted, report.present, segments, report.overlaps = counts
-            report.odd = dict(line.get("odd", {}))
+            report.files, report.converted, report.present, segments, *later = counts
+            report.overlaps, report.joined_gaps = later
+            report.odd, report.odd_examples = (dict(line.get(n, {})) for n in ("odd", "odd_examples"))
             report.skipped += [Skip(**skip) for skip in line["skipped"]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(f"not the journal of a conversion: {error}", file=path) from error

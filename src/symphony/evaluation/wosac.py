@@ -15,6 +15,7 @@ import numpy as np
 
 from symphony.agents import Agent, load_agent
 from symphony.config import WosacSettings
+from symphony.data.report import Skip
 from symphony.data.rollouts import RolloutArrays
 from symphony.data.segment import RunSegment
 from symphony.data.sources.wosac import DT
@@ -26,7 +27,7 @@ from symphony.evaluation.paired import clustered_mean
 from symphony.evaluation.passing import PassingGaps, order_of, passing_gaps, passing_pairs
 from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wosac_window
 from symphony.metrics import OrderStatistics
-from symphony.metrics.wosac import CHALLENGES, SimulatedRollouts, WosacScores, score
+from symphony.metrics.wosac import CHALLENGES, SimulatedRollouts, WosacScores, check_scored, score
 from symphony.simulation.driving import search_kind
 from symphony.simulation.workers import shared
 from symphony.simulation.wosac import constant_velocity, wosac_rollouts
@@ -68,9 +69,10 @@ class WosacEvaluation:
         agent: its name.
         how: what decides the rollouts, see :func:`simulated_how`.
         data: name and checksum of the store.
-        segments: ids of the run segments.
+        segments: ids of the run segments that were scored.
         groups: [K] the recording of each.
         results: by agent.
+        left_out: run segments that can't be scored, and why.
     """
 
     config: str
@@ -80,6 +82,7 @@ class WosacEvaluation:
     segments: list[str]
     groups: list[str]
     results: dict[str, WosacResult]
+    left_out: list[Skip] = field(default_factory=list)
 
     def numbers(self, agent: str) -> dict[str, tuple[float, float]]:
         """Mean of every number over run segments, and its standard error over recordings (NaN for a single one)."""
@@ -111,6 +114,7 @@ class WosacEvaluation:
             "data": self.data,
             "recordings": len(set(self.groups)),
             "agents": agents,
+            "left_out": [skip.to_json() for skip in self.left_out],
         }
 
 
@@ -170,6 +174,7 @@ def evaluate_wosac(
     progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     baselines: bool = True,
+    strict: bool = False,
 ) -> WosacEvaluation:
     """Score an agent on run segments of a store, and beside it :data:`WOSAC_BASELINES`.
 
@@ -184,10 +189,12 @@ def evaluate_wosac(
         config: year of the challenge.
         progress: called with the segments done and their total.
         baselines: with them.
+        strict: a run segment that can't be scored (too short, without road edges, vehicles or a future) is an error
+            instead of being left out.
 
     Raises:
         ConfigError: no such year, or the agent can't be simulated so.
-        DataError: the store is empty, or a segment can't be scored; names it.
+        DataError: the store is empty, or no segment can be scored; names the first.
         NotFiniteError: a network of the agent puts out a number that is not finite.
     """
     if config not in CHALLENGES:
@@ -200,22 +207,46 @@ def evaluate_wosac(
     thinned = _thinned(agent, store, items, settings.future) if baselines else 1
     names = [one.name for one in everyone] + [THINNED] * (thinned > 1)
     results = dict.fromkeys(sorted(names, key=_place), WosacResult())
-    scorer, groups = _SegmentScorer(everyone, store, settings, config, thinned), []
+    scorer = _SegmentScorer(everyone, store, settings, config, thinned, strict)
+    scored: list[tuple[int, str]] = []
+    left_out: list[Skip] = []
     tasks = [[item] for item in items]
-    with closing(shared(scorer, tasks, settings.config(1, 0))) as found:
-        for done, (group, parts) in enumerate(found, 1):
-            groups.append(group)
-            results = {name: result.joined(parts[name]) for name, result in results.items()}
+    with closing(shared(scorer, tasks, settings.config(1, 0))) as outcomes:
+        for done, (item, found) in enumerate(zip(items, outcomes, strict=True), 1):
+            if isinstance(found, Skip):
+                left_out.append(found)
+            else:
+                scored.append((item, found[0]))
+                results = {name: result.joined(found[1][name]) for name, result in results.items()}
             progress(done, len(items))
+    if not scored:
+        raise left_out[0].error
     return WosacEvaluation(
         config=config,
         agent=agent.name,
         how=how,
         data={"name": store.path.resolve().name, "checksum": store.checksum()},
-        segments=[store.ids[item] for item in items],
-        groups=groups,
+        segments=[store.ids[item] for item, _ in scored],
+        groups=[group for _, group in scored],
         results=results,
+        left_out=left_out,
     )
+
+
+def scorable(store: SegmentStore, items: Sequence[int], future: int = FUTURE) -> None:
+    """See that some run segment can be scored.
+
+    Raises:
+        DataError: none can; names the first.
+    """
+    first: DataError | None = None
+    for item in items:
+        try:
+            return check_scored(wosac_scenario(store[item], future))
+        except DataError as error:
+            first = first or error
+    if first is not None:
+        raise first
 
 
 def _place(name: str) -> int:
@@ -241,12 +272,19 @@ class _SegmentScorer:
     settings: WosacSettings
     config: str
     thinned: int
+    strict: bool
 
-    def __call__(self, items: list[int]) -> tuple[str, dict[str, WosacResult]]:
-        """The recording, and what was found of each agent."""
+    def __call__(self, items: list[int]) -> tuple[str, dict[str, WosacResult]] | Skip:
+        """The recording, and what was found of each agent; or why there is nothing."""
         segment = self.store[items[0]]
         future = self.settings.future
-        window, scenario = wosac_window(segment, future), wosac_scenario(segment, future)
+        try:
+            window, scenario = wosac_window(segment, future), wosac_scenario(segment, future)
+            check_scored(scenario, CHALLENGES[self.config])
+        except DataError as error:
+            if self.strict:
+                raise
+            return Skip.of(error, segment.file, segment.segment_id)
         pairs = passing_pairs(window)
         found = {}
         for name, make in self._makers(window).items():

@@ -31,7 +31,11 @@ _NUMBER = re.compile(r"[0-9]{1,9}")
 _LINES = ("lanes", "boundary", "marks")
 _ROAD = tuple(item.name for item in fields(RoadMap) if item.name not in _LINES)
 _SCALARS = ("segment_id", "source", "dt", "ego", "current_step", "file", "group")
-_LOG = tuple(item.name for item in fields(RunSegment) if item.name not in (*_SCALARS, "road"))
+_LOG = tuple(
+    item.name
+    for item in fields(RunSegment)
+    if item.name not in (*_SCALARS, "road") and item.metadata.get("hashed", True)
+)
 _TREE = tuple(item.name for item in fields(SavedTrees) if item.name != "prune_every")
 
 # Shapes by letter: K rollouts, N driven agents, T steps, U = T + 1; R trees, S branches, P periods, L leaves.

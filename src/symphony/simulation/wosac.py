@@ -85,6 +85,29 @@ def constant_velocity(segment: RunSegment, future: int = FUTURE) -> RolloutArray
     return _arrays(segment, rows, _repeated(_extrapolated(segment, rows, future)))
 
 
+def with_the_rest(found: RolloutArrays, segment: RunSegment) -> RolloutArrays:
+    """Rollouts with those of the agents that were left out of them as odd: a submission must hold everyone.
+
+    Args:
+        found: rollouts of some agents.
+        segment: all agents; the others go on at their velocity.
+
+    Raises:
+        DataError: a state of theirs at the current step is not finite.
+    """
+    now = segment.current_step
+    rest = np.asarray(segment.valid[:, now] & ~np.isin(segment.agent_id, found.object_id))
+    if not rest.any():
+        return found
+    logged = [getattr(segment, name)[rest, now] for name in ("position", "heading", "velocity")]
+    if not all(np.isfinite(values).all() for values in logged):
+        raise DataError("not finite at the current step", segment=segment.segment_id, field="tracks.states")
+    alone = segment.replace(valid=segment.valid & rest[:, None])
+    more = constant_velocity(alone, found.x.shape[-1])
+    joined = {n: np.concatenate([getattr(found, n), getattr(more, n)], 1) for n in ("x", "y", "z", "heading")}
+    return RolloutArrays(np.concatenate([found.object_id, more.object_id]), **joined)
+
+
 def _repeated(states: Doubles) -> Doubles:
     return np.repeat(states[None], ROLLOUTS, 0)
 

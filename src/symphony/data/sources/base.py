@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -12,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_FILE
+from symphony.data.odd import mended
+from symphony.data.resample import EVEN
 from symphony.data.segment import Floats, RunSegment, validate
 from symphony.errors import DataError
 
@@ -71,15 +74,26 @@ class Reader(ABC):
         if isinstance(item, DataError):
             return item.at(file=path)
         try:
-            return validate(item if item.group else item.replace(group=item.segment_id))
-        except DataError as error:
-            return DataError(error.message, file=path, segment=error.segment, field=error.field)
+            item = item if item.group else item.replace(group=item.segment_id)
+            try:
+                return validate(item)
+            except DataError as error:
+                return _mended(item) or DataError(
+                    error.message, file=path, segment=error.segment, field=error.field
+                )
         except Exception as error:  # arrays of other kinds than a segment has
             return unexpected(error, file=path, segment=item.segment_id)
 
     @abstractmethod
     def _read(self, path: Path) -> Iterator[Item]:
         """Yield the records, not validated yet; may raise :class:`DataError` where it can't read on."""
+
+
+def _mended(segment: RunSegment) -> RunSegment | None:
+    """What is left of a segment that breaks the schema, if that is one (see :func:`symphony.data.odd.mended`)."""
+    with contextlib.suppress(DataError, IndexError, ValueError, TypeError):
+        return validate(mended(segment))
+    return None
 
 
 def unexpected(error: Exception, *, file: object = None, segment: str | None = None) -> UnexpectedError:
@@ -132,15 +146,22 @@ def pairs(links: list[tuple[int, int]]) -> NDArray[np.int32]:
 def time_step(times: NDArray[np.float64], field: str) -> float:
     """Seconds between steps that begin at ``times`` [T], T at least 2; to the millisecond where that fits the log.
 
-    At 15 or 30 Hz it does not: with rounded steps a log would run up to a percent too fast or slow.
+    At 15 or 30 Hz it does not: with rounded steps a log would run up to a percent too fast or slow. Where steps are
+    off by more than a tenth it is the usual one, to which :func:`symphony.data.resample.evened` brings the log.
 
     Raises:
-        DataError: a step is off by more than a tenth, or is no number; names ``field``.
+        DataError: more than a third of the steps are no such ones, or half of them are missing; names ``field``.
     """
     gaps = np.diff(times)
     mean = float(gaps.mean())
     dt = round(mean, 3)
     dt = dt if abs(dt - mean) <= 1e-3 * mean else mean
-    if not (dt > 0 and (np.abs(gaps - dt) <= 0.1 * dt).all()):
+    if dt > 0 and (np.abs(gaps - dt) <= EVEN * dt).all():
+        return dt
+    usual = float(np.median(gaps))
+    steps = np.rint(gaps / usual) if usual > 0 else gaps
+    even = (steps == 1) & (np.abs(gaps - usual) <= 0.5 * usual)
+    if not (usual > 0 and 0 < steps.sum() <= 2 * len(gaps) and even.mean() >= 2 / 3):
         raise DataError(f"steps of {gaps.min():g} to {gaps.max():g} s are uneven", field=field)
-    return dt
+    mean = float((times[-1] - times[0]) / steps.sum())
+    return round(mean, 3) if abs(round(mean, 3) - mean) <= 1e-2 * mean else mean

@@ -26,9 +26,10 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -36,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.bounds import check_counts
+from symphony.data.resample import MAX_GAP, evened
 from symphony.data.segment import Bools, RoadMap, RunSegment
 from symphony.data.sources.base import Item, Reader, to_float32
 from symphony.data.sources.egos import busiest_first
@@ -51,7 +53,7 @@ from symphony.data.sources.interaction_tracks import (
     merged,
     read_rows,
     resolved,
-    time_step,
+    stepped,
 )
 from symphony.data.sources.lanelet2 import Projection, read_lanelet2
 from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, stop_line, successors
@@ -68,14 +70,16 @@ MAX_STEPS = 360_000
 
 @dataclass(frozen=True)
 class Scene:
-    """What the windows of one file share."""
+    """What the windows of one file share; ``start`` is the time of step 0 in milliseconds."""
 
     name: str
     file: str
-    dt_ms: int
+    dt: float
+    start: float
     road: RoadMap
     lights: Lights
     origin: Doubles
+    odd: Mapping[str, str]
 
 
 class InteractionReader(Reader):
@@ -133,38 +137,38 @@ class InteractionReader(Reader):
         files = find_files(path)
         if files.walkers is not None:
             rows = joined(rows, read_rows(files.walkers))
-        dt_ms = time_step(rows)
+        rows, dt, start = stepped(rows)
         if self.motion == "positions":
             rows = merged(rows)
         else:
-            check_motion(rows, dt_ms)
+            check_motion(rows, dt, start)
         # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
         with np.errstate(over="ignore", invalid="ignore"):
-            known = resolved(rows, by_positions=self.motion == "positions")
-            yield from self._segments(known, _scene(files, rows, dt_ms), files)
+            known = resolved(rows, dt, by_positions=self.motion == "positions")
+            yield from self._segments(known, _scene(files, rows, dt, start), files)
 
     def _segments(self, rows: Rows, scene: Scene, files: Files) -> Iterator[Item]:
         cases = np.unique(rows.case)
         for case in cases:
             mine = rows.take(slice(*np.searchsorted(rows.case, [case, case + 1])))
             first = int(mine.time[0])
-            steps = int(mine.time[-1] - first) // scene.dt_ms + 1
+            steps = int(mine.time[-1]) - first + 1
             if steps > MAX_STEPS:
                 raise DataError(f"{steps} steps, at most {MAX_STEPS} can be read", field="timestamp_ms")
             single = files.tracks.name.startswith("vehicle_tracks_")
-            for start, stop in self._windows(steps, scene.dt_ms) if single else [(0, steps)]:
-                begin, end = (first + step * scene.dt_ms for step in (start, stop))
-                part = mine.take(slice(*np.searchsorted(mine.time, [begin, end])))
-                what = f"t{start * scene.dt_ms / 1000:g}" if single else f"case{case}"
+            for start, stop in self._windows(steps, scene.dt) if single else [(0, steps)]:
+                begin = first + start
+                part = mine.take(slice(*np.searchsorted(mine.time, [begin, first + stop])))
+                what = f"t{round(start * scene.dt, 3):g}" if single else f"case{case}"
                 name = f"{scene.name}_{files.part}_{what}"
                 try:
                     yield from self._window(part, scene, name, begin, stop - start, 0 if single else HISTORY)
                 except DataError as error:
                     yield error.at(segment=name)
 
-    def _windows(self, steps: int, dt_ms: int) -> list[tuple[int, int]]:
+    def _windows(self, steps: int, dt: float) -> list[tuple[int, int]]:
         """First step and the one after the last of each window."""
-        length, stride = (max(round(1000 * s / dt_ms), 1) for s in (self.window, self.stride))
+        length, stride = (max(round(s / dt), 1) for s in (self.window, self.stride))
         found = []
         for start in range(0, max(steps - 1, 1), stride):
             stop = min(start + length + 1, steps)
@@ -186,44 +190,56 @@ class InteractionReader(Reader):
             raise DataError(f"track {wrong} has more than one", field="agent_type")
         state = np.zeros((len(ids), steps, 5))
         valid = np.zeros((len(ids), steps), np.bool_)
-        step = (rows.time - begin) // scene.dt_ms
+        step = rows.time - begin
         state[row, step], valid[row, step] = rows.state[:, :5], True
         state[valid, :2] -= scene.origin
         if self.motion == "positions":
-            state = from_positions(state, valid, scene.dt_ms / 1000)
+            state = from_positions(state, valid, scene.dt)
         state = headings(state, valid)
-        candidates = busiest_first(ids, kind.astype(np.uint8), state[..., :2], valid)
+        there = np.flatnonzero(~_lost(valid, scene.dt))
+        candidates = busiest_first(ids, kind.astype(np.uint8), state[:, there, :2], valid[:, there])
         if not len(candidates):
             raise DataError("no moving vehicle is observed at every step", field="track_id")
-        times = begin + np.arange(steps) * scene.dt_ms
+        times = np.rint(scene.start + 1000 * scene.dt * (begin + there)).astype(np.int64)
         segment = RunSegment(
             segment_id=name,
             source=self.name,
-            dt=scene.dt_ms / 1000,
+            dt=scene.dt,
             ego=int(candidates[0]),
             agent_id=ids,
             agent_type=kind.astype(np.uint8),
             size=_sizes(rows, row, kind),
-            position=to_float32(np.pad(state[..., :2], ((0, 0), (0, 0), (0, 1)))),
-            heading=to_float32(state[..., 4]),
-            velocity=to_float32(state[..., 2:4]),
-            valid=valid,
+            position=to_float32(np.pad(state[:, there, :2], ((0, 0), (0, 0), (0, 1)))),
+            heading=to_float32(state[:, there, 4]),
+            velocity=to_float32(state[:, there, 2:4]),
+            valid=valid[:, there],
             road=scene.road,
             signal_lane=scene.lights.lane,
             signal_point=to_float32(np.pad(scene.lights.point - scene.origin, ((0, 0), (0, 1)))),
             signal_state=scene.lights.at(times),
             origin=np.array([*scene.origin, 0.0]),
-            current_step=min(current, steps - 1),
+            current_step=min(int(np.searchsorted(there, current)), len(there) - 1),
             predict=_marked(rows.marks[:, 0], row),
             interest=_marked(rows.marks[:, 1], row),
             file=scene.file,
             group=name.rpartition("_")[0],
+            odd=scene.odd,
         )
+        segment = evened(segment, there.astype(np.float64) * scene.dt)
         if self.egos == "one":
             yield segment
             return
         for ego in sorted(candidates.tolist()):
             yield segment.replace(ego=ego, segment_id=f"{name}_ego{ids[ego]}")
+
+
+def _lost(valid: Bools, dt: float) -> Bools:
+    """[T] steps at which a recording lost the frame: nobody is seen for at most :data:`.resample.MAX_GAP`."""
+    there = np.flatnonzero(valid.any(axis=0))
+    lost = np.zeros(valid.shape[1], np.bool_)
+    for before, after in pairwise(there.tolist()):
+        lost[before + 1 : after] = (after - before) * dt <= MAX_GAP
+    return lost
 
 
 def _marked(mark: Bools, row: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -240,7 +256,7 @@ def _sizes(rows: Rows, row: NDArray[np.int64], kind: NDArray[np.int64]) -> NDArr
     return to_float32(size)
 
 
-def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
+def _scene(files: Files, rows: Rows, dt: float, start: float) -> Scene:
     projection: Projection = partial(utm, origin=np.zeros(2))
     has_phases = files.phases is not None
     if files.meta is not None:
@@ -258,7 +274,7 @@ def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
         if files.phases is None or files.topology is None:
             raise DataError("its signal phases, or the one *_map.kml that goes with them, are missing")
         lines = [center(lane) for lane in lanes]
-        until = int(rows.time.max())
+        until = int(start + 1000 * dt * rows.time.max())
         lights = read_lights(
             files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection, until
         )
@@ -274,4 +290,4 @@ def _scene(files: Files, rows: Rows, dt_ms: int) -> Scene:
     if float(np.median(away)) > FAR:
         message = f"the tracks are {np.median(away):.0f} m away from the map: another origin or projection"
         raise DataError(message, field="x, y")
-    return Scene(files.scene, files.tracks.name, dt_ms, road, lights, origin)
+    return Scene(files.scene, files.tracks.name, dt, start, road, lights, origin, source.odd)

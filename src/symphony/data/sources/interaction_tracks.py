@@ -6,12 +6,12 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.resample import wrap
+from symphony.data.resample import EVEN, wrap
 from symphony.data.segment import AgentType, Bools
 from symphony.data.sources.lines import Doubles
 from symphony.errors import DataError
@@ -45,7 +45,7 @@ class Rows:
 
     Attributes:
         case: [N] number of the case the row belongs to; 0 throughout where the file is one recording.
-        time: [N] milliseconds.
+        time: [N] milliseconds, and after :func:`stepped` the number of the step.
         track: [N] id; that of a track named ``P7`` is -8, that of track 7 is 7.
         kind: [N] :class:`AgentType`, UNSET for ``pedestrian/bicycle``.
         state: [N, 7] x, y, vx, vy, heading, length, width; NaN where not given.
@@ -53,7 +53,7 @@ class Rows:
     """
 
     case: NDArray[np.int64]
-    time: NDArray[np.int64]
+    time: NDArray[Any]
     track: NDArray[np.int64]
     kind: NDArray[np.int64]
     state: Doubles
@@ -149,7 +149,7 @@ def _rows(names: list[str], lines: list[list[str]], first: int) -> Rows:
     case = columns.get("case_id")
     return Rows(
         case=np.zeros(count, np.int64) if case is None else _whole(case, "case_id", first),
-        time=_whole(columns["timestamp_ms"], "timestamp_ms", first),
+        time=_times(columns["timestamp_ms"], "timestamp_ms", first),
         track=_mapped(columns["track_id"], _track_id, "track_id", first),
         kind=_mapped(columns["agent_type"], lambda t: _TYPES[t.strip().lower()], "agent_type", first),
         state=np.stack(state, axis=-1),
@@ -179,13 +179,19 @@ def _number(text: str, name: str, line: int) -> float:
         raise DataError(f"{text[:40]!r} is not a number", field=f"line {line}: {name}") from None
 
 
-def _whole(texts: tuple[str, ...], name: str, first: int) -> NDArray[np.int64]:
+def _times(texts: tuple[str, ...], name: str, first: int, what: str = "a time") -> Doubles:
     values = np.array([_number(text, name, first + k) for k, text in enumerate(texts)])
-    wrong = ~((np.abs(values) < 2**53) & (values == np.round(values)))
+    wrong = ~(np.abs(values) < 2**53)
+    if what != "a time":
+        wrong |= values != np.round(values)
     if wrong.any():
         k = int(np.argmax(wrong))
-        raise DataError(f"{texts[k][:40]!r} is not a whole number", field=f"line {first + k}: {name}")
-    return values.astype(np.int64)
+        raise DataError(f"{texts[k][:40]!r} is not {what}", field=f"line {first + k}: {name}")
+    return values
+
+
+def _whole(texts: tuple[str, ...], name: str, first: int) -> NDArray[np.int64]:
+    return _times(texts, name, first, "a whole number").astype(np.int64)
 
 
 def _flags(texts: tuple[str, ...] | None, count: int, name: str, first: int) -> Bools:
@@ -212,41 +218,58 @@ def _track_id(text: str) -> int:
     return -1 - int(digits) if text.startswith("P") else int(digits)
 
 
-def time_step(rows: Rows) -> int:
-    """Milliseconds between the steps of a recording, which all times must be whole multiples of.
+def stepped(rows: Rows) -> tuple[Rows, float, float]:
+    """(rows with numbers of steps for times, seconds per step, milliseconds at step 0) of a recording.
+
+    Times may be rounded to milliseconds, so that the steps of 30 Hz look uneven, and frames may be missing.
 
     Raises:
-        DataError: there are fewer than two times, or they are uneven.
+        DataError: there are fewer than two times, or they are no multiples of one step.
     """
-    times = np.unique(rows.time)
+    times, which = np.unique(rows.time, return_inverse=True)
     if len(times) < 2:
         raise DataError("fewer than two steps", field="timestamp_ms")
-    step = int(np.median(np.diff(times)))
-    off = (times - times[0]) % step if step else times
-    if not 0 < step <= MAX_GAP_MS or off.any():
-        raise DataError(f"times are no multiples of their usual step of {step} ms", field="timestamp_ms")
-    return step
+    gaps = np.diff(times)
+    usual = float(np.median(gaps))
+    # Gap by gap, so that the error of the usual step does not add up over the recording.
+    count = float(np.rint(gaps / usual).sum())
+    mean = float(times[-1] - times[0]) / max(count, 1)
+    fitting = (
+        c for c in (float(np.rint(mean)), 1000 / max(np.rint(1000 / mean), 1)) if abs(c - mean) * count <= 1.5
+    )
+    step = next(fitting, mean)
+    number = np.rint((times - times[0]) / step).astype(np.int64)
+    off = np.abs(times - times[0] - number * step) > EVEN * step + 1
+    if not usual <= MAX_GAP_MS or off.any() or (np.diff(number) < 1).any():
+        raise DataError(f"times are no multiples of their usual step of {usual:g} ms", field="timestamp_ms")
+    return replace(rows, time=number[which]), step / 1000, float(times[0])
 
 
-def check_motion(rows: Rows, dt_ms: int) -> None:
+def check_motion(rows: Rows, dt: float, start: float = 0.0) -> None:
     """See that velocities and headings of vehicles that move are those of their positions.
 
     Compared over a second: medians over all vehicles, so that single wild tracks do not count.
+
+    Args:
+        rows: of :func:`stepped`.
+        dt: seconds per step.
+        start: milliseconds at step 0.
 
     Raises:
         DataError: they are not, or a track has two states at one time.
     """
     twice = _twice(rows)
     if len(twice):
-        at = f"track {rows.track[twice[0]]} has two states at {rows.time[twice[0]]} ms"
+        time = start + 1000 * dt * rows.time[twice[0]]
+        at = f"track {rows.track[twice[0]]} has two states at {time:.0f} ms"
         raise DataError(f"{at}, and {len(twice)} times so in all{_HINT}", field="timestamp_ms")
     by_track = rows.take(np.lexsort((rows.time, rows.track, rows.case)))
-    lag = max(1, round(1000 / dt_ms))
+    lag = max(1, round(1 / dt))
     one, two = by_track.take(slice(None, -lag)), by_track.take(slice(lag, None))
-    both = (one.track == two.track) & (one.case == two.case) & (two.time - one.time == lag * dt_ms)
+    both = (one.track == two.track) & (one.case == two.case) & (two.time - one.time == lag)
     both &= (one.kind == AgentType.VEHICLE) & (two.kind == AgentType.VEHICLE)
     one, two = one.take(np.flatnonzero(both)), two.take(np.flatnonzero(both))
-    covered = (two.state[:, :2] - one.state[:, :2]) / (lag * dt_ms / 1000)
+    covered = (two.state[:, :2] - one.state[:, :2]) / (lag * dt)
     logged = (one.state[:, 2:4] + two.state[:, 2:4]) / 2
     fast = np.hypot(*covered.T) > _MOVING
     if fast.sum() < _ENOUGH:
@@ -284,29 +307,30 @@ def merged(rows: Rows) -> Rows:
     return replace(found, state=np.concatenate([mean, found.state[:, 4:]], axis=1))
 
 
-def _speeds(rows: Rows) -> Doubles:
+def _speeds(rows: Rows, dt: float) -> Doubles:
     """[N] m/s to the next state of the same track, at its last from the one before; 0 for a single one."""
     order = np.lexsort((rows.time, rows.track, rows.case))
     case, track, time = rows.case[order], rows.track[order], rows.time[order]
     same = (case[1:] == case[:-1]) & (track[1:] == track[:-1])
     step = np.hypot(*np.diff(rows.state[order, :2], axis=0).T)
-    speed = np.where(same, step / np.where(same, np.diff(time) / 1000, 1.0), np.nan)
+    speed = np.where(same, step / np.where(same, np.diff(time) * dt, 1.0), np.nan)
     ahead, behind = np.append(speed, np.nan), np.append(np.nan, speed)
     found = np.zeros(len(rows))
     found[order] = np.nan_to_num(np.where(np.isnan(ahead), behind, ahead))
     return found
 
 
-def resolved(rows: Rows, *, by_positions: bool = False) -> Rows:
+def resolved(rows: Rows, dt: float, *, by_positions: bool = False) -> Rows:
     """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists.
 
     Args:
-        rows: ordered.
+        rows: of :func:`stepped`.
+        dt: seconds per step.
         by_positions: take speeds from the positions, not from the velocities.
     """
     kind = rows.kind.copy()
     unknown = np.flatnonzero(kind == AgentType.UNSET)
-    speed = _speeds(rows) if by_positions else np.hypot(rows.state[:, 2], rows.state[:, 3])
+    speed = _speeds(rows, dt) if by_positions else np.hypot(rows.state[:, 2], rows.state[:, 3])
     keys = np.stack([rows.case[unknown], rows.track[unknown]])
     for case, track in np.unique(keys, axis=1).T:
         mine = unknown[(keys[0] == case) & (keys[1] == track)]

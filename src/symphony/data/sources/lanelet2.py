@@ -14,9 +14,10 @@ What is read, and what is not:
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +32,12 @@ _DRIVABLE = frozenset(
     {"road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"}
 )
 """Subtypes of areas on which vehicles may be."""
+
+NO_NODE = "a node left out that the map lacks"
+NO_LANELET = "a lanelet left out that can't be read"
+NO_AREA = "an area left out that can't be read"
+
+T = TypeVar("T")
 
 Projection = Callable[[Doubles], Doubles]
 """[N, 2] latitude and longitude in degrees to metres."""
@@ -116,12 +123,16 @@ class Area:
 
 @dataclass(frozen=True)
 class LaneletMap:
-    """Everything read from a file, in metres; lanelets, ways and areas in file order."""
+    """Everything read from a file, in metres; lanelets, ways and areas in file order.
+
+    ``odd`` says what was left out, as a map that was cut out of a larger one lacks some of it: kind -> example.
+    """
 
     lanelets: tuple[Lanelet, ...]
     ways: dict[int, Way]
     rules: dict[int, Rule]
     areas: tuple[Area, ...] = ()
+    odd: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
@@ -132,25 +143,29 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
         projection: for files without metres, such as ``partial(utm, origin=...)``.
 
     Raises:
-        DataError: it is no OSM XML, declares a document type, has no lanelets, or one can't be read; names the
-            file and the element.
+        DataError: it is no OSM XML, declares a document type, an element can't be read, or it has no lanelets with
+            both bounds; names the file and the element.
     """
     try:
         root = load_xml(path, "OSM")
         if root.tag != "osm":
             raise DataError(f"not an OSM file: its root is <{root.tag[:40]}>", field="osm")
-        ways = _ways(root, projection)
+        odd: dict[str, str] = {}
+        ways = _ways(root, projection, odd)
         relations = [(node, _tags(node)) for node in _living(root, "relation")]
         rules = [_rule(n, tags, ways) for n, tags in relations if tags.get("type") == "regulatory_element"]
-        lanelets = tuple(_lanelet(n, tags, ways) for n, tags in relations if tags.get("type") == "lanelet")
+        wanted = [(n, tags) for n, tags in relations if tags.get("type") == "lanelet"]
+        lanelets = tuple(_all_but(_lanelet, wanted, ways, NO_LANELET, odd))
         if not lanelets:
-            raise DataError("has no lanelets", field="relation")
-        areas = tuple(
-            _area(n, tags, ways)
+            missing = f": {odd[NO_LANELET]}" if NO_LANELET in odd else ""
+            raise DataError(f"has no lanelets{missing}", field="relation")
+        wanted = [
+            (n, tags)
             for n, tags in relations
             if tags.get("type") in ("multipolygon", "area") and _for_vehicles(tags)
-        )
-        return LaneletMap(lanelets, ways, {rule.rule_id: rule for rule in rules}, areas)
+        ]
+        areas = tuple(_all_but(_area, wanted, ways, NO_AREA, odd))
+        return LaneletMap(lanelets, ways, {rule.rule_id: rule for rule in rules}, areas, odd)
     except DataError as error:
         raise error.at(file=path) from error
     except OSError as error:
@@ -165,7 +180,22 @@ def _tags(node: ET.Element) -> dict[str, str]:
     return {child.get("k", ""): child.get("v", "").strip() for child in node.findall("tag")}
 
 
-def _ways(root: ET.Element, projection: Projection) -> dict[int, Way]:
+def _all_but(
+    read: Callable[[ET.Element, dict[str, str], dict[int, Way]], T],
+    relations: list[tuple[ET.Element, dict[str, str]]],
+    ways: dict[int, Way],
+    kind: str,
+    odd: dict[str, str],
+) -> Iterator[T]:
+    """The relations that are whole; the first of the others is noted."""
+    for node, tags in relations:
+        try:
+            yield read(node, tags, ways)
+        except DataError as error:
+            odd.setdefault(kind, f"{error.field}: {error.message}")
+
+
+def _ways(root: ET.Element, projection: Projection, odd: dict[str, str]) -> dict[int, Way]:
     places = _places(root, projection)
     ways = {}
     for node in _living(root, "way"):
@@ -173,7 +203,8 @@ def _ways(root: ET.Element, projection: Projection) -> dict[int, Way]:
         refs = [integer(child.get("ref"), f"way {way_id}: nd") for child in node.findall("nd")]
         missing = [ref for ref in refs if ref not in places]
         if missing:
-            raise DataError(f"there is no node {missing[0]}", field=f"way {way_id}: nd")
+            odd.setdefault(NO_NODE, f"way {way_id}: node {missing[0]}")
+            refs = [ref for ref in refs if ref in places]
         # The same node twice in a row is a slip of the editor.
         refs = [ref for k, ref in enumerate(refs) if k == 0 or ref != refs[k - 1]]
         line = np.array([places[ref] for ref in refs], np.float64).reshape(-1, 2)

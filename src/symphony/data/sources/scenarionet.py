@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_STEPS, check_counts
+from symphony.data.resample import evened
 from symphony.data.segment import AgentType, Bools, RunSegment, SignalState
 from symphony.data.sources.base import Item, Reader, time_step, to_float32
 from symphony.data.sources.lines import Doubles
@@ -76,7 +77,8 @@ class ScenarioNetReader(Reader):
 
 def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     metadata = mapping(scenario.get("metadata"), "metadata")
-    dt, steps = _time_step(scenario, metadata)
+    dt, times = _time_step(scenario, metadata)
+    steps = len(times)
     names, kinds, states, valid = _tracks(mapping(scenario.get("tracks"), "tracks"), steps)
     ego = metadata.get("sdc_id")
     if not isinstance(ego, str) or ego not in names:
@@ -90,7 +92,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     if dataset == "nuscenes":
         _carry_velocity(states[..., 4:6], valid)
     numbers = all(each.isdecimal() and len(each) < 18 for each in names)
-    return RunSegment(
+    segment = RunSegment(
         segment_id=name.replace("/", "_"),
         source=ScenarioNetReader.name,
         dt=dt,
@@ -110,6 +112,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         file=file,
         group=_group(metadata, dataset),
     )
+    return evened(segment, times)
 
 
 def _group(metadata: Mapping[Any, Any], dataset: str) -> str:
@@ -117,13 +120,13 @@ def _group(metadata: Mapping[Any, Any], dataset: str) -> str:
     return f"{dataset} {place} {date}" if isinstance(place, str) and isinstance(date, str) else ""
 
 
-def _time_step(scenario: Mapping[Any, Any], metadata: Mapping[Any, Any]) -> tuple[float, int]:
-    """(seconds per step, number of steps)."""
+def _time_step(scenario: Mapping[Any, Any], metadata: Mapping[Any, Any]) -> tuple[float, Doubles]:
+    """(seconds per step, time of each)."""
     times = numbers(metadata.get("ts"), "metadata: ts", 1)[:, 0]
     steps = scenario.get("length")
     if steps != len(times) or not 2 <= len(times) <= MAX_STEPS:
         raise DataError(f"{len(times)} for {str(steps)[:20]} steps", field="metadata: ts")
-    return time_step(times, "metadata: ts"), len(times)
+    return time_step(times, "metadata: ts"), times
 
 
 _STATE = (("position", 3), ("heading", 1), ("velocity", 2), ("length", 1), ("width", 1), ("height", 1))

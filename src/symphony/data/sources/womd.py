@@ -28,6 +28,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_AGENTS, check_counts, check_signals
+from symphony.data.resample import evened
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.base import Item, Reader, codes, pairs, time_step, to_float32, unexpected
@@ -97,7 +98,8 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
         DataError: naming the field of the format.
     """
     name = _name(scenario)
-    dt, steps = _time_step(scenario)
+    dt, times = _time_step(scenario)
+    steps = len(times)
     states, kept, renumber = _tracks(scenario, steps)
     ego = _index(scenario.sdc_track_index, renumber, "sdc_track_index")
     if ego < 0:
@@ -115,7 +117,7 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
     where = {track: i for i, track in enumerate(ids.tolist())}
     interest = [where[track] for track in scenario.objects_of_interest if track in where]
     masked = np.where(valid[..., None], states, 0.0)
-    return RunSegment(
+    segment = RunSegment(
         segment_id=name,
         source=WomdReader.name,
         dt=dt,
@@ -137,6 +139,7 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
         predict=np.array([p for p in predict if p >= 0], np.int32),
         file=file,
     )
+    return evened(segment, times)
 
 
 def _check_count(count: int, most: int, field: str) -> None:
@@ -154,14 +157,14 @@ def _name(scenario: pb.Scenario) -> str:
     return name
 
 
-def _time_step(scenario: pb.Scenario) -> tuple[float, int]:
-    """(seconds per step, number of steps)."""
+def _time_step(scenario: pb.Scenario) -> tuple[float, Doubles]:
+    """(seconds per step, time of each)."""
     times = np.array(scenario.timestamps_seconds, np.float64)
     if len(times) < 2:
         raise DataError(f"{len(times)} steps, needs at least 2", field="timestamps_seconds")
     if not np.isfinite(times).all():
         raise DataError("not finite", field="timestamps_seconds")
-    return time_step(times, "timestamps_seconds"), len(times)
+    return time_step(times, "timestamps_seconds"), times
 
 
 def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict[int, int]]:

@@ -8,7 +8,14 @@ from __future__ import annotations
 from symphony.metrics.wosac.config import CHALLENGE_2024, CHALLENGE_2025, CHALLENGES, WosacConfig
 from symphony.metrics.wosac.features import StepFeatures, WosacFeatures, compute_features
 from symphony.metrics.wosac.scenario import Lines, SimulatedRollouts, WosacScenario
-from symphony.metrics.wosac.scoring import WosacScores, mean_scores, object_scores, score, score_features
+from symphony.metrics.wosac.scoring import (
+    WosacScores,
+    check_scored,
+    mean_scores,
+    object_scores,
+    score,
+    score_features,
+)
 
 __all__ = [
     "CHALLENGES",
@@ -21,6 +28,7 @@ __all__ = [
     "WosacFeatures",
     "WosacScenario",
     "WosacScores",
+    "check_scored",
     "compute_features",
     "mean_scores",
     "object_scores",

@@ -15,6 +15,7 @@ from symphony.errors import DataError
 from symphony.metrics.wosac.config import (
     BUCKETS,
     CHALLENGE_2025,
+    CURRENT,
     Bernoulli,
     FlagComponent,
     NumberComponent,
@@ -100,8 +101,7 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025
     likelihoods = {}
     for name, values in log_likelihoods(features, config).items():
         mask = component_mask(features, name)
-        if not mask.any():
-            raise DataError("the log is valid at no step that could be scored", field=name)
+        _check(mask, name)
         likelihoods[name] = math.exp(values[mask].double().mean().item())
     weights = {name: component.weight for name, component in config.components.items()}
     displacement = features.simulated.average_displacement_error
@@ -116,6 +116,26 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025
         min_average_displacement_error=displacement.mean(-1).amin().item(),
         **rates,
     )
+
+
+def check_scored(scenario: WosacScenario, config: WosacConfig = CHALLENGE_2025) -> None:
+    """See that the log of a scenario says something about every component, before anything is simulated.
+
+    Raises:
+        DataError: it doesn't, such as one without vehicles or a future; names scenario and component.
+    """
+    rows = torch.isin(scenario.object_id, scenario.evaluated)
+    valid, kind = scenario.valid[rows, CURRENT + 1 :], scenario.object_type[rows]
+    try:
+        for name in config.components:
+            _check(_mask(valid, kind, name), name)
+    except DataError as error:
+        raise error.at(segment=scenario.scenario_id) from None
+
+
+def _check(mask: Tensor, name: str) -> None:
+    if not mask.any():
+        raise DataError("the log is valid at no step that could be scored", field=name)
 
 
 def object_scores(features: WosacFeatures, config: WosacConfig = CHALLENGE_2025) -> list[dict[str, Any]]:
@@ -154,7 +174,10 @@ def log_likelihoods(features: WosacFeatures, config: WosacConfig) -> dict[str, T
 
 def component_mask(features: WosacFeatures, name: str) -> Bool[Tensor, " E *steps"]:
     """Where a component's likelihood counts: [E, 80], or [E] of yes or no."""
-    valid = features.log_valid
+    return _mask(features.log_valid, features.object_type, name)
+
+
+def _mask(valid: Tensor, kind: Tensor, name: str) -> Tensor:
     if name in _FLAGS:
         return torch.ones_like(valid[:, 0])
     if name in {"linear_speed", "angular_speed"}:
@@ -162,7 +185,7 @@ def component_mask(features: WosacFeatures, name: str) -> Bool[Tensor, " E *step
     if name in {"linear_acceleration", "angular_acceleration"}:
         return speed_mask(speed_mask(valid))
     if name == "time_to_collision":
-        return valid & (features.object_type == VEHICLE)[:, None]
+        return valid & (kind == VEHICLE)[:, None]
     return valid
 
 

@@ -1,0 +1,275 @@
+"""One odd thing loses nothing else: it is left out, counted once by kind with an example, and the rest goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from helpers_convert import FakeReader
+from helpers_interaction import public, track
+from helpers_segments import hide, straight_road
+from helpers_sources import read_error, read_one, womd_scenario
+from symphony.cli import main
+from symphony.data.convert import convert, info
+from symphony.data.odd import LATE_EGO, NO_SIZE, THIN, WILD, from_ego, mended
+from symphony.data.resample import LOST, REPEATED, UNEVEN, evened, resample
+from symphony.data.segment import RunSegment, SignalState, validate
+from symphony.data.sources.base import Item, time_step
+from symphony.data.sources.interaction_tracks import Rows, stepped
+from symphony.data.sources.tfrecord import write_records
+from symphony.data.store import SegmentStore
+from symphony.errors import DataError
+
+TENTH = 0.1 * np.arange(91)
+
+
+def scene(**changes: Any) -> RunSegment:
+    return straight_road(3, dt=0.1, steps=91).replace(**changes)
+
+
+def seen_at(times: NDArray[np.float64]) -> RunSegment:
+    """The cars of a straight road, at the moments given; they keep their speed between steps of 0.1 s."""
+    whole = scene()
+    index, share = np.floor(times / 0.1 + 1e-9).astype(int), (times / 0.1) % 1
+    index = np.minimum(index, 89)
+    share = times / 0.1 - index
+    position = whole.position[:, index] * (1 - share[:, None]) + whole.position[:, index + 1] * share[:, None]
+    heading = whole.heading[:, index] * (1 - share) + whole.heading[:, index + 1] * share
+    return whole.replace(
+        position=position.astype(np.float32),
+        heading=heading.astype(np.float32),
+        velocity=whole.velocity[:, index],
+        valid=whole.valid[:, index],
+        signal_state=whole.signal_state[:, index],
+    )
+
+
+# Times
+
+
+def test_even_times_change_nothing() -> None:
+    whole = scene()
+    assert evened(whole, TENTH) is whole
+    assert evened(whole, TENTH + np.random.default_rng(0).uniform(-0.004, 0.004, 91)) is whole
+
+
+@given(st.integers(2, 80), st.integers(1, 9))
+def test_lost_frames_are_filled_in_between(first: int, count: int) -> None:
+    kept = np.delete(np.arange(91), np.arange(first, min(first + count, 90)))
+    found = evened(seen_at(TENTH[kept]), TENTH[kept])
+    assert time_step(TENTH[kept], "times") == 0.1
+    assert found.num_steps == 91
+    assert found.odd == {LOST: f"{91 - len(kept)} of 91"}
+    whole = scene()
+    np.testing.assert_array_equal(found.position[:, kept], whole.position[:, kept])
+    assert found.valid.all()
+    np.testing.assert_allclose(found.position, whole.position, atol=0.3)  # m, of a car that accelerates
+    validate(found)
+
+
+def test_a_long_gap_stays_open() -> None:
+    kept = np.delete(np.arange(91), np.arange(40, 55))
+    lit = seen_at(TENTH[kept])
+    lit = lit.replace(
+        signal_lane=np.zeros(1, np.int32),
+        signal_point=np.zeros((1, 3), np.float32),
+        signal_state=np.full((1, len(kept)), SignalState.GO, np.uint8),
+    )
+    found = evened(lit, TENTH[kept])
+    assert not found.valid[:, 40:55].any()
+    assert found.valid[:, :40].all()
+    assert found.valid[:, 55:].all()
+    assert set(found.signal_state[0, 40:55].tolist()) == {SignalState.UNKNOWN}
+    validate(found)
+
+
+@given(st.integers(0, 2**16))
+def test_uneven_times_are_brought_to_even_ones(seed: int) -> None:
+    times = np.sort(np.random.default_rng(seed).uniform(-0.03, 0.03, 91) + TENTH)
+    times -= times[0]
+    times = np.clip(times, 0, 9)
+    found = evened(seen_at(times), times)
+    whole = scene()
+    steps = found.num_steps
+    assert steps in {90, 91}
+    assert set(found.odd) <= {UNEVEN, LOST}
+    # Within a tenth of a step at the highest speed, and what a straight line misses between two frames.
+    fastest = np.hypot(*np.moveaxis(whole.velocity, -1, 0)).max()
+    np.testing.assert_allclose(found.position, whole.position[:, :steps], atol=0.01 * fastest + 0.05)
+
+
+def test_a_frame_that_comes_twice_counts_once() -> None:
+    times = np.insert(TENTH, 40, TENTH[39])
+    found = evened(seen_at(times), times)
+    assert found.odd == {REPEATED: "1 of 92"}
+    np.testing.assert_array_equal(found.position, scene().position)
+
+
+@pytest.mark.parametrize(
+    "times", [[0, 1, 5, 6, 20], [0, 0.1, 0.2, 50.0, 50.1, 50.2], [0, 0, 0, 0], [3, 2, 1, 0]]
+)
+def test_times_without_a_step_are_refused(times: list[float]) -> None:
+    with pytest.raises(DataError, match="uneven"):
+        time_step(np.array(times, np.float64), "times")
+
+
+@pytest.mark.parametrize("rate", [10, 12.5, 25, 29.97, 30, 50, 100])
+@pytest.mark.parametrize("whole", [True, False], ids=["whole milliseconds", "thousandths"])
+def test_rates_of_recordings(rate: float, whole: bool) -> None:
+    frames = np.delete(np.arange(int(12 * rate)), np.arange(30, 35))  # five are lost
+    times = np.round(5000 + 1000 * frames / rate, 0 if whole else 3)
+    empty = np.zeros(len(times), np.int64)
+    rows = Rows(empty, times, empty, empty, np.zeros((len(times), 7)), np.zeros((len(times), 2), bool))
+    found, dt, start = stepped(rows)
+    assert dt == pytest.approx(1 / rate, rel=2e-4 if whole else 1e-6)
+    assert found.time.tolist() == frames.tolist()
+    assert start == 5000
+
+
+@pytest.mark.parametrize("rate", [25, 30, 29.97])
+def test_interaction_at_other_rates(rate: float, tmp_path: Path) -> None:
+    def at(line: str) -> str:
+        fields = line.split(",")
+        frame = round(float(fields[2]) / 100)
+        fields[2] = f"{1000 * frame / rate:.3f}"
+        fields[6:8] = (str(float(v) * rate / 10) for v in fields[6:8])
+        return ",".join(fields)
+
+    cars = [*track(3, steps=range(110)), *track(4, x=-20, steps=range(110))]
+    path = public(tmp_path, [at(line) for line in cars])
+    found = read_one("interaction", path, window=3.0)
+    assert found.dt == pytest.approx(1 / rate, rel=1e-6)
+    assert not found.odd
+    fifth = resample(found, 0.2)
+    assert fifth.num_steps == 16
+    assert fifth.valid.all()
+
+
+def test_frames_that_a_recording_lost(tmp_path: Path) -> None:
+    cars = [*track(3), *track(4, x=-20)]
+    whole = read_one("interaction", public(tmp_path / "a", cars))
+    lost = [line for line in cars if not 300 <= int(line.split(",")[2]) < 800]
+    found = read_one("interaction", public(tmp_path / "b", lost))
+    assert found.odd == {LOST: f"5 of {whole.num_steps}"}
+    np.testing.assert_allclose(found.position, whole.position, atol=1e-3)
+
+
+# Agents and states
+
+
+def test_boxes_without_a_size() -> None:
+    whole = scene()
+    for sides in ((0, 0, 0), (-1, -1, -1), (np.nan,) * 3, (200, 1, 1)):
+        size = whole.size.copy()
+        size[1] = sides
+        found = validate(mended(whole.replace(size=size)))
+        assert found.odd == {NO_SIZE: f"agent {whole.agent_id[1]}"}
+        assert found.agent_id.tolist() == [whole.agent_id[k] for k in (0, 2)]
+        size[[0, 1]] = size[[1, 0]]
+        with pytest.raises(DataError):  # the ego's
+            validate(mended(whole.replace(size=size)))
+    size = whole.size.copy()
+    size[1], size[2, 2] = (0.04, 0.04, 0.8), np.nan
+    found = validate(mended(whole.replace(size=size)))
+    assert found.odd == {THIN: f"agent {whole.agent_id[1]}"}
+    np.testing.assert_array_equal(found.size[1], np.float32([0.05, 0.05, 0.8]))
+    assert found.size[2, 2] == 0
+
+
+@given(st.integers(0, 90), st.sampled_from([3000.0, 1e5, np.nan, np.inf]))
+def test_a_wild_state_costs_itself_alone(step: int, away: float) -> None:
+    position = scene().position.copy()
+    position[1, step, 0] += away
+    found = validate(mended(scene(position=position)))
+    expected = np.ones((3, 91), bool)
+    expected[1, step] = False
+    np.testing.assert_array_equal(found.valid, expected)
+    assert list(found.odd) == [WILD]
+
+
+def test_who_is_never_where_it_can_be_is_left_out() -> None:
+    velocity = scene().velocity.copy()
+    velocity[1] = 1e4
+    found = validate(mended(scene(velocity=velocity)))
+    assert found.num_agents == 2
+
+
+def test_references_follow_who_is_left() -> None:
+    size = scene().size.copy()
+    size[1] = 0
+    found = mended(scene(size=size, ego=2, predict=np.int32([1, 2]), interest=np.int32([1])))
+    assert (found.ego, found.predict.tolist(), found.interest.tolist()) == (1, [1], [])
+
+
+def test_an_ego_that_comes_late() -> None:
+    late = hide(scene(current_step=10), 0, slice(0, 3))
+    found = validate(from_ego(late))
+    assert found.odd == {LATE_EGO: "3 of 91"}
+    assert (found.num_steps, found.current_step) == (88, 7)
+    np.testing.assert_array_equal(found.position, late.position[:, 3:])
+    for unchanged in (scene(), hide(scene(), 0, slice(0, 20)), hide(scene(), 0, slice(5, 90))):
+        assert from_ego(unchanged) is unchanged
+    # Who has left by then is gone.
+    assert from_ego(hide(late, 1, slice(2, 91))).num_agents == 2
+
+
+# The report
+
+
+class Lame(FakeReader):
+    """One of its agents has no size where the line says so, and in the last line the ego comes late."""
+
+    def _read(self, path: Path) -> Iterator[Item]:
+        for number, item in enumerate(super()._read(path)):
+            assert isinstance(item, RunSegment)
+            size = item.size.copy()
+            size[-1, 0] = 0 if number in {1, 2} else size[-1, 0]
+            yield hide(item, 0, slice(0, 2)) if number == 3 else replace(item, size=size)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_it_is_counted_by_kind_with_an_example(workers: int, tmp_path: Path) -> None:
+    (tmp_path / "a.scene").write_text("straight 1\nstraight 2\nstraight 3\nstraight 4")
+    report = convert(Lame(), [tmp_path], tmp_path / "out", workers=workers)
+    assert report.converted == 4
+    assert report.odd == {NO_SIZE: 2, LATE_EGO: 1}
+    assert set(report.odd_examples) == set(report.odd)
+    assert report.odd_examples[NO_SIZE].startswith("straight-2: agent ")
+    assert report.odd_examples[LATE_EGO] == "straight-4: 2 of 91"
+    found = info(tmp_path / "out")
+    assert (found["odd"], found["odd_examples"]) == (report.odd, report.odd_examples)
+    assert list(SegmentStore(tmp_path / "out").tags(1)["odd"]) == [NO_SIZE]
+    strict = convert(Lame(), [tmp_path], tmp_path / "strict", workers=workers, strict=True)
+    assert (strict.converted, strict.odd) == (1, {})
+    assert [skip.segment for skip in strict.skipped] == ["straight-2", "straight-3", "straight-4"]
+    assert strict.settings["strict"] is True
+
+
+def test_the_command_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fine, odd = womd_scenario("fine"), womd_scenario("odd")
+    for state in odd.tracks[0].states:
+        state.length = 0
+    write_records(tmp_path / "a.tfrecord", [s.SerializeToString() for s in (fine, odd)])
+    base = ["data", "convert", "womd", str(tmp_path / "a.tfrecord"), "--interactive", "1", "--rate", "10"]
+    assert main([*base, "--out", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert NO_SIZE in said
+    assert "first: odd: agent" in said
+    assert len(SegmentStore(tmp_path / "out")) == 2
+    assert main([*base, "--out", str(tmp_path / "strict"), "--strict"]) == 0
+    assert SegmentStore(tmp_path / "strict").ids == ["fine"]
+
+
+def test_what_cannot_be_mended_is_refused_as_before(tmp_path: Path) -> None:
+    scenario = womd_scenario("nan")
+    scenario.tracks[2].states[0].center_x = np.nan  # of the ego, from whose first place all is counted
+    write_records(tmp_path / "a", [scenario.SerializeToString()])
+    assert read_error("womd", tmp_path / "a").field == "position"
