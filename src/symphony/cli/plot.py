@@ -1,4 +1,4 @@
-"""Draw run segments, what agents do in them, the tree of a search, the curves of a training, the paper's figure."""
+"""Draw run segments, routes, what agents do, the tree of a search, the curves of a training, the paper's figure."""
 
 from __future__ import annotations
 
@@ -182,6 +182,52 @@ class Segment:
         title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
         chosen = choice.agents.tolist()
         plot_segment(segment, self.out, step=self.step, interactive=chosen, title=title)
+
+
+@app.command(name="routes")
+@dataclass(frozen=True)
+class Routes:
+    """Draw the feasible routes of agents on the map, and mark the one that each took.
+
+    A panel is drawn for each interactive agent of each segment.
+    """
+
+    data: Path
+    """Store of run segments."""
+    out: Path
+    """Picture to write (.png, .pdf or .svg)."""
+    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
+    """Their ids, or their numbers in the store; by default three, spread evenly over the store."""
+    interactive: int = 2
+    """Agents of each segment, the ego included."""
+
+    def __post_init__(self) -> None:
+        if self.interactive < 1:
+            raise ConfigError(f"--interactive must be at least 1, is {self.interactive}")
+
+    def run(self) -> None:
+        """Find the routes and draw them."""
+        from functools import partial
+
+        from symphony.data.selection import interactive_choice
+        from symphony.data.store import SegmentStore
+        from symphony.envs.routes import route_table
+        from symphony.render import plot_grid, plot_routes
+        from symphony.roadgraph import LaneGraph
+        from symphony.simulation.demonstrations import evenly_spaced
+
+        store = SegmentStore(self.data)
+        if len(store) == 0:
+            raise DataError("the store holds no run segments", file=store.path)
+        panels = []
+        for number in segment_indices(store, self.segments) or evenly_spaced(len(store), 3):
+            segment = store[number]
+            graph = LaneGraph(segment.road)
+            for agent in interactive_choice(segment, self.interactive, fewer=True).agents.tolist():
+                table = route_table(segment, graph, agent)
+                lines = [table.line(route) for route in range(len(table.count))]
+                panels.append(partial(plot_routes, segment, agent, lines, table.logged))
+        plot_grid(panels, self.out, columns=self.interactive if self.interactive > 1 else 3, size=6.0)
 
 
 def segment_index(store: SegmentStore, name: str) -> int:

@@ -6,6 +6,7 @@ the part of it that is seen, N agents, M rows.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,11 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.data.segment import RunSegment
+from symphony.errors import DataError, DataWarning
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
 from symphony.geometry.nearest import first_smallest, on_host
 from symphony.geometry.stations import stations_along
-from symphony.roadgraph import LaneGraph, ground_truth_routes, route_lines, routes, starting_lanes
+from symphony.roadgraph import LaneGraph, Route, ground_truth_routes, route_lines, routes, starting_lanes
 from symphony.roadgraph.routes import HORIZON
 from symphony.streams import stream_of
 
@@ -100,6 +102,28 @@ def route_table(
             comes in later with the first on a lane.
         reach: of :func:`drivable`, where that is known.
     """
+    try:
+        first, _, lines = agent_routes(segment, graph, agent, begin, reach)
+    except DataError as error:
+        warnings.warn(f"{error}; it has none", DataWarning, stacklevel=2)
+        return NO_ROUTES
+    if not lines:
+        return NO_ROUTES
+    right = ground_truth_routes(lines, segment.position[agent, first:, :2], segment.valid[agent, first:])
+    tied = np.flatnonzero(right)
+    draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
+    count = np.array([len(line) for line in lines], np.int64)
+    return RouteTable(np.concatenate(lines).astype(np.float32), count, right, int(tied[draw]))
+
+
+def agent_routes(
+    segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0, reach: float | None = None
+) -> tuple[int, list[Route], list[NDArray[np.float64]]]:
+    """The step at which an agent's routes begin, the routes, and their lines; see :func:`route_table`.
+
+    Raises:
+        DataError: the routes cannot be built; names segment and agent.
+    """
     steps = begin + np.flatnonzero(segment.valid[agent, begin:])
     for first in steps if begin else steps[:1]:
         position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
@@ -107,23 +131,19 @@ def route_table(
         if starts:
             break
     else:
-        return NO_ROUTES
+        return 0, [], []
     reach = drivable(segment) if reach is None else reach
     horizon = max(HORIZON, reach)
-    onward = max(reach + ONWARD - horizon, 0.0)
-    _, lines = route_lines(
-        graph,
-        routes(graph, starts, horizon=horizon, onward=onward),
-        dict(starts),
-        spacing=SPACING,
-        length=max(horizon, reach + ONWARD),
-        speed=float(np.linalg.norm(segment.velocity[agent, first])),
-    )
-    right = ground_truth_routes(lines, segment.position[agent, first:, :2], segment.valid[agent, first:])
-    tied = np.flatnonzero(right)
-    draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
-    count = np.array([len(line) for line in lines], np.int64)
-    return RouteTable(np.concatenate(lines).astype(np.float32), count, right, int(tied[draw]))
+    found = routes(graph, starts, horizon=horizon, onward=max(reach + ONWARD - horizon, 0.0))
+    length, speed = max(horizon, reach + ONWARD), float(np.linalg.norm(segment.velocity[agent, first]))
+    try:
+        kept, lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)
+        if not all(np.isfinite(line).all() for line in lines):
+            raise ValueError("points that are not finite")
+    except (ValueError, IndexError, ArithmeticError) as error:
+        message = f"the routes of agent {int(segment.agent_id[agent])} can't be built: {error}"
+        raise DataError(message, segment=segment.segment_id, field="road.lanes") from error
+    return int(first), kept, lines
 
 
 def logged_progress(

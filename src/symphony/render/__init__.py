@@ -4,6 +4,7 @@ from symphony.render.curves import plot_curves
 from symphony.render.genealogy import plot_genealogy, plot_search
 from symphony.render.histograms import plot_curvature
 from symphony.render.plots import plot_grid, plot_rollout, plot_segment
+from symphony.render.routes import plot_routes
 from symphony.render.tree import SearchTree, plot_tree
 from symphony.render.video import Clip, animate_rollouts
 
@@ -16,6 +17,7 @@ __all__ = [
     "plot_genealogy",
     "plot_grid",
     "plot_rollout",
+    "plot_routes",
     "plot_search",
     "plot_segment",
     "plot_tree",

@@ -142,6 +142,14 @@ class LaneGraph:
         return LineIndex([self.lines[k] for k in self.usable_lanes])
 
     @cached_property
+    def lane_points(self) -> tuple[Reals, Reals]:
+        """Points [P, 2] of all usable lanes, and unit vectors [P, 2] along the lanes there."""
+        ways = [np.gradient(self.lines[k], axis=0) for k in self.usable_lanes]
+        way = np.concatenate([np.zeros((0, 2)), *ways])
+        points = np.concatenate([np.zeros((0, 2)), *(self.lines[k] for k in self.usable_lanes)])
+        return points, way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+
+    @cached_property
     def region_index(self) -> LineIndex:
         """Spatial index over the branching regions."""
         return LineIndex([self.lines[k] for k in self.regions.lane])

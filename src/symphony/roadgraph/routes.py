@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
@@ -329,6 +330,23 @@ def route_lines(
         kept.append(route)
         lines.append(points)
     return kept, lines
+
+
+def ends_inside(graph: LaneGraph, line: Reals) -> bool:
+    """Whether a line [P, 2] ends where the map goes on.
+
+    That is more than 20 m within the convex hull of all lanes, or where a lane lies ahead of its end, at most 30 m
+    away, 2.5 m aside and 30 degrees turned.
+    """
+    end, way = line[-1], line[-1] - line[-2]
+    way = way / max(float(np.hypot(*way)), 1e-9)
+    points, ways = graph.lane_points
+    away = points - end
+    along, aside = away @ way, np.abs(away[:, 0] * way[1] - away[:, 1] * way[0])
+    if ((along > 1.0) & (along < 30.0) & (aside < 2.5) & (ways @ way > np.cos(np.radians(30.0)))).any():
+        return True
+    outline = shapely.MultiPoint(points).convex_hull
+    return bool(shapely.distance(outline.boundary, shapely.Point(end)) > 20.0)
 
 
 def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:

@@ -72,8 +72,8 @@ class Traffic:
         agent_type: [A] :class:`symphony.data.segment.AgentType`.
         valid: [A] who is there.
         lights: [Q] :class:`symphony.data.segment.SignalState` of each light of the scenario.
-        route: [K, 2] points to follow from where the ego has come to, 3 m apart: 200 m of the scenario's route, or what
-            there is of it up to the end of the map.
+        route: [K, 2] points to follow from where the ego has come to, 3 m apart: 200 m of the scenario's route, or
+            what there is of it up to the end of the map.
     """
 
     step: int

@@ -8,8 +8,8 @@ Its input ends when the rollout does. What it writes to its standard error is sh
 SCENE has ``segment_id``, ``dt``, ``steps``, ``seed``, ``ego``, ``goal`` [2], ``route`` [[x, y], ...], ``lanes`` (each
 with ``id``, ``points``, ``speed_limit`` or null, ``successors``) and ``lights`` (``x``, ``y``, ``lane``). NOW has
 ``time``, ``step``, ``ego`` (``x``, ``y``, ``heading``, ``speed``, ``length``, ``width``), ``agents`` (lists ``x``,
-``y``, ``heading``, ``vx``, ``vy``, ``length``, ``width``, ``type``, ``id``), ``route`` (what lies ahead) and ``lights``
-(the list of their states). Units and words are those of :class:`symphony.simulation.planner_view.Observation`.
+``y``, ``heading``, ``vx``, ``vy``, ``length``, ``width``, ``type``, ``id``), ``route`` (what lies ahead) and
+``lights`` (their states). Units and words are those of :class:`symphony.simulation.planner_view.Observation`.
 """
 
 from __future__ import annotations
