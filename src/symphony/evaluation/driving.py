@@ -16,6 +16,7 @@ from symphony.evaluation.contacts import Bools, Indices, Reals, lane_widths
 from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph
+from symphony.roadgraph.routes import ends_inside
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.world import World
 
@@ -26,6 +27,8 @@ WRONG_WAY = 2 * math.pi / 3
 """Smallest angle between an agent and a lane that it drives the wrong way."""
 IN_LANE = 2.0
 """Metres from a centre line within which an agent is in the lane."""
+PAST_END = 5.0
+"""Metres from the end of a route beyond which an agent has gone on."""
 _FOLLOWED = 3.0
 """Metres from a centre line, on average, within which a path follows the lane."""
 
@@ -125,7 +128,10 @@ def wrong_way(world: World, evaluated: Indices, graph: LaneGraph) -> Bools:
 
 
 class Progress(NamedTuple):
-    """Metres [K, M] that evaluated agents got on in all, that they did while the log has them, and the log itself."""
+    """Metres [K, M] that evaluated agents got on in all, that they did while the log has them, and the log itself.
+
+    The first two are NaN where an agent went on beyond a route that ends inside the map.
+    """
 
     driven: Reals
     compared: Reals
@@ -135,8 +141,10 @@ class Progress(NamedTuple):
 def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     """How far evaluated agents (numbers [M] of the driven ones) got on.
 
-    Along the route that an agent follows, from where it begins to where it ends, also where the route passes a place
-    twice (:func:`symphony.geometry.stations.stations_along`); without a route, the length of its path.
+    It is measured along the route that an agent follows, and beyond its end along the path of the log, where the log
+    goes on from there. A route that passes a place twice is followed in order
+    (:func:`symphony.geometry.stations.stations_along`). For an agent that goes on where both end but the map does not
+    it is NaN. Without a route it is the length of the agent's path.
     """
     rows, within = saved.agents[evaluated], slice(saved.start, saved.last + 1)
     there = saved.there[..., evaluated].swapaxes(1, 2)
@@ -144,20 +152,54 @@ def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     log = saved.segment.position[rows, within, :2].astype(np.float64)
     seen = saved.segment.valid[rows, within]
     goal = saved.goal[:, evaluated]
-    counts = np.diff(saved.routes.offsets)
-    most = max(2, int(counts.max(initial=0)))
-    routes = [saved.routes[k][:, :2] for k in np.flatnonzero(counts).tolist()]
-    lines = [np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in routes]
-    has = np.append(counts > 1, False)[goal]
-    along = np.array(lines, np.float64).reshape(-1, most, 2)[np.cumsum(counts > 0)[goal[has]] - 1]
     both = there & seen
     driven, compared = _length(path, there), _length(path, both)
     logged = np.broadcast_to(_length(log, seen), goal.shape).copy()
-    places = stations_along(along, path[has], there[has])
+    counts = np.diff(saved.routes.offsets)
+    has = np.append(counts > 1, False)[goal]
+    if not has.any():
+        return Progress(driven, compared, logged)
+    # Agents have routes of their own, so a route is that of one agent.
+    number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)
+    pairs = dict(zip(goal[has].tolist(), number[has].tolist(), strict=True))
+    whole = {
+        route: _with_log(saved.routes[route][:, :2].astype(np.float64), log[agent], seen[agent])
+        for route, agent in pairs.items()
+    }
+    most = max(map(len, whole.values()))
+    along = {route: np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for route, line in whole.items()}
+    lines = np.stack([along[route] for route in goal[has].tolist()])
+    places = stations_along(lines, path[has], there[has])
     driven[has], compared[has] = _advance(places, there[has]), _advance(places, both[has])
-    number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)[has]
-    logged[has] = _advance(stations_along(along, log[number], seen[number]), seen[number])
+    who = list(pairs.values())
+    of_log = stations_along(np.stack(list(along.values())), log[who], seen[who])
+    advance = dict(zip(whole, _advance(of_log, seen[who]).tolist(), strict=True))
+    logged[has] = [advance[route] for route in goal[has].tolist()]
+    # Whoever is farther from the end than a vehicle is long has gone on from it.
+    past = np.linalg.norm(path[has] - lines[:, -1:], axis=-1) > PAST_END
+    past &= places >= np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)[:, None] - 1e-3
+    beyond = np.flatnonzero((past & there[has]).any(1))
+    if len(beyond):
+        graph = LaneGraph(saved.segment.road)
+        open_end = {route: ends_inside(graph, line) for route, line in whole.items()}
+        undefined = [k for k in beyond.tolist() if open_end[int(goal[has][k])]]
+        for part in (driven, compared):
+            values = part[has]
+            values[undefined] = np.nan
+            part[has] = values
     return Progress(driven, compared, logged)
+
+
+def _with_log(route: Reals, log: Reals, seen: Bools) -> Reals:
+    """A route [P, 2], and from its end on the path of a log [U, 2] that goes on from there."""
+    places = stations_along(route[None], log[None], seen[None])[0]
+    length = np.linalg.norm(np.diff(route, axis=0), axis=-1).sum()
+    passed = np.flatnonzero(seen & (places >= length - 1e-3))
+    if not len(passed) or np.linalg.norm(log[passed[0]] - route[-1]) > PAST_END + _FOLLOWED:
+        return route
+    path = log[passed]
+    moves = np.linalg.norm(np.diff(np.concatenate([route[-1:], path]), axis=0), axis=-1) > 0.1
+    return np.concatenate([route, path[moves]])
 
 
 def _length(path: Reals, valid: Bools) -> Reals:

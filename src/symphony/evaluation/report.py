@@ -167,6 +167,7 @@ _NUMBERS = (
     "low_ttc_time",
     "progress",
     "progress_ratio",
+    "beyond_route",
     "max_acceleration",
     "max_braking",
     "max_jerk",
@@ -201,7 +202,9 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
         events += found
         ttc = np.where(counted.T, time_to_collision(world, rows)[:, 1:], math.inf)
         steps = int(counted.sum())
-        logged_progress = float(moved.logged[k].sum())
+        # Of an agent whose progress is not defined, the log's does not count either.
+        known = np.isfinite(moved.driven[k])
+        logged_progress = float(moved.logged[k][known].sum())
         out.append(
             {
                 "collision": len(hits.agent) > 0,
@@ -212,10 +215,11 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
                 "wrong_way_time": _percent((wrong_way(world, rows, graph)[:, 1:] & counted.T).sum(), steps),
                 "min_ttc": _finite(ttc.min(initial=math.inf)),
                 "low_ttc_time": _percent((ttc < LOW_TTC).sum(), steps),
-                "progress": float(moved.driven[k].mean()) if len(who) else None,
-                "progress_ratio": float(moved.compared[k].sum()) / logged_progress
+                "progress": float(moved.driven[k][known].mean()) if known.any() else None,
+                "progress_ratio": float(moved.compared[k][known].sum()) / logged_progress
                 if logged_progress > 1
                 else None,
+                "beyond_route": int((~known).sum()),
                 "max_acceleration": _peak(motion.acceleration[k]),
                 "max_braking": _peak(-motion.acceleration[k]),
                 "max_jerk": _peak(np.abs(motion.jerk[k])),
