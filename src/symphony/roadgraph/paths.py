@@ -63,7 +63,7 @@ def blend(line: Reals, point: Reals, length: float) -> Reals:
     fades = 1.0 - share * share * (3.0 - 2.0 * share)
     moved = on + (aside * fades)[:, None] * normal
     moved[0] = point
-    return np.concatenate([moved, line[arc > end]])
+    return np.concatenate([moved, line[arc > end + _CLOSE]])
 
 
 def beside(line: Reals, point: Reals) -> tuple[float, float]:

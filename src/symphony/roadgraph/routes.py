@@ -371,7 +371,7 @@ def route_errors(
     """
     path = np.asarray(path, np.float64)
     way = np.hypot(*np.diff(path, axis=0).T).sum()
-    spacing = max(np.hypot(*(lines[0][1] - lines[0][0])), _TIE)
+    spacing = max(_TIE, *(float(np.hypot(*(line[1] - line[0]))) for line in lines))
     most = min(max(map(len, lines)), int((1.5 * way + _SLACK) / spacing) + 2)
     # Shorter ones end with their last point again. Routes that part farther on are one here.
     different: dict[bytes, int] = {}
