@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.cli.tables import print_metrics, short_name, write_numbers
 from symphony.config import EvaluateConfig, WosacSettings
 from symphony.config.evaluation import check_planner_seconds
@@ -61,6 +62,7 @@ class Evaluate:
     search or without it (see docs/wosac.md)."""
     wosac_config: Literal["2024", "2025"] = "2025"
     """Year of the challenge whose weights the WOSAC score has."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
@@ -100,7 +102,8 @@ class Evaluate:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
 
             check_picture(self.figure)
-        agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
+        agent = load_agent(self.agent, self.config.device, trust_code=self.trust_code)
+        store = SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         chosen = segment_indices(store, self.segments)
         if self.metrics:
@@ -212,6 +215,7 @@ class Evaluate:
                 segments=self.segments,
                 planner=self.planner,
                 planner_seconds=self.planner_seconds,
+                trust_code=self.trust_code,
                 config=self.config,
             ).simulated()
             store = SegmentStore(self.data)

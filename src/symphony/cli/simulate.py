@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import ConfigError
@@ -49,6 +50,7 @@ class Simulate:
     for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them."""
     tree: bool = True
     """Leave out the branches that a search pruned."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
@@ -72,7 +74,7 @@ class Simulate:
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
-            load_agent(self.agent or self.agents, self.config.device),
+            load_agent(self.agent or self.agents, self.config.device, trust_code=self.trust_code),
             SegmentStore(self.data),
             self.config,
         )

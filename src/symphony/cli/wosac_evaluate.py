@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.cli.tables import write_numbers
 from symphony.config import WosacSettings
 
@@ -36,6 +37,7 @@ class Evaluate:
     """Ids of the run segments, or their numbers in the store; by default all."""
     baselines: bool = True
     """Score the agent alone."""
+    trust_code: TrustCode = False
     settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
 
     def run(self) -> None:
@@ -46,7 +48,8 @@ class Evaluate:
         from symphony.data.store import SegmentStore
         from symphony.evaluation.wosac import evaluate_wosac
 
-        agent, store = load_agent(self.agent, self.settings.device), SegmentStore(self.data)
+        agent = load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
+        store = SegmentStore(self.data)
         items = segment_indices(store, self.segments) or list(range(len(store)))
         with segments_bar(f"scoring {agent.name}") as advance:
             found = evaluate_wosac(
