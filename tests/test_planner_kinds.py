@@ -365,7 +365,7 @@ def test_a_folder_without_a_planner_is_refused(store: Path, tmp_path: Path) -> N
 
 def test_files_that_cannot_be_run_are_named(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("1 / 0\n")
-    with pytest.raises(ConfigError, match=r"broken.py can't be imported: ZeroDivisionError"):
+    with pytest.raises(ConfigError, match=r"broken.py.*ZeroDivisionError"):
         planner_maker(f"{tmp_path}/broken.py:plan")
     (tmp_path / "empty.py").write_text("")
     with pytest.raises(ConfigError, match=r"no attribute 'plan'"):

@@ -57,7 +57,16 @@ SETTINGS = ("agent__encoder", "agent__policy", "discriminator__network", "search
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_a_folder_runs_no_code(stranger: Callable[..., Path], setting: str, place: str, capsys: Any) -> None:
     folder = stranger(**{setting: f"{place}:Encoder"})
-    command = ["simulate", str(folder), "--data", str(builtin_store("test")), "--segments", "0", "--out", "sim"]
+    command = [
+        "simulate",
+        str(folder),
+        "--data",
+        str(builtin_store("test")),
+        "--segments",
+        "0",
+        "--out",
+        "sim",
+    ]
     assert main(command) == 1
     assert f"{setting.replace('__', '.')} names code, '{place}:Encoder'" in capsys.readouterr().err
     assert not Path("ran").exists()
@@ -67,7 +76,9 @@ def test_a_folder_runs_no_code(stranger: Callable[..., Path], setting: str, plac
 @pytest.mark.filterwarnings("always::symphony.errors.DataWarning")
 def test_trusted_code_is_named_and_runs(stranger: Callable[..., Path], capsys: Any) -> None:
     folder = stranger(agent__encoder="stranger/notes.py:Encoder")
-    with pytest.warns(DataWarning, match=r"agent\.json: agent\.encoder runs code, 'stranger/notes\.py:Encoder'"):
+    with pytest.warns(
+        DataWarning, match=r"agent\.json: agent\.encoder runs code, 'stranger/notes\.py:Encoder'"
+    ):
         assert load_agent(str(folder), trust_code=True).policy is not None
     assert Path("ran").exists()
     data = ["--data", str(builtin_store("test"))]
@@ -114,5 +125,5 @@ def test_the_current_folder_is_not_searched_for_it(stranger: Callable[..., Path]
     ],
 )
 def test_networks_are_no_larger_than_their_weights(stranger: Callable[..., Path], settings: Any) -> None:
-    with pytest.raises(SymphonyError, match="asks for a network|at most|no networks of these sizes"):
+    with pytest.raises(SymphonyError, match=r"asks for a network|at most|no networks of these sizes"):
         load_agent(str(stranger(**settings)))

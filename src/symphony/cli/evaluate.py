@@ -203,7 +203,7 @@ class Evaluate:
 
         from symphony.cli.planners import table_text
         from symphony.cli.plot import segment_indices
-        from symphony.cli.simulate import Simulate, failed_runs
+        from symphony.cli.simulate import Simulate, tell_failed
         from symphony.data.store import SegmentStore
         from symphony.evaluation.planners import planner_record
 
@@ -222,11 +222,10 @@ class Evaluate:
             chosen = segment_indices(store, self.segments) or range(len(store))
             folder = folder.only(store.ids[i] for i in chosen)
             record = planner_record(folder)
-            for line in failed_runs(folder):
-                sys.stderr.write(f"{line}\n")
-        if self.json is not None:
-            write_numbers(self.json, record)
-        (sys.stderr if str(self.json) == "-" else sys.stdout).write(table_text([record]))
+            if self.json is not None:
+                write_numbers(self.json, record)
+            (sys.stderr if str(self.json) == "-" else sys.stdout).write(table_text([record]))
+            tell_failed(folder, lambda line: sys.stderr.write(f"{line}\n"))
 
 
 def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False) -> None:

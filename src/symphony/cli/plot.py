@@ -35,7 +35,7 @@ class Tree:
     """Store of run segments."""
     segment: str
     """The segment's id, or its number in the store."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
     trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
@@ -68,7 +68,7 @@ class Rollouts:
     """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
     data: Path
     """Store of run segments."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg), or animation (.gif)."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
     """Their ids, or their numbers in the store; by default some, spread evenly over the store."""
@@ -120,7 +120,7 @@ class Curves:
         tyro.conf.arg(metavar="RUN ...", help_behavior_hint="(required)"),
     ]
     """Folders of runs, still training or done."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
     metrics: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Draw these metrics only; by default all there are."""
@@ -160,7 +160,7 @@ class Segment:
     """Folder of the store."""
     segment: str
     """Its id, or its number in the store."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
     interactive: int = 2
     """Agents in colour, the ego included."""

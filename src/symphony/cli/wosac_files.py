@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from symphony.errors import DataError
+from symphony.files import Lock
 
 if TYPE_CHECKING:
     from symphony.metrics.wosac import WosacFeatures, WosacScores
@@ -78,15 +80,18 @@ def score_files(
     """
     from symphony.data.engine import ordered_map
 
+    held: AbstractContextManager[object] = nullcontext()
     if features is not None:
         features.mkdir(parents=True, exist_ok=True)
+        held = Lock(features / "features.lock")
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     pairs = _pairs(scenarios, rollouts, partial)
     tasks = (ScoreTask(*pair, config, per_object, features) for pair in pairs)
     results = []
-    for result in ordered_map(score_task, tasks, workers=workers):
-        results.append(result)
-        progress(len(results), total)
+    with held:
+        for result in ordered_map(score_task, tasks, workers=workers):
+            results.append(result)
+            progress(len(results), total)
     if not results:
         raise DataError("no scenario has rollouts", file=scenarios)
     return results
