@@ -58,6 +58,14 @@ def told(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
     return call
 
 
+BRAKE = """
+import json, sys
+for line in sys.stdin:
+    told = json.loads(line)
+    print(json.dumps({} if "reset" in told else {"step": told["plan"]["step"], "plan": [-1.0, 0.0]}), flush=True)
+"""
+
+
 def drive(store: Path, *more: Any, rollouts: int = 1) -> list[Any]:
     """The common part of a simulation of the first segment beside the log."""
     return ["simulate", "playback", "--data", store, "--segments", 0, "--rollouts", rollouts, *more]
@@ -231,7 +239,7 @@ def test_planners_that_no_file_defines(store: Path, tmp_path: Path) -> None:
 
 
 def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path, told: Any) -> None:
-    Path("brake.py").write_text("import sys\nfor line in sys.stdin:\n    print('{}', flush=True)\n")
+    Path("brake.py").write_text(BRAKE)
     command = ["simulate", run, "--data", store, "--segments", 0, "--rollouts", 2, "--out", "a"]
     code, words = told(*command, "--planner", "pipe:python brake.py")
     assert code == 1
