@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 import os
 import shutil
 import sys
+import tarfile
+import tracemalloc
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from symphony.agents import load_agent
 from symphony.agents.included import pretrained_folder
 from symphony.cli import main
 from symphony.data.builtin import builtin_store
-from symphony.errors import ConfigError, DataWarning, SymphonyError
+from symphony.data.npz import read_npz
+from symphony.data.rollouts import read_rollouts
+from symphony.data.submission_check import _encoded, check_submission
+from symphony.errors import ConfigError, DataError, DataWarning, SymphonyError
 
 NOTES = """
 from pathlib import Path
@@ -127,3 +136,70 @@ def test_the_current_folder_is_not_searched_for_it(stranger: Callable[..., Path]
 def test_networks_are_no_larger_than_their_weights(stranger: Callable[..., Path], settings: Any) -> None:
     with pytest.raises(SymphonyError, match=r"asks for a network|at most|no networks of these sizes"):
         load_agent(str(stranger(**settings)))
+
+
+def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
+    """An archive of float32 arrays whose headers claim shapes, with so many bytes of zeros each."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, (shape, size) in members.items():
+            header = io.BytesIO()
+            described = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(header, described)
+            with archive.open(f"{name}.npy", "w") as part:
+                part.write(header.getvalue())
+                for begin in range(0, size, 1 << 24):
+                    part.write(bytes(min(1 << 24, size - begin)))
+
+
+def shard(path: Path, size: int, key: int = 10, kind: bytes = tarfile.REGTYPE) -> None:
+    """A submission with one member: a message of so many bytes of zeros, or a header of the archive's own."""
+    head = _encoded(key) + _encoded(size) if kind == tarfile.REGTYPE else b""
+    member = tarfile.TarInfo("a.binproto-00000-of-00001")
+    member.size, member.type = len(head) + size, kind
+    path.write_bytes(gzip.compress(member.tobuf(tarfile.GNU_FORMAT) + head + bytes(size + 10_240), 1))
+
+
+def check(path: Path) -> None:
+    (problem, *_) = check_submission(path).problems
+    raise problem
+
+
+MIB = 1 << 20
+BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]] = {
+    "an array by its header": (
+        lambda to: npz(to, {"x": ((10**13,), 16)}),
+        read_rollouts,
+        "field x.* by its header",
+    ),
+    "an array that is there": (
+        lambda to: npz(to, {"x": ((600 * MIB // 4,), 600 * MIB)}),
+        read_rollouts,
+        "field x",
+    ),
+    "several arrays": (
+        lambda to: npz(to, dict.fromkeys("ab", ((5 * MIB,), 20 * MIB))),
+        lambda of: read_npz(of, most=30 * MIB),
+        "field b",
+    ),
+    "a scenario": (lambda to: shard(to, 130 * MIB), check, "a message of 136314880 bytes"),
+    "another message": (lambda to: shard(to, 50 * MIB, 18), check, "a message of 52428800 bytes"),
+    "a long name": (
+        lambda to: shard(to, 50 * MIB, kind=tarfile.GNUTYPE_LONGNAME),
+        check,
+        "52428800 bytes of a header",
+    ),
+    "a header": (lambda to: shard(to, 50 * MIB, kind=tarfile.XHDTYPE), check, "52428800 bytes of a header"),
+}
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+def test_sizes_come_before_memory(kind: str, tmp_path: Path) -> None:
+    make, read, why = BOMBS[kind]
+    make(path := tmp_path / "bomb")
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=why):
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < 32 * MIB
+    finally:
+        tracemalloc.stop()
