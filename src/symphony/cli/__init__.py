@@ -48,6 +48,9 @@ FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
 RESULTS = ("json", "figure", "out")
 """Fields of commands: files that are written once everything is done, those whose metavar is FILE."""
 
+RENAMED: dict[str, str] = {}
+"""Options that the last release called otherwise, such as ``{"evaluate --old": "--new"}``; they go with the next."""
+
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
 Every command explains itself, as in `symphony data convert --help`. The version: `symphony --version`. With
@@ -87,6 +90,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
+        args = _renamed(args)
         if args[:1] == ["train"]:
             args = profiles.expanded(args)
         command = app.cli(
@@ -112,6 +116,20 @@ def main(args: Sequence[str] | None = None) -> int:
             command.run()
 
     return guarded(run)
+
+
+def _renamed(args: list[str]) -> list[str]:
+    """Arguments with options by their names of today."""
+    for old, new in RENAMED.items():
+        *command, name = old.split()
+        for place, word in enumerate(args if args[: len(command)] == command else ()):
+            given, *value = word.split("=", 1)
+            if given.replace("_", "-") == name:
+                sys.stderr.write(
+                    f"symphony: warning: {name} is called {new} now, and won't be known much longer\n"
+                )
+                args = [*args[:place], "=".join([new, *value]), *args[place + 1 :]]
+    return args
 
 
 def results_of(command: Any) -> Iterator[Path]:
