@@ -12,6 +12,8 @@ CORE := $(VENV)/.core
 DEV := $(VENV)/.dev
 CONSTRAINTS ?= constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
+# All there are, so that no test is skipped for want of one.
+EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video
 SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md
 
 .DEFAULT_GOAL := help
@@ -103,5 +105,5 @@ $(CORE): pyproject.toml $(CONSTRAINTS)
 	@touch $@
 
 $(DEV): $(CORE)
-	$(INSTALL) -e '.[dev,docs]'
+	$(INSTALL) -e '.[$(EXTRAS)]'
 	@touch $@
