@@ -54,7 +54,8 @@ RENAMED: dict[str, str] = {}
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
 Every command explains itself, as in `symphony data convert --help`. The version: `symphony --version`. With
-SYMPHONY_DEBUG=1 in the environment, errors come with their traceback."""
+SYMPHONY_DEBUG=1 in the environment, errors come with their traceback. Exit status: 0 done, 1 failed, 2 wrong usage,
+3 every simulated run failed."""
 
 # Every command is a dataclass: its fields are the arguments, `run` does the work and raises what goes wrong.
 app = tyro.extras.SubcommandApp()
