@@ -187,7 +187,8 @@ def lock_file(path: Path) -> AbstractContextManager[object]:
 
 
 def _program() -> str:
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]])
+    program = Path(sys.argv[0])
+    return " ".join([program.parent.name if program.stem == "__main__" else program.name, *sys.argv[1:2]])
 
 
 def _is_at(file: int, path: Path) -> bool:
