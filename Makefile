@@ -12,7 +12,9 @@ CORE := $(VENV)/.core
 DEV := $(VENV)/.dev
 CONSTRAINTS ?= constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
-SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md
+# All there are, so that no test is skipped for want of one.
+EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video
+SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
@@ -103,5 +105,5 @@ $(CORE): pyproject.toml $(CONSTRAINTS)
 	@touch $@
 
 $(DEV): $(CORE)
-	$(INSTALL) -e '.[dev,docs]'
+	$(INSTALL) -e '.[$(EXTRAS)]'
 	@touch $@

@@ -7,13 +7,16 @@ import multiprocessing
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
 
 from helpers_processes import serve_from_here
+from helpers_skips import LIMITS, by_kind, grown
 from symphony.data import engine
 
 # A busy machine must not fail a test; other examples are tried each time.
@@ -37,6 +40,33 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     serve_from_here()
+
+
+def _skipped(config: pytest.Config) -> Counter[str]:
+    reporter: Any = config.pluginmanager.get_plugin("terminalreporter")
+    reports = [] if reporter is None else reporter.stats.get("skipped", [])
+    return by_kind([str(report.longrepr[2]) for report in reports])
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """With SYMPHONY_SKIPS in the environment (.ci/run) more skipped tests than are written down are a failure."""
+    if (
+        os.environ.get("SYMPHONY_SKIPS")
+        and not session.exitstatus
+        and grown(_skipped(session.config), LIMITS.read_text())
+    ):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Say what skipped tests lacked."""
+    counts = _skipped(config)
+    if counts:
+        terminalreporter.section("skipped for want of")
+        for kind, count in counts.most_common():
+            terminalreporter.line(f"{count:4} {kind}")
+    for line in grown(counts, LIMITS.read_text()) if os.environ.get("SYMPHONY_SKIPS") else ():
+        terminalreporter.line(line, red=True)
 
 
 @pytest.fixture(autouse=True)

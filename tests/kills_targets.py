@@ -38,7 +38,7 @@ from symphony.simulation.saving import save_simulation
 AGENT = "pretrained:bc_ts_h"
 TIMES = ("seconds", "updates_per_second", "cost", "out", "path")
 """Names of what is a matter of the clock or of the folder."""
-PASSING = ("run.lock", "store.lock")
+PASSING = ("run.lock", "store.lock", "rollouts.lock")
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 
 import symphony.data.convert
+from helpers_cli import words
 from helpers_interaction import public, track
 from helpers_processes import apart
 from helpers_segments import crossing, straight_road
 from symphony import __version__
-from symphony.cli import main
+from symphony.cli import RENAMED, main
 from symphony.cli.data import Info
 from symphony.data.segment import RunSegment
 from symphony.data.sources import Reader
@@ -356,3 +357,28 @@ def test_options_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str
     for option, value in (("--window", "4"), ("--stride", "2"), ("--motion", "positions")):
         assert main(["data", "convert", "womd", file, "--out", str(tmp_path / "b"), option, value]) == 2
         assert f"{option} is for interaction" in capsys.readouterr().err
+
+
+def test_what_users_type_changes_on_purpose_only() -> None:
+    held = (Path(__file__).parent / "cli.txt").read_text().splitlines()
+    now = words()
+    assert now == held, (
+        f"gone: {sorted(set(held) - set(now))}, new: {sorted(set(now) - set(held))}; "
+        "rename through cli.RENAMED, and write the list anew: python tests/helpers_cli.py > tests/cli.txt"
+    )
+    for old, new in RENAMED.items():
+        assert old not in held
+        assert f"{old.rpartition(' ')[0]} {new}" in held
+
+
+@pytest.mark.parametrize("given", [["--old-name", "idm"], ["--old_name=idm"]])
+def test_a_renamed_option_goes_on_working(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], given: list[str]
+) -> None:
+    monkeypatch.setattr(symphony.cli, "RENAMED", {"evaluate --old-name": "--planner"})
+    monkeypatch.setattr(symphony.cli, "guarded", lambda run: 0)
+    assert main(["evaluate", "playback", "--data", "x", *given]) == 0
+    assert capsys.readouterr().err == (
+        "symphony: warning: --old-name is called --planner now, and won't be known much longer\n"
+    )
+    assert main(["simulate", "playback", "--data", "x", "--out", "y", *given]) == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from symphony.cli import main
 from symphony.cli.tables import KINDS, print_metrics, print_table
 from symphony.cli.train import last_words
 from symphony.config import ValidationConfig
+from symphony.errors import ConfigError
 from symphony.recipes import train
 from symphony.training.logging import Tracker
 
@@ -96,3 +98,32 @@ def test_weights_and_biases_is_told_project_group_and_tags(
     assert (told["project"], told["group"], told["tags"]) == ("mine", "seeds", ["a", "b"])
     Tracker(tmp_path, {}, "offline").close()
     assert (told["project"], told["group"], told["tags"]) == ("symphony", None, None)
+
+
+def test_a_run_that_goes_on_is_the_same_at_weights_and_biases(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import wandb
+
+    told: list[dict[str, Any]] = []
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setattr(wandb, "init", lambda **given: told.append(given))
+    for after in (0, 3, 0):
+        Tracker(tmp_path, {}, "offline", after=after).close()
+    assert [given["resume"] for given in told] == [None, "allow", None]
+    assert told[0]["id"] == told[1]["id"] != told[2]["id"]
+    (tmp_path / "wandb-id").write_text("../other\n")
+    Tracker(tmp_path, {}, "offline", after=3).close()
+    assert re.fullmatch(r"[0-9a-f]{8}", told[3]["id"])
+
+
+def test_without_a_key_there_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import wandb
+
+    def init(**given: Any) -> None:
+        raise wandb.errors.UsageError("No API key configured.\nUse `wandb login` to log in.")
+
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setattr(wandb, "init", init)
+    with pytest.raises(ConfigError, match=r"^Weights & Biases: No API key .*log in\. .*--wandb offline$"):
+        Tracker(tmp_path, {}, "online")

@@ -98,7 +98,6 @@ def test_killed_between_any_two_changes_of_a_file(
     begin.mkdir()
     if way == "append":
         convert(FakeReader(), [logs[0]], begin / "store")
-        (begin / "store" / "store.lock").unlink()
 
     def run(folder: Path) -> Any:
         return convert(FakeReader(), logs, folder / "store", workers=workers, append=way == "append")

@@ -57,6 +57,7 @@ def commands(page: str) -> list[list[str]]:
     return found
 
 
+@pytest.mark.filterwarnings("ignore::symphony.errors.DataWarning")  # code that an agent names, and is trusted
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
 def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

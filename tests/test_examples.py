@@ -20,6 +20,7 @@ from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
+from symphony.errors import DataWarning
 from symphony.recipes import train
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.saving import save_simulation
@@ -162,4 +163,6 @@ def test_a_recipe_learns_with_attention(example: Any, tmp_path: Path) -> None:
     assert example("attention").Others
     config = tiny("bc", builtin_store("train"), tmp_path / "run", steps=2, checkpoint_every=2)
     config = replace(config, agent=replace(config.agent, encoder="attention:Others", hidden=8))
-    assert "keys" in str(load_agent(str(train(config))).policy)
+    with pytest.warns(DataWarning, match="agent.encoder runs code, 'attention:Others'"):
+        agent = load_agent(str(train(config)), trust_code=True)
+    assert "keys" in str(agent.policy)

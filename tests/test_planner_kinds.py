@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from pathlib import Path
@@ -48,7 +49,7 @@ for line in sys.stdin:
     else:
         ego, dt = told["plan"]["ego"], scene["dt"]
         assert len(told["plan"]["agents"]["x"]) == len(told["plan"]["agents"]["type"])
-        print(json.dumps([-1.0, 0.0]), flush=True)
+        print(json.dumps({"step": told["plan"]["step"], "plan": [-1.0, 0.0]}), flush=True)
 """
 
 
@@ -119,7 +120,10 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("said", "why"),
     [
-        ("[NaN, 0.0]", "not finite"),
+        ('{"step": 2, "plan": [NaN, 0.0]}', "not finite"),
+        ('{"step": 2, "plan": null}', "step 2: "),
+        ('{"step": 1, "plan": [-1.0, 0.0]}', 'step 2: ValueError: answered .* not {"step": 2, '),
+        ("[-1.0, 0.0]", 'step 2: ValueError: answered .* not {"step": 2, '),
         ('{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
         ("what?", "step 2: JSONDecodeError"),
         ("null", "step 2: "),
@@ -132,7 +136,7 @@ def test_what_another_process_says_wrong_fails_the_run(
     command = f"pipe:{sys.executable} {tmp_path}/piped.py 2 '{said}'"
     folder = run(store, tmp_path / "sim", command, "playback", rollouts=1)
     for saved in folder:
-        assert why in saved.failed[0]
+        assert re.search(why, saved.failed[0])
         assert saved.counted[0].sum() == 2
 
 
@@ -365,8 +369,98 @@ def test_a_folder_without_a_planner_is_refused(store: Path, tmp_path: Path) -> N
 
 def test_files_that_cannot_be_run_are_named(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("1 / 0\n")
-    with pytest.raises(ConfigError, match=r"broken.py can't be imported: ZeroDivisionError"):
+    with pytest.raises(ConfigError, match=r"broken.py.*ZeroDivisionError"):
         planner_maker(f"{tmp_path}/broken.py:plan")
     (tmp_path / "empty.py").write_text("")
     with pytest.raises(ConfigError, match=r"no attribute 'plan'"):
         planner_maker(f"{tmp_path}/empty.py:plan")
+
+
+ODD = """
+import json, os, sys, time
+kind, said = sys.argv[1], sys.argv[2]
+if kind == "child" and os.fork() == 0:
+    open(said, "a").write(f"{os.getpid()}\\n")
+    time.sleep(100)
+if kind == "env":
+    open(said, "w").write(json.dumps(dict(os.environ)))
+for line in sys.stdin:
+    told = json.loads(line)
+    step = told.get("plan", {}).get("step")
+    if step == 2 and kind == "flood":
+        while True:
+            sys.stdout.write("x" * 65536)
+    if step == 2 and kind == "binary":
+        sys.stdout.buffer.write(b"\\xff\\x00\\n")
+        sys.stdout.flush()
+    if step == 2 and kind == "deep":
+        print("[" * 200_000 + "]" * 200_000, flush=True)
+        continue
+    if step == 2 and kind == "debug":
+        print([0.0, 0.0], flush=True)
+    print(json.dumps({} if step is None else {"step": step, "plan": [-1.0, 0.0]}), flush=True)
+    if step == 2 and kind == "twice":
+        print(json.dumps({"step": step, "plan": [-1.0, 0.0]}), flush=True)
+        time.sleep(0.1)
+"""
+
+
+def odd(store: Path, tmp_path: Path, kind: str) -> RolloutFolder:
+    (tmp_path / "odd.py").write_text(ODD)
+    command = f"pipe:{sys.executable} {tmp_path}/odd.py {kind} {tmp_path}/said"
+    return run(store, tmp_path / "sim", command, "playback", rollouts=1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "step", "why"),
+    [
+        ("flood", 2, "an answer of more than 1048576 bytes"),
+        ("binary", 2, "UnicodeDecodeError|JSONDecodeError|more than one line"),
+        ("deep", 2, "RecursionError"),
+        ("debug", 2, "more than one line for an answer|answered"),
+        ("twice", "[23]", "more than one line for an answer|answered"),
+    ],
+)
+def test_whatever_else_a_process_writes_ends_its_run(
+    store: Path, tmp_path: Path, kind: str, step: Any, why: str
+) -> None:
+    began = time.monotonic()
+    for saved in odd(store, tmp_path, kind):
+        assert re.search(f"step {step}: .*({why})", saved.failed[0]), saved.failed
+    assert time.monotonic() - began < 30
+
+
+def test_what_a_process_started_ends_with_it(store: Path, tmp_path: Path) -> None:
+    assert not any(saved.failed for saved in odd(store, tmp_path, "child"))
+    children = [int(word) for word in (tmp_path / "said").read_text().split()]
+    assert len(children) == 2
+    late = time.monotonic() + 10
+    while time.monotonic() < late and any(map(lives, children)):
+        time.sleep(0.05)
+    assert not any(map(lives, children))
+
+
+def lives(process: int) -> bool:
+    """Whether there is such a process, and it is no zombie that nobody has asked for."""
+    stat = Path(f"/proc/{process}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_a_process_gets_a_small_environment(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("SECRET", "GIVEN", "ALSO", "PYTHONHASHSEED", "LANG"):
+        monkeypatch.setenv(name, "1")
+    monkeypatch.setenv("SYMPHONY_PLANNER_ENV", "GIVEN, ALSO")
+    odd(store, tmp_path, "env")
+    found = json.loads((tmp_path / "said").read_text())
+    assert {"GIVEN", "ALSO", "PATH", "PYTHONHASHSEED", "LANG"} <= found.keys()
+    others = found.keys() - {
+        "GIVEN",
+        "ALSO",
+        "PATH",
+        "HOME",
+        "LANG",
+        "LC_CTYPE",
+    }  # the last is Python's own doing
+    assert all(name.startswith("PYTHON") for name in others), others

@@ -286,6 +286,7 @@ def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     writer.add(played(hit.replace(group="north"), rollouts=2))
     writer.add(played(free.replace(group="south"), rollouts=2, failed={1: "planner raised ValueError"}))
     writer.fail("lost", 2, "no ego")
+    writer.close()
     folder = save_rollouts(tmp_path / "sim", ABOUT, [])
     found = report(folder)
     totals = found.totals()
@@ -455,3 +456,13 @@ def test_the_command_writes_page_numbers_and_table(
     ]
     assert main(["report", str(tmp_path / "nothing")]) == 1
     assert "no folder of rollouts" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["=HYPERLINK(1)", "+1", "-x", "@SUM(A1)", "plain"])
+def test_words_are_no_formulas_in_a_spreadsheet(tmp_path: Path, name: str) -> None:
+    found = report(save_rollouts(tmp_path, ABOUT, [played(straight_road().replace(segment_id=name))]))
+    lines = found.csv().splitlines()
+    cells = dict(zip(*csv.reader(lines[:2]), strict=True))
+    assert cells["segment"] == (name if name == "plain" else f"'{name}")
+    assert all(cell[:1] not in ("=", "+", "@") for line in csv.reader(lines) for cell in line)
+    assert float(cells["max_jerk"]) == found.rows[0]["max_jerk"]  # numbers are left alone

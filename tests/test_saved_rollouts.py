@@ -112,6 +112,7 @@ def test_an_interrupted_folder_is_continued(tmp_path: Path) -> None:
     writer = RolloutWriter(tmp_path / "cut", ABOUT)
     writer.add(found[0])
     writer.fail(found[1].segment.segment_id, 2, "out of memory")
+    writer.close()
     assert [entry.failed for entry in load_rollouts(tmp_path / "cut").failures] == ["out of memory"]
     with (tmp_path / "cut" / "index.jsonl").open("a") as index:
         index.write('{"segment": "straight-2", "roll')

@@ -180,8 +180,8 @@ def test_checkpoints_without_the_configuration_they_go_with_are_refused(
 LOCKED = """
 import sys, time
 from pathlib import Path
-from symphony.files import lock
-held = lock(Path(sys.argv[1]))
+from symphony.files import Lock
+held = Lock(Path(sys.argv[1]))
 print("held", flush=True)
 time.sleep(600)
 """
@@ -197,7 +197,7 @@ def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(DataError, match=r"part: is being written by another process"):
+        with pytest.raises(DataError, match=rf"part: is being written by another process: {other.pid} on "):
             train(settings)
         assert (learned(part), records(part)) == (before, records(run))
         other.kill()

@@ -17,7 +17,7 @@ from helpers_runs import tiny
 from helpers_segments import crossing
 from helpers_store import fill
 from symphony.agents import load_agent
-from symphony.cli import main
+from symphony.cli import ALL_FAILED, main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
@@ -56,6 +56,14 @@ def told(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
         return code, " ".join((printed.out + printed.err).split())
 
     return call
+
+
+BRAKE = """
+import json, sys
+for line in sys.stdin:
+    told = json.loads(line)
+    print(json.dumps({} if "reset" in told else {"step": told["plan"]["step"], "plan": [-1.0, 0.0]}), flush=True)
+"""
 
 
 def drive(store: Path, *more: Any, rollouts: int = 1) -> list[Any]:
@@ -231,7 +239,7 @@ def test_planners_that_no_file_defines(store: Path, tmp_path: Path) -> None:
 
 
 def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path, told: Any) -> None:
-    Path("brake.py").write_text("import sys\nfor line in sys.stdin:\n    print('{}', flush=True)\n")
+    Path("brake.py").write_text(BRAKE)
     command = ["simulate", run, "--data", store, "--segments", 0, "--rollouts", 2, "--out", "a"]
     code, words = told(*command, "--planner", "pipe:python brake.py")
     assert code == 1
@@ -242,10 +250,14 @@ def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path,
 def test_a_report_of_nothing_says_so(store: Path, told: Any) -> None:
     Path("mine.py").write_text(PLAN.format("missing"))
     code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
-    assert (code, "1 of 1 runs failed" in words) == (0, True)
+    assert (code, "all 1 runs failed" in words) == (ALL_FAILED, True)
     code, words = told("report", "a", "--evaluated", "ego")
-    assert code == 0
+    assert code == ALL_FAILED
     assert "no run could be evaluated" in words
+    assert Path("a/report.html").is_file()
+    code, words = told("evaluate", *drive(store, "--planner", "mine.py:plan", "--json", "a.json")[1:])
+    assert (code, "all 1 runs failed" in words) == (ALL_FAILED, True)
+    assert Path("a.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -259,9 +271,17 @@ def test_a_report_of_nothing_says_so(store: Path, told: Any) -> None:
 def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, body: str, reason: str) -> None:
     Path("mine.py").write_text(PLAN.format(body))
     code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
-    assert code == 0
-    assert "1 of 1 runs failed" in words
+    assert code == ALL_FAILED
+    assert "all 1 runs failed" in words
     assert reason in words
+
+
+def test_some_runs_that_fail_are_told_of(store: Path, told: Any) -> None:
+    Path("mine.py").write_text(PLAN.format("1 / (seen.seed % 2) and (0.0, 0.0)"))
+    code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a", rollouts=8))
+    assert code == 0
+    assert "of 8 runs failed, the first: " in words
+    assert told("report", "a", "--evaluated", "ego")[0] == 0
 
 
 def test_a_batch_of_planners_that_plans_nothing() -> None:

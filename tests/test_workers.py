@@ -60,7 +60,8 @@ class Seen:
         self.progress: list[tuple[int, int]] = []
         self.batches: list[EvaluatedBatch] = []
         self.clips = ClipKeeper([1, 4], 2)
-        keepers = [self.clips, RolloutKeeper(RolloutWriter(out, ABOUT), "tiny"), self.batches.append]
+        writer = RolloutWriter(out, ABOUT)
+        keepers = [self.clips, RolloutKeeper(writer, "tiny"), self.batches.append]
 
         def observe(batch: EvaluatedBatch) -> None:
             for keeper in keepers:
@@ -72,6 +73,7 @@ class Seen:
         self.found: Evaluation = evaluate(
             make_agent(), store, replace(CONFIG, **changes), progress, baselines=True, observe=observe
         )
+        writer.close()
         self.files = files(out)
 
     def numbers(self) -> list[Any]:

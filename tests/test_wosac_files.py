@@ -243,7 +243,7 @@ def with_nan(array: Any) -> Any:
     (put(z=lambda a: a[0]), ("field z", "(3, 80), expected (32, 3, 80)")),
     (put(z=lambda a: a.astype(int)), ("field z", "floating-point")),
     (put(x=with_nan), ("field x", "agent 101, rollout 3, step 18: not finite")),
-    (put(y=lambda a: a.astype(object)), ("field y: damaged", "pickle")),
+    (put(y=lambda a: a.astype(object)), ("field y", "damaged: an array of objects")),
 ])  # fmt: skip
 def test_wrong_rollouts(
     one: tuple[Path, Path],

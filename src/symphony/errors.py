@@ -20,6 +20,10 @@ def printable(text: str, keep: str = "") -> str:
     )
 
 
+class AllFailedError(SymphonyError):
+    """Every run failed: there are results, but they only say why. The command line ends with a status of its own."""
+
+
 class DataError(SymphonyError):
     """Bad or unusable data.
 

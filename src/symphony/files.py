@@ -6,10 +6,14 @@ import json
 import math
 import os
 import re
+import socket
+import sys
+import uuid
+import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from symphony.errors import DataError
 
@@ -105,24 +109,100 @@ def json_text(result: Any) -> str:
     return json.dumps(finite(result), indent=2, allow_nan=False) + "\n"
 
 
-def lock(path: Path) -> BinaryIO:
-    """Keep other writers out of a folder until the file that is returned is closed, or this process ends.
+class Lock:
+    """Keeps other writers out of a folder, or a file, until it is closed or this process ends.
 
     Args:
-        path: the file in the folder that stands for it; it stays there.
+        path: the file that stands for it, removed in the end. It says who writes, which whoever else comes is told.
+        output: what is written; by default the folder of that file.
+
+    Attributes:
+        run: an id of what is done.
 
     Raises:
-        DataError: another process is in there, or the disk refuses; names the folder.
+        DataError: another process is at it, or the disk refuses; names the output.
     """
+
+    def __init__(self, path: Path, output: Path | None = None) -> None:
+        self.path, self.output, self.run = path, output or path.parent, uuid.uuid4().hex[:8]
+        with naming(path):
+            self._file = self._taken()
+            who = f"{os.getpid()} on {socket.gethostname()}, run {self.run} of {_program()}"
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, who.encode(errors="replace"), 0)
+        self._close = weakref.finalize(self, _release, path, self._file, os.getpid())
+
+    def _taken(self) -> int:
+        while True:
+            file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            try:
+                if fcntl is not None:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                who = os.pread(file, 500, 0).decode(errors="replace")
+                os.close(file)
+                raise DataError(f"is being written by another process: {who}", file=self.output) from error
+            except OSError:
+                os.close(file)
+                raise
+            if _is_at(file, self.path):
+                return file
+            os.close(file)  # who had it has removed it meanwhile
+
+    def check(self) -> None:
+        """See that the output is still ours.
+
+        Raises:
+            DataError: the folder was removed, and another process may be writing a new one there.
+        """
+        if not _is_at(self._file, self.path):
+            message = f"was removed or replaced while run {self.run} wrote into it"
+            raise DataError(message, file=self.output)
+
+    def close(self) -> None:
+        """Let others in."""
+        self._close()
+
+    def __enter__(self) -> Lock:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def lock_file(path: Path) -> AbstractContextManager[object]:
+    """Keep other writers away from a file for as long as the work on it takes; makes its folder.
+
+    What is no ordinary file (a terminal, a pipe) is left alone.
+
+    Raises:
+        DataError: as :class:`Lock`.
+    """
+    place = Path(os.path.realpath(path))
+    if place.exists() and not place.is_file():
+        return nullcontext()
     with naming(path):
-        file = path.open("ab")
-    if fcntl is not None:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.close()
-            raise DataError("is being written by another process", file=path.parent) from error
-    return file
+        place.parent.mkdir(parents=True, exist_ok=True)
+    return Lock(place.with_name(f".{place.name}.lock"), path)
+
+
+def _program() -> str:
+    program = Path(sys.argv[0])
+    return " ".join([program.parent.name if program.stem == "__main__" else program.name, *sys.argv[1:2]])
+
+
+def _is_at(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _release(path: Path, file: int, process: int) -> None:
+    # A copy of the process that took it has no say.
+    if os.getpid() == process and _is_at(file, path):
+        path.unlink(missing_ok=True)
+    os.close(file)
 
 
 @contextmanager

@@ -13,18 +13,29 @@ from typing import Any
 from symphony.errors import ConfigError
 
 
-def load_object(path: str) -> Any:
-    """Import ``module:name``; modules in the current folder are found, as with ``python -m``. A file will do, too:
-    ``path/to/file.py:name``, with what lies beside it to import.
+def load_object(path: str, *, here: bool = True) -> Any:
+    """Import ``module:name``. A file will do, too: ``path/to/file.py:name``, with what lies beside it to import.
+
+    Args:
+        path: the import path.
+        here: find modules in the current folder, too, as ``python -m`` does. Not for paths that the user did not
+            type: whatever lies in the folder would run.
 
     Raises:
         ConfigError: if there is no such module, file or name.
     """
     module, _, name = path.rpartition(":")
-    if os.getcwd() not in sys.path and "" not in sys.path:
-        sys.path.append(os.getcwd())
+    find = (
+        (lambda: _file(Path(module))) if module.endswith(".py") else lambda: importlib.import_module(module)
+    )
     try:
-        found = _file(Path(module)) if module.endswith(".py") else importlib.import_module(module)
+        try:
+            found = find()
+        except ModuleNotFoundError:
+            if not here or os.getcwd() in sys.path or "" in sys.path:
+                raise
+            sys.path.append(os.getcwd())
+            found = find()
         for part in name.split("."):
             found = getattr(found, part)
     except ConfigError:
@@ -50,9 +61,9 @@ def _file(path: Path) -> ModuleType:
     sys.modules[str(path)] = module
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:  # whatever a user's file raises
+    except BaseException:
         del sys.modules[str(path)]
-        raise ConfigError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
+        raise
     return module
 
 

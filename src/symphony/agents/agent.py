@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from symphony.agents.checkpoint import load_checkpoint
+from symphony.agents.checkpoint import CheckpointError, load_checkpoint
 from symphony.agents.choice import choose, split_name
 from symphony.agents.included import PREFIX
 from symphony.agents.networks import (
@@ -24,7 +25,8 @@ from symphony.config import AgentSpec, SearchConfig, read_json
 from symphony.envs.baselines import ConstantVelocity, RandomActions
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataWarning
+from symphony.imports import load_object
 
 PLAYBACK = "playback"
 """Name of the logged trajectories themselves, evaluated like an agent."""
@@ -125,7 +127,7 @@ def build_agent(name: str, spec: AgentSpec) -> Agent:
     )
 
 
-def load_agent(name: str, device: str = "cpu") -> Agent:
+def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> Agent:
     """An agent by name.
 
     Args:
@@ -134,10 +136,12 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
             the best checkpoint is taken if it was validated, else the last; ``RUN@last``, ``RUN@best`` or
             ``RUN@3000`` (a step) names another.
         device: where its weights go.
+        trust_code: let its folder name code by import paths, which then runs with all rights of this process; a
+            :class:`~symphony.errors.DataWarning` says which. Without it such a folder is refused.
 
     Raises:
-        ConfigError: if there is no such agent, checkpoint or device.
-        CheckpointError: if its weights can't be read.
+        ConfigError: if there is no such agent, checkpoint or device, or the folder names code.
+        CheckpointError: if its weights can't be read, or its networks are larger than they are.
     """
     if name == PLAYBACK:
         return Agent(name, None)
@@ -148,11 +152,49 @@ def load_agent(name: str, device: str = "cpu") -> Agent:
     if name == "random":
         return Agent(name, RandomActions(Bicycle()))
     folder, which = split_name(name)
-    agent = build_agent(name, read_spec(folder))
-    load_checkpoint(choose(folder, which), modules=agent.modules, partial=True, restore_rng=False)
+    spec = read_spec(folder)
+    _check_code(spec, folder / FILE, trust_code)
+    checkpoint = choose(folder, which)
+    if not spec.code:
+        _check_sizes(name, spec, folder / FILE, checkpoint)
+    agent = build_agent(name, spec)
+    load_checkpoint(checkpoint, modules=agent.modules, partial=True, restore_rng=False)
     for module in agent.modules.values():
         module.eval()
     return agent.to(usable_device(device))
+
+
+def _check_code(spec: AgentSpec, file: Path, trusted: bool) -> None:
+    """See that a specification from a file names code only where the user trusts it, and import that."""
+    for setting, path in spec.code.items():
+        if not trusted:
+            raise ConfigError(
+                f"{file}: {setting} names code, '{path}', that would run with all your rights; if you trust it, "
+                "say --trust-code (in Python: trust_code=True)"
+            )
+        warnings.warn(f"{file}: {setting} runs code, '{path}'", DataWarning, stacklevel=3)
+        try:
+            load_object(path, here=False)
+        except ConfigError as error:
+            raise ConfigError(
+                f"{error}; for an agent's own code the current folder is not searched: name a file, or set PYTHONPATH"
+            ) from error
+
+
+def _check_sizes(name: str, spec: AgentSpec, file: Path, checkpoint: Path) -> None:
+    """See that networks are no larger than their weights on the disk, before they take memory."""
+    try:
+        with torch.device("meta"):
+            modules = build_agent(name, spec).modules
+    except (RuntimeError, OverflowError) as error:  # sizes that no tensor can have
+        raise ConfigError(f"{file}: no networks of these sizes: {str(error)[:200]}") from error
+    for part, module in modules.items():
+        asked = sum(tensor.numel() * tensor.element_size() for tensor in module.state_dict().values())
+        held = checkpoint / f"module.{part}.safetensors"
+        if held.is_file() and asked > held.stat().st_size:
+            raise CheckpointError(
+                f"has {held.stat().st_size} bytes, and {file} asks for a network of {asked}", file=held
+            )
 
 
 def usable_device(name: str) -> torch.device:

@@ -13,7 +13,8 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import TextIO
+from pathlib import Path
+from typing import Any, TextIO, get_type_hints
 
 import tyro
 
@@ -37,20 +38,24 @@ from symphony.cli import (
     wosac,
 )
 from symphony.cli.helps import PARAGRAPHS
-from symphony.errors import ConfigError, DataWarning, SymphonyError, printable
-from symphony.files import check_writable
+from symphony.errors import AllFailedError, ConfigError, DataWarning, SymphonyError, printable
+from symphony.files import check_writable, lock_file
 
 __all__ = ["main"]
 
-FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
 
-RESULTS = ("json", "figure")
-"""Fields of commands: files that are written once everything is done."""
+RESULTS = ("json", "figure", "out")
+"""Fields of commands: files that are written once everything is done, those whose metavar is FILE."""
+
+RENAMED: dict[str, str] = {}
+"""Options that the last release called otherwise, such as ``{"evaluate --old": "--new"}``; they go with the next."""
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
 Every command explains itself, as in `symphony data convert --help`. The version: `symphony --version`. With
-SYMPHONY_DEBUG=1 in the environment, errors come with their traceback."""
+SYMPHONY_DEBUG=1 in the environment, errors come with their traceback. Exit status: 0 done, 1 failed, 2 wrong usage,
+3 every simulated run failed."""
 
 # Every command is a dataclass: its fields are the arguments, `run` does the work and raises what goes wrong.
 app = tyro.extras.SubcommandApp()
@@ -77,7 +82,7 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the arguments, by default those of the process.
 
     Returns:
-        Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 143 terminated.
+        Exit status: 0 done, 1 failed, 2 wrong usage, 3 every simulated run failed, 130 interrupted, 143 terminated.
     """
     if args is None:
         settle()
@@ -86,6 +91,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
+        args = _renamed(args)
         if args[:1] == ["train"]:
             args = profiles.expanded(args)
         command = app.cli(
@@ -104,13 +110,36 @@ def main(args: Sequence[str] | None = None) -> int:
         return guarded(_gone)
 
     def run() -> None:
-        for name in RESULTS:
-            path = getattr(command, name, None)
-            if path is not None and str(path) != "-":
+        with contextlib.ExitStack() as held:
+            for path in results_of(command):
                 check_writable(path)
-        command.run()
+                held.enter_context(lock_file(path))
+            command.run()
 
     return guarded(run)
+
+
+def _renamed(args: list[str]) -> list[str]:
+    """Arguments with options by their names of today."""
+    for old, new in RENAMED.items():
+        *command, name = old.split()
+        for place, word in enumerate(args if args[: len(command)] == command else ()):
+            given, *value = word.split("=", 1)
+            if given.replace("_", "-") == name:
+                sys.stderr.write(
+                    f"symphony: warning: {name} is called {new} now, and won't be known much longer\n"
+                )
+                args = [*args[:place], "=".join([new, *value]), *args[place + 1 :]]
+    return args
+
+
+def results_of(command: Any) -> Iterator[Path]:
+    """Files that a command writes."""
+    for name, hint in get_type_hints(type(command), include_extras=True).items():
+        path, extras = getattr(command, name), getattr(hint, "__metadata__", ())
+        named = any(getattr(extra, "metavar", None) == "FILE" for extra in extras)
+        if name in RESULTS and named and path is not None and str(path) != "-":
+            yield path
 
 
 def settle() -> None:
@@ -162,7 +191,7 @@ def guarded(action: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except (SymphonyError, OSError) as error:
-        return _complain(error, FAILED)
+        return _complain(error, ALL_FAILED if isinstance(error, AllFailedError) else FAILED)
     return 0
 
 

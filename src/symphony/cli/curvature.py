@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 
@@ -31,6 +32,7 @@ class Curvature:
     """Store of run segments to simulate."""
     evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Without --data: which evaluation of a run counts, as in `symphony table`."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
@@ -87,7 +89,8 @@ class Curvature:
         from symphony.data.store import SegmentStore
         from symphony.evaluation.records import evaluation_record, keep_evaluation
 
-        agent, store = load_agent(str(run), self.config.device), SegmentStore(self.data)
+        agent = load_agent(str(run), self.config.device, trust_code=self.trust_code)
+        store = SegmentStore(self.data)
         record = evaluation_record(agent, evaluate_with_bar(agent, store, self.config, baselines=True), store)
         keep_evaluation(agent.name, record)
         return record

@@ -10,7 +10,7 @@ from symphony.cli.evaluate import evaluate_with_bar
 from symphony.cli.tables import print_metrics
 from symphony.config import EvaluateConfig, TrainConfig
 from symphony.config.profiles import demo
-from symphony.files import write_json
+from symphony.files import Lock, write_json
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,11 @@ class Demo:
 
     def run(self) -> None:
         """Run it."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        with Lock(self.out / "demo.lock"):
+            self._run()
+
+    def _run(self) -> None:
         import shutil
 
         from rich.console import Console

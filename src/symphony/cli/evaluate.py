@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.cli.tables import print_metrics, short_name, write_numbers
 from symphony.config import EvaluateConfig, WosacSettings
 from symphony.config.evaluation import check_planner_seconds
@@ -61,6 +62,7 @@ class Evaluate:
     search or without it (see docs/wosac.md)."""
     wosac_config: Literal["2024", "2025"] = "2025"
     """Year of the challenge whose weights the WOSAC score has."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
@@ -100,7 +102,8 @@ class Evaluate:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
 
             check_picture(self.figure)
-        agent, store = load_agent(self.agent, self.config.device), SegmentStore(self.data)
+        agent = load_agent(self.agent, self.config.device, trust_code=self.trust_code)
+        store = SegmentStore(self.data)
         config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
         chosen = segment_indices(store, self.segments)
         if self.metrics:
@@ -199,7 +202,7 @@ class Evaluate:
 
         from symphony.cli.planners import table_text
         from symphony.cli.plot import segment_indices
-        from symphony.cli.simulate import Simulate, failed_runs
+        from symphony.cli.simulate import Simulate, tell_failed
         from symphony.data.store import SegmentStore
         from symphony.evaluation.planners import planner_record
 
@@ -211,17 +214,17 @@ class Evaluate:
                 segments=self.segments,
                 planner=self.planner,
                 planner_seconds=self.planner_seconds,
+                trust_code=self.trust_code,
                 config=self.config,
             ).simulated()
             store = SegmentStore(self.data)
             chosen = segment_indices(store, self.segments) or range(len(store))
             folder = folder.only(store.ids[i] for i in chosen)
             record = planner_record(folder)
-            for line in failed_runs(folder):
-                sys.stderr.write(f"{line}\n")
-        if self.json is not None:
-            write_numbers(self.json, record)
-        (sys.stderr if str(self.json) == "-" else sys.stdout).write(table_text([record]))
+            if self.json is not None:
+                write_numbers(self.json, record)
+            (sys.stderr if str(self.json) == "-" else sys.stdout).write(table_text([record]))
+            tell_failed(folder, lambda line: sys.stderr.write(f"{line}\n"))
 
 
 def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False) -> None:

@@ -31,7 +31,7 @@ class Export:
         from rich.console import Console
 
         from symphony.errors import ConfigError
-        from symphony.files import naming, write_file
+        from symphony.files import Lock, naming, write_file
         from symphony.simulation.export import commonroad, to_dict
         from symphony.simulation.saved_files import file_stem, load_rollouts
 
@@ -39,17 +39,18 @@ class Export:
         out = self.folder / "export" if self.out is None else self.out
         with naming(out):
             out.mkdir(parents=True, exist_ok=True)
-        count = 0
-        for name in self.segments or folder.ids:
-            saved = folder.of(name)
-            for k in self.rollouts or range(saved.rollouts):
-                if not 0 <= k < saved.rollouts:
-                    raise ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
-                stem = out / f"{file_stem(name)}-{k}"
-                if self.format == "json":
-                    text = json.dumps(to_dict(saved, k), ensure_ascii=False, allow_nan=False)
-                    write_file(stem.with_name(f"{stem.name}.json"), text + "\n")
-                else:
-                    write_file(stem.with_name(f"{stem.name}.xml"), commonroad(saved, k))
-                count += 1
+        with Lock(out / "export.lock"):
+            count = 0
+            for name in self.segments or folder.ids:
+                saved = folder.of(name)
+                for k in self.rollouts or range(saved.rollouts):
+                    if not 0 <= k < saved.rollouts:
+                        raise ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
+                    stem = out / f"{file_stem(name)}-{k}"
+                    if self.format == "json":
+                        text = json.dumps(to_dict(saved, k), ensure_ascii=False, allow_nan=False)
+                        write_file(stem.with_name(f"{stem.name}.json"), text + "\n")
+                    else:
+                        write_file(stem.with_name(f"{stem.name}.xml"), commonroad(saved, k))
+                    count += 1
         Console().print(f"written: {count} files in {out}", soft_wrap=True, markup=False)

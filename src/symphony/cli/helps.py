@@ -5,11 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Annotated
 
+import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 PARAGRAPHS = ConstructorRegistry()
 """For `tyro.cli`, which by itself keeps the line breaks of an attribute's docstring where its lines are indented."""
+
+TrustCode = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Run the code that the agent's folder names by import paths; without it such a folder is refused."
+    ),
+]
 
 _under_way: list[object] = []
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.cli.curvature import Curvature
+from symphony.cli.helps import TrustCode
 from symphony.cli.tables import short_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
@@ -34,8 +35,9 @@ class Tree:
     """Store of run segments."""
     segment: str
     """The segment's id, or its number in the store."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> None:
@@ -48,7 +50,7 @@ class Tree:
         from symphony.simulation.crowd import crowd_dataset
 
         picture_path(self.out)
-        agent, config = load_agent(self.agent, self.config.device), self.config
+        agent, config = load_agent(self.agent, self.config.device, trust_code=self.trust_code), self.config
         store = SegmentStore(self.data)
         dataset = crowd_dataset(store, agent, config, [segment_index(store, self.segment)])
         plot_search(dataset.segment(0), search_tree(agent, dataset, 0, config), self.out)
@@ -66,7 +68,7 @@ class Rollouts:
     """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
     data: Path
     """Store of run segments."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg), or animation (.gif)."""
     segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
     """Their ids, or their numbers in the store; by default some, spread evenly over the store."""
@@ -74,6 +76,7 @@ class Rollouts:
     """How many, if none are named."""
     drawn: int = 8
     """Rollouts drawn of each segment, at most."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
@@ -93,7 +96,7 @@ class Rollouts:
 
         check_picture(self.out)
         agent, store, config = (
-            load_agent(self.agent, self.config.device),
+            load_agent(self.agent, self.config.device, trust_code=self.trust_code),
             SegmentStore(self.data),
             self.config,
         )
@@ -117,7 +120,7 @@ class Curves:
         tyro.conf.arg(metavar="RUN ...", help_behavior_hint="(required)"),
     ]
     """Folders of runs, still training or done."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
     metrics: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Draw these metrics only; by default all there are."""
@@ -157,7 +160,7 @@ class Segment:
     """Folder of the store."""
     segment: str
     """Its id, or its number in the store."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Picture to write (.png, .pdf or .svg)."""
     interactive: int = 2
     """Agents in colour, the ego included."""

@@ -48,7 +48,7 @@ def run(method: Method, description: str | None, args: Sequence[str] | None = No
     config = EvaluateConfig(
         rollouts=settings.rollouts, seed=settings.training.seed, device=settings.training.device
     )
-    agent = load_agent(str(folder), config.device)
+    agent = load_agent(str(folder), config.device, trust_code=True)  # the user's own words a moment ago
     found = evaluate_with_bar(agent, store, config, baselines=True)
     print_evaluation(found, settings.test)
     keep_evaluation(agent.name, evaluation_record(agent, found, store))

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from symphony.cli.tables import number_cell, print_table
+from symphony.errors import AllFailedError
+
+if TYPE_CHECKING:
+    from symphony.evaluation.report import Report as Found
+    from symphony.simulation.saved_files import RolloutFolder
 
 
 @dataclass(frozen=True)
@@ -30,36 +35,17 @@ class Report:
     def run(self) -> None:
         """Evaluate, write, and print the totals."""
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
         from rich.table import Table
 
-        from symphony.evaluation.report import report
-        from symphony.files import naming, write_file, write_json
-        from symphony.render.report_page import report_page
-        from symphony.render.viewer import view_page
+        from symphony.files import Lock, naming
         from symphony.simulation.saved_files import load_rollouts
 
         folder, out = load_rollouts(self.folder), self.folder if self.out is None else self.out
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("segments"),
-        )
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task("Evaluating", total=len(folder))
-            found = report(
-                folder, self.evaluated, lambda done, total: bar.update(task, completed=done, total=total)
-            )
-        plain = found.plain()
         with naming(out):
             out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "report.json", plain)
-        write_file(out / "report.csv", found.csv())
-        write_file(out / "report.html", report_page(plain, "view.html" if self.view else None))
-        if self.view:
-            replays = ((saved, found.events[saved.segment.segment_id]) for saved in folder)
-            write_file(out / "view.html", view_page(folder.about.agent, replays, folder.about.settings))
+        with Lock(out / "report.lock"):
+            found = self._written(folder, out)
+        plain = found.plain()
         table = Table(
             "",
             "",
@@ -74,3 +60,34 @@ class Report:
         if not table.row_count:
             Console().print("no run could be evaluated")
         Console().print(f"written: {out / 'report.html'}", soft_wrap=True, markup=False)
+        if plain["runs"] and plain["failed_runs"] == plain["runs"]:
+            raise AllFailedError(f"all {plain['runs']} runs failed; report.json says why each did")
+
+    def _written(self, folder: RolloutFolder, out: Path) -> Found:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+        from symphony.evaluation.report import report
+        from symphony.files import write_file, write_json
+        from symphony.render.report_page import report_page
+        from symphony.render.viewer import view_page
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("segments"),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task("Evaluating", total=len(folder))
+            found = report(
+                folder, self.evaluated, lambda done, total: bar.update(task, completed=done, total=total)
+            )
+        plain = found.plain()
+        write_json(out / "report.json", plain)
+        write_file(out / "report.csv", found.csv())
+        write_file(out / "report.html", report_page(plain, "view.html" if self.view else None))
+        if self.view:
+            replays = ((saved, found.events[saved.segment.segment_id]) for saved in folder)
+            write_file(out / "view.html", view_page(folder.about.agent, replays, folder.about.settings))
+        return found

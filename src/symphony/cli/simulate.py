@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import check_planner_seconds
-from symphony.errors import ConfigError
+from symphony.errors import AllFailedError, ConfigError
 
 if TYPE_CHECKING:
     from symphony.simulation.saved_files import RolloutFolder
@@ -49,6 +51,7 @@ class Simulate:
     for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them."""
     tree: bool = True
     """Leave out the branches that a search pruned."""
+    trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
@@ -72,7 +75,7 @@ class Simulate:
         from symphony.simulation.saving import save_simulation
 
         agent, store, config = (
-            load_agent(self.agent or self.agents, self.config.device),
+            load_agent(self.agent or self.agents, self.config.device, trust_code=self.trust_code),
             SegmentStore(self.data),
             self.config,
         )
@@ -110,14 +113,19 @@ class Simulate:
         found, console = self.simulated(), Console()
         line = f"{len(found)} run segments in {self.out}: symphony view {self.out}"
         console.print(line, soft_wrap=True, markup=False)
-        if self.planner:
-            for line in failed_runs(found):
-                console.print(line, soft_wrap=True, markup=False)
+        tell_failed(found, lambda line: console.print(line, soft_wrap=True, markup=False))
 
 
-def failed_runs(folder: RolloutFolder) -> list[str]:
-    """How many runs failed, and why the first of them did; nothing if all are well."""
+def tell_failed(folder: RolloutFolder, tell: Callable[[str], object]) -> None:
+    """Tell how many runs failed, and why the first of them did; nothing if all are well.
+
+    Raises:
+        AllFailedError: all did.
+    """
     why = [f"{saved.segment.segment_id}, {reason}" for saved in folder for reason in saved.failed.values()]
     why += [f"{entry.segment}, {entry.failed}" for entry in folder.failures for _ in range(entry.rollouts)]
     runs = sum(entry.rollouts for entry in [*folder.entries, *folder.failures])
-    return [f"{len(why)} of {runs} runs failed, the first: {why[0]}"] if why else []
+    if why and len(why) == runs:
+        raise AllFailedError(f"all {runs} runs failed, the first: {why[0]}")
+    if why:
+        tell(f"{len(why)} of {runs} runs failed, the first: {why[0]}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -44,14 +45,16 @@ class View:
         """Write the page, the picture or the film."""
         from rich.console import Console
 
+        from symphony.files import lock_file
         from symphony.simulation.saved_files import load_rollouts
 
         folder = load_rollouts(self.folder)
         out = self.folder / "view.html" if self.out is None else self.out
-        if out.suffix.lower() == ".html":
-            write_view(folder, out, self.segments)
-        else:
-            self._draw(folder, out)
+        with lock_file(out) if self.out is None else nullcontext():
+            if out.suffix.lower() == ".html":
+                write_view(folder, out, self.segments)
+            else:
+                self._draw(folder, out)
         Console().print(f"written: {out}", soft_wrap=True, markup=False)
 
     def _draw(self, folder: RolloutFolder, out: Path) -> None:

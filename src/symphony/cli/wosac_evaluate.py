@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.cli.tables import write_numbers
 from symphony.cli.wosac_score import print_left_out
 from symphony.config import WosacSettings
@@ -40,6 +41,7 @@ class Evaluate:
     strict: bool = False
     """Stop at a run segment that can't be scored (without road edges, vehicles or a future) instead of leaving it
     out."""
+    trust_code: TrustCode = False
     settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
 
     def run(self) -> None:
@@ -50,7 +52,8 @@ class Evaluate:
         from symphony.data.store import SegmentStore
         from symphony.evaluation.wosac import evaluate_wosac
 
-        agent, store = load_agent(self.agent, self.settings.device), SegmentStore(self.data)
+        agent = load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
+        store = SegmentStore(self.data)
         items = segment_indices(store, self.segments) or list(range(len(store)))
         with segments_bar(f"scoring {agent.name}") as advance:
             found = evaluate_wosac(

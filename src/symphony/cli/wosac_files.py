@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from symphony.errors import DataError
+from symphony.files import Lock
 
 if TYPE_CHECKING:
     from symphony.data.report import Skip
@@ -86,19 +88,22 @@ def score_files(
     """
     from symphony.data.engine import ordered_map
 
+    held: AbstractContextManager[object] = nullcontext()
     if features is not None:
         features.mkdir(parents=True, exist_ok=True)
+        held = Lock(features / "features.lock")
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     pairs = _pairs(scenarios, rollouts, partial)
     tasks = (ScoreTask(*pair, config, per_object, features, strict) for pair in pairs)
     results: list[ScenarioScore] = []
     skipped: list[Skip] = []
-    for result in ordered_map(score_task, tasks, workers=workers):
-        if isinstance(result, ScenarioScore):
-            results.append(result)
-        else:
-            skipped.append(result)
-        progress(len(results) + len(skipped), total)
+    with held:
+        for result in ordered_map(score_task, tasks, workers=workers):
+            if isinstance(result, ScenarioScore):
+                results.append(result)
+            else:
+                skipped.append(result)
+            progress(len(results) + len(skipped), total)
     if not results:
         raise skipped[0].error if skipped else DataError("no scenario has rollouts", file=scenarios)
     return results, skipped

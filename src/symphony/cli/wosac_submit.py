@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from symphony.cli.helps import TrustCode
 from symphony.config import WosacSettings
 from symphony.config.wosac import FUTURE
 from symphony.data.submission_meta import SubmissionMeta
@@ -40,6 +41,7 @@ class Submit:
     meta: Annotated[SubmissionMeta, tyro.conf.arg(name="")]
     shards: int = 0
     """Files in the archive; 0: 150, or one a scenario where there are fewer."""
+    trust_code: TrustCode = False
     settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
 
     def __post_init__(self) -> None:
@@ -61,7 +63,7 @@ class Submit:
         from symphony.data.submission import write_submission
         from symphony.data.submission_check import required_agents
 
-        agent = load_agent(self.agent, self.settings.device)
+        agent = load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
         # Before hours of simulation: that all can be read, and no scenario comes twice.
         total = len(required_agents(self.data))
         shards = self.shards or min(SHARDS, total)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import arg
 
-from symphony.config.checks import not_negative, one_of, positive
+from symphony.config.checks import at_most, not_negative, one_of, positive
 from symphony.errors import ConfigError
 from symphony.keys import OBJECTS, OWN
 
@@ -58,6 +58,8 @@ class AgentConfig:
     def __post_init__(self) -> None:
         positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
         not_negative(self, "num_lights", "cells")
+        at_most(self, 10_000, "num_objects", "num_points", "num_lights")
+        at_most(self, 1001, "accelerations", "cells")
         one_of(self, "features", ["paper", "gaps", "road"])
         one_of(self, "goal_features", ["points", "turns"])
         if self.accelerations < 3 or self.accelerations % 2 == 0:
@@ -151,6 +153,7 @@ class SearchConfig:
     def __post_init__(self) -> None:
         positive(self, "branches", "test_branches", "prune_every", "keep", "temperature")
         positive(self, "segments", "updates", "states")
+        at_most(self, 10_000, "branches", "test_branches")
         one_of(self, "survivors", get_args(Survivors))
         one_of(self, "goals", ["tree", "branch"])
         one_of(self, "rule", RULES, path=True)
@@ -194,3 +197,16 @@ class AgentSpec:
             raise ConfigError(
                 f"cells are of displacements, and the actions are those of a {self.action_space}"
             )
+
+    @property
+    def code(self) -> dict[str, str]:
+        """Import paths of code that is not this package's, by the settings that name them."""
+        network = "" if self.discriminator is None else self.discriminator.network
+        paths = {
+            "agent.encoder": self.agent.encoder,
+            "agent.policy": self.agent.policy,
+            "discriminator.network": network,
+            "search.rule": self.search.rule,
+            "search.aggregate": self.search.aggregate,
+        }
+        return {name: path for name, path in paths.items() if ":" in path}

@@ -25,6 +25,14 @@ def not_negative(config: Any, *names: str) -> None:
             raise ConfigError(f"{option(name)} must not be negative, is {value}")
 
 
+def at_most(config: Any, limit: int, *names: str) -> None:
+    """Raise ConfigError for a count beyond what any machine could hold, say in the file of an agent."""
+    for name in names:
+        value = getattr(config, name)
+        if value > limit:
+            raise ConfigError(f"{option(name)} must be at most {limit}, is {value}")
+
+
 def one_of(config: Any, name: str, known: Iterable[str], *, path: bool = False) -> None:
     """Raise ConfigError for a setting that is no known name, nor, with `path`, an import path."""
     value, known = getattr(config, name), list(known)

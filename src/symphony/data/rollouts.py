@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.npz import read_npz
 from symphony.errors import DataError
 
 STATES = ("x", "y", "z", "heading")
@@ -39,25 +38,12 @@ def read_rollouts(file: Path) -> RolloutArrays:
     Raises:
         DataError: the file is damaged or something is missing or of a wrong kind; names file and field.
     """
-    with file.open("rb") as raw:
-        try:
-            archive = np.load(raw, allow_pickle=False)
-            if isinstance(archive, np.lib.npyio.NpzFile):
-                return _read(archive, file)
-        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
-            raise DataError(f"not an .npz archive, or damaged: {error}", file=file) from None
-    raise DataError("is one array, expected an .npz archive of several", file=file)
-
-
-def _read(archive: Any, file: Path) -> RolloutArrays:
-    arrays = {}
+    held = read_npz(file, ("object_id", *STATES))
+    arrays: dict[str, Any] = {}
     for name in ("object_id", *STATES):
-        if name not in archive:
+        if name not in held:
             raise DataError("missing", file=file, field=name)
-        try:
-            array = archive[name]
-        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
-            raise DataError(f"damaged: {error}", file=file, field=name) from None
+        array = held[name]
         kind = np.integer if name == "object_id" else np.floating
         if not np.issubdtype(array.dtype, kind):
             wanted = "whole numbers" if name == "object_id" else "floating-point numbers"

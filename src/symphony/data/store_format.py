@@ -387,13 +387,13 @@ class TableWriter:
             file.close()
 
 
-def lock(folder: Path) -> BinaryIO:
-    """Keep other writers out of a folder until the file that is returned is closed.
+def lock(folder: Path) -> files.Lock:
+    """Keep other writers out of a folder until what is returned is closed.
 
     Raises:
         DataError: another process is in there.
     """
-    return files.lock(folder / LOCK)
+    return files.Lock(folder / LOCK)
 
 
 def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:

@@ -7,7 +7,7 @@ import operator
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from symphony.data.store import GROUP, TWICE, SegmentStore
 from symphony.data.store_format import MAPS, SEGMENTS, TableWriter
 from symphony.data.store_index import decoded, read_ids, read_indices
 from symphony.errors import DataError
+from symphony.files import Lock
 
 
 class StoreWriter:
@@ -47,7 +48,7 @@ class StoreWriter:
             if not append:
                 raise DataError("already a segment store (append to it, or choose another)", file=self.path)
         self.path.mkdir(parents=True, exist_ok=True)
-        self._lock: BinaryIO | None = layout.lock(self.path)
+        self._lock: Lock | None = layout.lock(self.path)
         try:
             self._open(fresh, keep)
         except BaseException:

@@ -27,6 +27,26 @@ _DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError)
 _NAMED, _KEPT = 5, 1000
 _MAX_REST = 1 << 16
 """Bytes of a shard that are no scenarios: some lines of text."""
+MAX_SCENARIO = 128 << 20
+"""Bytes of the rollouts of a scenario: of more than 3 000 agents."""
+_MAX_NAME = 1 << 16
+"""Bytes that a member of an archive may have beside its content, such as a long name."""
+
+
+class _Member(tarfile.TarInfo):
+    """A member of an archive; what is read into memory to know it is small."""
+
+    def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
+        beside = self.type in (
+            *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.GNUTYPE_SPARSE),
+            *(tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE),
+        )
+        if beside and self.size > _MAX_NAME:
+            raise tarfile.ReadError(f"{self.size} bytes of a header")
+        return super()._proc_member(archive)  # type: ignore[misc]
+
+    def _proc_gnusparse_10(self, *_: object) -> None:
+        raise tarfile.ReadError("a sparse file")  # whose map is as long as it says
 
 
 @dataclass
@@ -88,7 +108,7 @@ def check_submission(path: Path, required: Mapping[str, frozenset[int]] | None =
     metas: dict[str, bytes] = {}
     try:
         with gzip.open(path) as unzipped:
-            with tarfile.open(fileobj=unzipped, mode="r|") as archive:
+            with tarfile.open(fileobj=unzipped, mode="r|", tarinfo=_Member) as archive:
                 for member in archive:
                     _check_member(archive, member, path, report, required, shards, metas)
             # To the end, where the checksum of the whole lies.
@@ -167,6 +187,8 @@ def _messages(stream: IO[bytes], size: int) -> Iterator[tuple[pb.ScenarioRollout
         size -= used + more + length
         if size < 0:
             raise DecodeError("cut short")
+        if length > (limit := MAX_SCENARIO if key == _SCENARIO_KEY else _MAX_REST):
+            raise DecodeError(f"a message of {length} bytes, at most {limit} are read")
         payload = stream.read(length)
         if key == _SCENARIO_KEY:
             yield pb.ScenarioRollouts.FromString(payload), b""

@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from symphony.data import store_format
 from symphony.data.report import Report, Skip
@@ -126,7 +126,7 @@ class Draft:
         self.out, self.folder = out, folder_of(out)
         self._made = [p for p in self.folder.parents if not p.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock: BinaryIO = store_format.lock(self.folder)
+        self._lock = store_format.lock(self.folder)
         try:
             self._begin(job)
         except BaseException:

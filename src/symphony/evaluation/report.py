@@ -103,10 +103,15 @@ class Report:
         names = ("segment", "rollout", "group", "failed", *_NUMBERS)
         writer = csv.DictWriter(out, names, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(
-            {name: "" if value is None else value for name, value in row.items()} for row in rows
-        )
+        writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
         return out.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    """A value as a cell that no spreadsheet takes for a formula: words that begin like one get an apostrophe."""
+    if isinstance(value, str) and value.startswith(("=", "+", "-", "@")):
+        return f"'{value}"
+    return "" if value is None else value
 
 
 def report(

@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import struct
 import zipfile
-import zlib
 from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,9 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import symphony
+from symphony.data.npz import read_npz
 from symphony.envs.map_lists import MapLists, map_parts
 from symphony.envs.routes import RouteTable
 from symphony.envs.scene import SceneBatch
+from symphony.errors import DataError
 from symphony.files import replacing
 from symphony.simulation.experts import Experts
 
@@ -32,11 +32,6 @@ LISTS_VERSION = 1
 RECENT = 64
 """Maps whose lists are held in memory for the next scene on one of them."""
 PACKAGE = Path(symphony.__file__).parent
-_DAMAGED = (
-    *(OSError, ValueError, KeyError, EOFError, IndexError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
-"""What is raised for files that are not what was written."""
 
 
 class KeptFiles:
@@ -70,11 +65,8 @@ class KeptFiles:
         if path is None or not path.is_file():
             return None
         try:
-            with zipfile.ZipFile(path) as file:
-                # Read as a whole first, so that the checksum is compared before NumPy looks at anything.
-                parts = {name.removesuffix(".npy"): io.BytesIO(file.read(name)) for name in file.namelist()}
-            return {name: np.load(part, allow_pickle=False) for name, part in parts.items()}
-        except _DAMAGED:
+            return read_npz(path)
+        except (DataError, OSError):
             return None
 
     def _save(self, content: str, arrays: Mapping[str, NDArray[Any]], *, small: bool = False) -> None:

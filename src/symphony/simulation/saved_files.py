@@ -20,14 +20,18 @@ from safetensors.numpy import save
 
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
-from symphony.files import naming, replacing, write_json
+from symphony.files import Lock, naming, replacing, write_json
 from symphony.simulation.saved import SavedRollouts
 from symphony.simulation.saved_tensors import KEY, MAX_LENGTH, read_tensors, tensors_of
 
 FORMAT = 1
 MANIFEST, INDEX, SEGMENTS = "manifest.json", "index.jsonl", "segments"
+LOCK = "rollouts.lock"
+"""Held by who writes."""
 LATER = ("weights", "specification", "planner", "planner_seconds")
 """Settings that a manifest has since November 2026."""
+_BEGUN = (LOCK, SEGMENTS, INDEX)
+"""In a folder whose writer died before there was a manifest."""
 _LONGEST = 120
 _KINDS: dict[str, tuple[type, ...]] = {
     "segment": (str,),
@@ -106,12 +110,27 @@ class RolloutWriter:
         about: what the rollouts have in common.
 
     Raises:
-        DataError: the folder holds something else, or rollouts of another simulation.
+        DataError: the folder holds something else, or rollouts of another simulation, or another process writes it.
     """
 
     def __init__(self, path: str | Path, about: About) -> None:
         self.path = Path(path)
-        manifest = {"format": FORMAT, **dataclasses.asdict(about)}
+        foreign = DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
+        known = (self.path / MANIFEST, self.path / LOCK)  # with a lock, that of one who has just begun
+        if self.path.exists() and any(self.path.iterdir()) and not any(path.exists() for path in known):
+            raise foreign
+        with naming(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+        self._lock = Lock(self.path / LOCK)
+        try:
+            if not (self.path / MANIFEST).exists() and any(p.name not in _BEGUN for p in self.path.iterdir()):
+                raise foreign
+            self._begin({"format": FORMAT, **dataclasses.asdict(about)})
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self, manifest: dict[str, Any]) -> None:
         if (self.path / MANIFEST).exists():
             held = _read_manifest(self.path)
             changed = _differing(manifest, held)
@@ -123,14 +142,22 @@ class RolloutWriter:
             _repair(self.path / INDEX)
             if changed:
                 write_json(self.path / MANIFEST, manifest)
-        elif self.path.exists() and any(self.path.iterdir()):
-            raise DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
         else:
             with naming(self.path):
                 (self.path / SEGMENTS).mkdir(parents=True, exist_ok=True)
                 (self.path / INDEX).touch()
             write_json(self.path / MANIFEST, manifest)
         self._entries = _read_index(self.path)
+
+    def close(self) -> None:
+        """Let others write."""
+        self._lock.close()
+
+    def __enter__(self) -> RolloutWriter:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def has(self, segment_id: str) -> bool:
         """Whether the rollouts of that segment are there."""
@@ -160,6 +187,7 @@ class RolloutWriter:
         self._record(Entry(segment_id, rollouts, failed=reason, group=group))
 
     def _record(self, entry: Entry) -> None:
+        self._lock.check()
         path = self.path / INDEX
         given = dataclasses.asdict(entry)
         if not entry.group:
@@ -275,10 +303,10 @@ def save_rollouts(path: str | Path, about: About, found: Iterable[SavedRollouts]
     Raises:
         DataError: as :class:`RolloutWriter`.
     """
-    writer = RolloutWriter(path, about)
-    for saved in found:
-        if not writer.has(saved.segment.segment_id):
-            writer.add(saved)
+    with RolloutWriter(path, about) as writer:
+        for saved in found:
+            if not writer.has(saved.segment.segment_id):
+                writer.add(saved)
     return RolloutFolder(path)
 
 

@@ -74,24 +74,24 @@ def save_simulation(
     if planner:
         settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds}
     about = About.of(agent.name, dataset.store, settings, seed=config.seed)
-    writer = RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about)
-    names = [dataset.store.ids[i] for i in dataset.indices]
-    todo = [i for i, name in enumerate(names) if not writer.has(name)]
-    if planner:
-        todo = _with_ego(writer, dataset, todo, config.rollouts)
-    done = len(names) - len(todo)
-    drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
-    together = segments_together(agent, config, dataset.interactive)
-    if planner and not config.batch:
-        together = min(together, PLANNED)
-    tasks = batches(todo, together, config)
-    with closing(shared(drive, tasks, config, dataset)) as results:
-        for saved in results:
-            for one in saved:
-                writer.add(one)
-            done += len(saved)
-            if progress is not None:
-                progress(done, len(names))
+    with RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about) as writer:
+        names = [dataset.store.ids[i] for i in dataset.indices]
+        todo = [i for i, name in enumerate(names) if not writer.has(name)]
+        if planner:
+            todo = _with_ego(writer, dataset, todo, config.rollouts)
+        done = len(names) - len(todo)
+        drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
+        together = segments_together(agent, config, dataset.interactive)
+        if planner and not config.batch:
+            together = min(together, PLANNED)
+        tasks = batches(todo, together, config)
+        with closing(shared(drive, tasks, config, dataset)) as results:
+            for saved in results:
+                for one in saved:
+                    writer.add(one)
+                done += len(saved)
+                if progress is not None:
+                    progress(done, len(names))
     return RolloutFolder(path)
 
 

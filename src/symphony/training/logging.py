@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
+import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from numpy.typing import NDArray
 
+from symphony.errors import ConfigError
 from symphony.files import naming, write_file
 
 RECORDS = "metrics.jsonl"
+ID = "wandb-id"
+"""Beside it: the run's name at Weights & Biases."""
 
 
 class Tracker:
@@ -27,11 +32,15 @@ class Tracker:
         project: of Weights & Biases.
         group: of runs there; empty for none.
         tags: of the run there.
-        after: keep only records up to this step of an earlier, interrupted run.
+        after: keep only records up to this step of an earlier, interrupted run, which this one goes on with.
 
     Attributes:
         path: the file.
         kept: records of that earlier run.
+
+    Raises:
+        ConfigError: Weights & Biases can't be used, say without a key.
+        DataError: the disk refuses.
     """
 
     def __init__(
@@ -49,23 +58,30 @@ class Tracker:
         self.kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
         # Put in place as a whole, lest a kill meanwhile lose what is kept.
         write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
-        with naming(self.path):
-            self._file = self.path.open("a", encoding="utf-8")
         self._run = None
         mode: Any = os.environ.get("WANDB_MODE", wandb)
         if mode != "disabled":
             import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
-            self._run = tracking.init(
-                project=project,
-                group=group or None,
-                tags=list(tags) or None,
-                name=folder.name,
-                dir=str(folder),
-                config=settings,
-                mode=mode,
-                settings=tracking.Settings(silent=True, console="off"),
-            )
+            try:
+                self._run = tracking.init(
+                    project=project,
+                    group=group or None,
+                    tags=list(tags) or None,
+                    name=folder.name,
+                    dir=str(folder),
+                    config=settings,
+                    mode=mode,
+                    id=_run_id(folder, again=after > 0),
+                    resume="allow" if after else None,
+                    settings=tracking.Settings(silent=True, console="off"),
+                )
+            except tracking.errors.Error as error:
+                raise ConfigError(
+                    f"Weights & Biases: {' '.join(str(error).split())} Or keep the curves here: --wandb offline"
+                ) from error
+        with naming(self.path):
+            self._file = self.path.open("a", encoding="utf-8")
 
     def log(self, step: int, values: Mapping[str, float | str]) -> None:
         """Record numbers, and words, at an update. Raises DataError if the disk refuses."""
@@ -103,6 +119,16 @@ class Tracker:
         finally:
             if self._run is not None:
                 self._run.finish()
+
+
+def _run_id(folder: Path, *, again: bool) -> str:
+    """What Weights & Biases calls a run: the same when it goes on, so that its parts become one there."""
+    path = folder / ID
+    known = path.read_text(encoding="utf-8", errors="replace").strip() if again and path.is_file() else ""
+    if not re.fullmatch(r"[0-9a-z]{4,32}", known):
+        known = uuid.uuid4().hex[:8]
+        write_file(path, known + "\n")
+    return known
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:

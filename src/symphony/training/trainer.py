@@ -25,7 +25,7 @@ from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoin
 from symphony.agents.choice import Best
 from symphony.config import RunConfig, to_json
 from symphony.errors import ConfigError, DataError
-from symphony.files import lock, write_file
+from symphony.files import Lock, write_file
 from symphony.simulation import SceneDataset, SearchReplay
 from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.training.logging import Tracker
@@ -118,7 +118,7 @@ class Trainer:
             self.world.wait()
             if self.world.leads:
                 self.config.out.mkdir(parents=True, exist_ok=True)
-                held.enter_context(lock(self.config.out / LOCK))
+                self._lock = held.enter_context(Lock(self.config.out / LOCK))
                 if checkpoint_to_resume(self.config) != self.done:
                     raise ConfigError(
                         f"{self.config.out}: another process went on with this run in the meantime"
@@ -283,6 +283,7 @@ class Trainer:
 
     def _save(self, step: int) -> None:
         """Write a checkpoint; by now all records up to it are on the disk."""
+        self._lock.check()
         extra = {
             "best": None if self.best is None else dataclasses.asdict(self.best),
             "validated": self.validated,

@@ -1,0 +1,46 @@
+"""All commands and what they take, as `tests/cli.txt` holds them: `python tests/helpers_cli.py > tests/cli.txt`."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Iterator
+from unittest import mock
+
+from tyro.extras import SubcommandApp
+
+from symphony import cli
+
+
+def words() -> list[str]:
+    """A line for each argument of each command, as its help shows it."""
+    with mock.patch.dict(os.environ, {"COLUMNS": "110"}):  # no wider, or boxes stand beside one another
+        return [" ".join([*command, word]) for command in _commands(cli.app) for word in _told(command)]
+
+
+def _commands(app: SubcommandApp, *before: str) -> Iterator[tuple[str, ...]]:
+    for name, given in app._subcommands.items():
+        if isinstance(given.target, SubcommandApp):
+            yield from _commands(given.target, *before, name)
+        else:
+            yield *before, name
+
+
+def _told(command: tuple[str, ...]) -> Iterator[str]:
+    with contextlib.redirect_stdout(io.StringIO()) as shown:
+        cli.main([*command, "--help"])
+    title = ""
+    for line in shown.getvalue().splitlines():
+        if re.match(r" \w", line):
+            title = line.split()[0]
+        elif (found := re.match(r"  (\S.*?)(  |$)", line)) and (title == "positional" or found[1][0] == "-"):
+            names = re.findall(r"(?<!\S)--?[a-z][\w.-]*", found[1]) or [found[1]]
+            if names[0] != "-h":
+                yield ", ".join(names)
+
+
+if __name__ == "__main__":
+    sys.stdout.write("\n".join(words()) + "\n")

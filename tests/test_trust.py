@@ -1,0 +1,205 @@
+"""What a stranger's folder may ask for: no code, and no memory that its files don't fill (SECURITY.md)."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import shutil
+import sys
+import tarfile
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from symphony.agents import load_agent
+from symphony.agents.included import pretrained_folder
+from symphony.cli import main
+from symphony.data.builtin import builtin_store
+from symphony.data.npz import read_npz
+from symphony.data.rollouts import read_rollouts
+from symphony.data.submission_check import _encoded, check_submission
+from symphony.errors import ConfigError, DataError, DataWarning, SymphonyError
+
+NOTES = """
+from pathlib import Path
+Path(r"{}").write_text("code ran")
+from symphony.modules import SceneEncoder as Encoder
+"""
+
+
+@pytest.fixture(name="stranger")
+def _stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """The folder of an agent with other settings, in a current folder that Python doesn't search by itself."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", os.getcwd())])
+
+    def make(**settings: Any) -> Path:
+        folder = tmp_path / "stranger"
+        shutil.copytree(pretrained_folder("bc_ts_h"), folder)
+        values = json.loads((folder / "agent.json").read_text())
+        for name, value in settings.items():
+            part, _, setting = name.partition("__")
+            if setting:
+                values[part][setting] = value
+            else:
+                values[part] = value
+        (folder / "agent.json").write_text(json.dumps(values))
+        (folder / "notes.py").write_text(NOTES.format(tmp_path / "ran"))
+        shutil.copy(folder / "notes.py", tmp_path)
+        return folder
+
+    return make
+
+
+SHORT = ("--rollouts", "1", "--duration", "1", "--search", "none")
+SETTINGS = ("agent__encoder", "agent__policy", "discriminator__network", "search__rule", "search__aggregate")
+
+
+@pytest.mark.parametrize("place", ["stranger/notes.py", "notes"])
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_a_folder_runs_no_code(stranger: Callable[..., Path], setting: str, place: str, capsys: Any) -> None:
+    folder = stranger(**{setting: f"{place}:Encoder"})
+    command = [
+        "simulate",
+        str(folder),
+        "--data",
+        str(builtin_store("test")),
+        "--segments",
+        "0",
+        "--out",
+        "sim",
+    ]
+    assert main(command) == 1
+    assert f"{setting.replace('__', '.')} names code, '{place}:Encoder'" in capsys.readouterr().err
+    assert not Path("ran").exists()
+    assert not Path("sim").exists()
+
+
+@pytest.mark.filterwarnings("always::symphony.errors.DataWarning")
+def test_trusted_code_is_named_and_runs(stranger: Callable[..., Path], capsys: Any) -> None:
+    folder = stranger(agent__encoder="stranger/notes.py:Encoder")
+    with pytest.warns(
+        DataWarning, match=r"agent\.json: agent\.encoder runs code, 'stranger/notes\.py:Encoder'"
+    ):
+        assert load_agent(str(folder), trust_code=True).policy is not None
+    assert Path("ran").exists()
+    data = ["--data", str(builtin_store("test"))]
+    for command in (
+        ["simulate", str(folder), *data, "--out", "sim", "--segments", "0", *SHORT],
+        ["evaluate", str(folder), *data, "--segments", "0", *SHORT],
+        ["plot", "rollouts", str(folder), *data, "--out", "a.png", "--segments", "0", *SHORT],
+        ["plot", "tree", str(folder), *data, "--out", "b.png", "--segment", "0", "--duration", "1"],
+        ["plot", "curvature", str(folder), *data, "--out", "c.png", *SHORT],
+        ["wosac", "evaluate", str(folder), *data],
+    ):
+        assert main(command) == 1, command
+        assert "names code" in capsys.readouterr().err, command
+        if command[0] in ("simulate", "evaluate"):
+            assert main([*command, "--trust-code"]) == 0
+            assert "runs code, 'stranger/notes.py:Encoder'" in capsys.readouterr().err
+
+
+def test_the_current_folder_is_not_searched_for_it(stranger: Callable[..., Path]) -> None:
+    before = list(sys.path)
+    with (
+        pytest.warns(DataWarning, match="runs code"),
+        pytest.raises(ConfigError, match="current folder is not searched"),
+    ):
+        load_agent(str(stranger(agent__encoder="notes:Encoder")), trust_code=True)
+    assert not Path("ran").exists()
+    assert sys.path == before
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"agent__hidden": 60_000},
+        {"agent__hidden": 60_000_000},
+        {"agent__hidden": 2**62},
+        {"agent__head": 10**9},
+        {"agent__accelerations": 10**9 + 1},
+        {"action_space": "displacement", "agent__cells": 10**9 + 1},
+        {"discriminator__hidden": 10**9},
+        {"agent__num_points": 10**9},
+        {"agent__num_objects": 10**9},
+        {"agent__num_lights": 10**9},
+        {"search__test_branches": 10**9},
+    ],
+)
+def test_networks_are_no_larger_than_their_weights(stranger: Callable[..., Path], settings: Any) -> None:
+    with pytest.raises(SymphonyError, match=r"asks for a network|at most|no networks of these sizes"):
+        load_agent(str(stranger(**settings)))
+
+
+def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
+    """An archive of float32 arrays whose headers claim shapes, with so many bytes of zeros each."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, (shape, size) in members.items():
+            header = io.BytesIO()
+            described = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(header, described)
+            with archive.open(f"{name}.npy", "w") as part:
+                part.write(header.getvalue())
+                for begin in range(0, size, 1 << 24):
+                    part.write(bytes(min(1 << 24, size - begin)))
+
+
+def shard(path: Path, size: int, key: int = 10, kind: bytes = tarfile.REGTYPE) -> None:
+    """A submission with one member: a message of so many bytes of zeros, or a header of the archive's own."""
+    head = _encoded(key) + _encoded(size) if kind == tarfile.REGTYPE else b""
+    member = tarfile.TarInfo("a.binproto-00000-of-00001")
+    member.size, member.type = len(head) + size, kind
+    path.write_bytes(gzip.compress(member.tobuf(tarfile.GNU_FORMAT) + head + bytes(size + 10_240), 1))
+
+
+def check(path: Path) -> None:
+    (problem, *_) = check_submission(path).problems
+    raise problem
+
+
+MIB = 1 << 20
+BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]] = {
+    "an array by its header": (
+        lambda to: npz(to, {"x": ((10**13,), 16)}),
+        read_rollouts,
+        "field x.* by its header",
+    ),
+    "an array that is there": (
+        lambda to: npz(to, {"x": ((600 * MIB // 4,), 600 * MIB)}),
+        read_rollouts,
+        "field x",
+    ),
+    "several arrays": (
+        lambda to: npz(to, dict.fromkeys("ab", ((5 * MIB,), 20 * MIB))),
+        lambda of: read_npz(of, most=30 * MIB),
+        "field b",
+    ),
+    "a scenario": (lambda to: shard(to, 130 * MIB), check, "a message of 136314880 bytes"),
+    "another message": (lambda to: shard(to, 50 * MIB, 18), check, "a message of 52428800 bytes"),
+    "a long name": (
+        lambda to: shard(to, 50 * MIB, kind=tarfile.GNUTYPE_LONGNAME),
+        check,
+        "52428800 bytes of a header",
+    ),
+    "a header": (lambda to: shard(to, 50 * MIB, kind=tarfile.XHDTYPE), check, "52428800 bytes of a header"),
+}
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+def test_sizes_come_before_memory(kind: str, tmp_path: Path) -> None:
+    make, read, why = BOMBS[kind]
+    make(path := tmp_path / "bomb")
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=why):
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < 32 * MIB
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,137 @@
+"""One writer for each output: another one is refused by name (docs/hardening.md)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers_processes import apart
+from helpers_runs import tiny
+from helpers_saved import searched
+from symphony.cli import main
+from symphony.data.builtin import builtin_store
+from symphony.errors import DataError
+from symphony.files import Lock, lock_file
+from symphony.recipes import train
+from symphony.simulation.saved_files import RolloutWriter, load_rollouts, save_rollouts
+
+STORE = ["--data", str(builtin_store("test"))]
+SHORT = ["--segments", "0", "--duration", "1"]
+REFUSED = r"is being written by another process: \d+ on .*, run [0-9a-f]{8} of "
+
+
+def test_two_simulations_into_one_folder(tmp_path: Path) -> None:
+    about, (first, second) = searched()
+    with RolloutWriter(tmp_path / "sim", about) as writer:
+        for other in (about, replace(about, seed=7)):  # the same simulation, too
+            with pytest.raises(DataError, match=REFUSED):
+                RolloutWriter(tmp_path / "sim", other)
+        writer.add(first)
+    with pytest.raises(DataError, match="another simulation, which differs in seed"):
+        RolloutWriter(tmp_path / "sim", replace(about, seed=7))
+    with RolloutWriter(tmp_path / "sim", about) as writer:
+        writer.add(second)
+    assert load_rollouts(tmp_path / "sim").ids == [first.segment.segment_id, second.segment.segment_id]
+    assert not list(tmp_path.rglob("*.lock"))
+
+
+def test_a_folder_that_was_removed_meanwhile(tmp_path: Path) -> None:
+    about, (first, second) = searched()
+    with RolloutWriter(tmp_path / "sim", about) as writer:
+        writer.add(first)
+        shutil.rmtree(tmp_path / "sim")
+        save_rollouts(tmp_path / "sim", replace(about, seed=7), [])
+        with pytest.raises(DataError, match=r"was removed or replaced while run \w+ wrote into it"):
+            writer.add(second)
+    assert load_rollouts(tmp_path / "sim").about.seed == 7
+    assert not load_rollouts(tmp_path / "sim").ids
+
+
+def test_one_that_died_before_it_had_begun(tmp_path: Path) -> None:
+    about, (first, _) = searched()
+    (tmp_path / "sim" / "segments").mkdir(parents=True)
+    (tmp_path / "sim" / "rollouts.lock").write_text("who")
+    save_rollouts(tmp_path / "sim", about, [first])
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "notes.txt").write_text("mine")
+    for held in (False, True):
+        if held:
+            (tmp_path / "own" / "rollouts.lock").touch()
+        with pytest.raises(DataError, match="no folder of rollouts"):
+            RolloutWriter(tmp_path / "own", about)
+
+
+COMMANDS: dict[str, Callable[[str], list[str]]] = {
+    "sim/rollouts.lock": lambda sim: ["simulate", "playback", *STORE, *SHORT, "--out", sim],
+    "sim/report.lock": lambda sim: ["report", sim],
+    "sim/export/export.lock": lambda sim: ["export", sim],
+    "sim/.view.html.lock": lambda sim: ["view", sim],
+    ".page.html.lock": lambda sim: ["view", sim, "--out", "page.html"],
+    ".picture.png.lock": lambda sim: ["evaluate", "playback", *STORE, *SHORT, "--figure", "picture.png"],
+    ".numbers.json.lock": lambda sim: ["evaluate", "playback", *STORE, *SHORT, "--json", "numbers.json"],
+    ".segment.png.lock": lambda sim: ["plot", "segment", STORE[1], "--segment", "0", "--out", "segment.png"],
+    "demo/demo.lock": lambda sim: ["demo", "--out", "demo"],
+    "run/run.lock": lambda sim: ["train", "bc", *STORE, "--out", "run", "--profile", "smoke"],
+}
+
+
+@pytest.mark.parametrize("lock", COMMANDS)
+def test_commands_that_write_refuse_a_second(
+    lock: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_rollouts("sim", *searched())
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    (tmp_path / lock).parent.mkdir(parents=True, exist_ok=True)
+    with Lock(tmp_path / lock) as held:
+        assert main(COMMANDS[lock]("sim")) == 1
+        said = capsys.readouterr().err
+        assert f"is being written by another process: {os.getpid()} on " in said
+        assert f"run {held.run} of " in said
+    after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert after == before
+
+
+def test_a_folder_that_learns_is_taken_over_by_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny("bc", builtin_store("train"), tmp_path / "run", steps=2, checkpoint_every=1)
+    monkeypatch.setattr(Lock, "check", lambda self: (_ for _ in ()).throw(DataError("taken")))
+    with pytest.raises(DataError, match="taken"):
+        train(config)
+    assert not list(tmp_path.rglob("*.lock"))
+
+
+def test_what_is_no_file_needs_no_lock(tmp_path: Path) -> None:
+    with lock_file(Path(os.devnull)), lock_file(Path(os.devnull)):
+        pass
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    with lock_file(tmp_path / "file"), pytest.raises(DataError, match=REFUSED):
+        lock_file(tmp_path / "link")
+
+
+def hammer(folder: Path, times: int) -> int:
+    """Take a lock and give it back, again and again; whether two had it at once."""
+    had = 0
+    while had < times:
+        try:
+            with Lock(folder / "x.lock"):
+                os.close(os.open(folder / "inside", os.O_CREAT | os.O_EXCL))
+                (folder / "inside").unlink()
+                had += 1
+        except DataError:
+            continue
+    return 0
+
+
+def test_no_two_have_it_at_once(tmp_path: Path) -> None:
+    processes = [apart(hammer, tmp_path, 200) for _ in range(3)]
+    for process in processes:
+        process.join(60)
+    assert [process.exitcode for process in processes] == [0, 0, 0]
