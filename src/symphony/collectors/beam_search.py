@@ -18,6 +18,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from symphony.collectors._rows import take, take_values
+from symphony.collectors.backtracking import Backtrack, Lines, follow
 from symphony.collectors.branching import check_branching
 from symphony.collectors.result import BeamSearchResult, lineage, ranking
 from symphony.collectors.rules import (
@@ -45,7 +47,7 @@ def beam_search(
     *,
     steps: int,
     prune_every: int = 10,
-    rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
+    rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
     aggregate: Aggregation = max_then_sum,
     prune_last: bool = True,
     noise: Float[Tensor, "*b P"] | None = None,
@@ -78,7 +80,9 @@ def beam_search(
         start: [*b, S], e.g. ``branch(env.reset(...), S)``.
         steps: T, decisions per branch.
         prune_every: T_p, steps per period.
-        rule: which branches go on, see :mod:`symphony.collectors.rules`.
+        rule: which branches go on, see :mod:`symphony.collectors.rules`; or :class:`Backtrack`, with which nothing is
+            copied: branches are independent lines that go back where they are bad. That takes no gradients, all leaves,
+            and what is said below of slots, groups, noise and retries has no meaning for it.
         aggregate: any function of the scores of a period [*b, S, T_p, N] that gives totals [*b, S], e.g.
             ``lambda scores: scores.amax((-1, -2))``; see :class:`symphony.collectors.Aggregate`.
         prune_last: prune after the last period too.
@@ -114,6 +118,19 @@ def beam_search(
             "a tilt goes with rule Systematic and all leaves, without groups and without retries"
         )
     check_branching(env, start)
+    if isinstance(rule, Backtrack):
+        if leaves not in (None, start.shape[-1]) or retries:
+            raise ConfigError("rule Backtrack gives all branches as leaves, and has its own way to try again")
+        with set_exploration_type(exploration_type):
+            lines = follow(
+                lambda now, length: _simulate(env, policy, score, now, length, aggregate, keep),
+                aggregate,
+                start,
+                rule,
+                steps,
+                prune_every,
+            )
+        return _independent(lines, prune_every, keep_tree)
     threshold = torch.inf if retry_above is None else retry_above
     groups = None if group_key is None else _groups(start, group_key)
     members = None if groups is None or takes_groups(rule) else group_members(groups)
@@ -134,7 +151,7 @@ def beam_search(
                 if len(redo) == 0:
                     break
                 again = now if reseed is None else reseed(now.copy(), attempt)
-                other = _simulate(env, policy, score, _take(again, redo), length, aggregate, keep)
+                other = _simulate(env, policy, score, take(again, redo), length, aggregate, keep)
                 simulated += length * len(redo)
                 run = _better(run, other, redo.squeeze(-1), slot_keys)
             records += run.records
@@ -174,12 +191,12 @@ def beam_search(
     if weights:
         log_weights = torch.stack(weights, -2).gather(-1, slots[..., : len(weights), :]).sum(-2)
     steps_at = _step_rows(slots, start.shape[-1], periods)
-    trajectories = _take(tree, steps_at)
+    trajectories = take(tree, steps_at)
     trajectories.refine_names(..., "time")
     tree.refine_names(..., "time")
     return BeamSearchResult(
         trajectories=trajectories,
-        scores=_take_rows(simulated_scores, steps_at, tree.batch_dims),
+        scores=take_values(simulated_scores, steps_at, tree.batch_dims),
         slots=slots,
         totals=all_totals,
         parents=all_parents,
@@ -188,6 +205,23 @@ def beam_search(
         prune_every=prune_every,
         simulated_steps=simulated,
         log_weights=log_weights,
+    )
+
+
+def _independent(lines: Lines, prune_every: int, keep_tree: bool) -> BeamSearchResult:
+    """Lines as the leaves of a search in which every branch goes on from itself."""
+    slots = torch.arange(lines.totals.shape[-1], device=lines.totals.device).expand(lines.totals.shape)
+    lines.steps.refine_names(..., "time")
+    return BeamSearchResult(
+        trajectories=lines.steps,
+        scores=lines.scores,
+        slots=slots,
+        totals=lines.totals,
+        parents=slots,
+        simulated_scores=lines.scores,
+        tree=lines.steps.copy() if keep_tree else None,
+        prune_every=prune_every,
+        simulated_steps=lines.simulated,
     )
 
 
@@ -313,29 +347,13 @@ def _fork(
     # Places in the flattened [*b, S]: of the first branch of each row, and of the parents beside it.
     first = torch.arange(0, parents.numel(), branches, device=parents.device)
     rows = first.reshape(*parents.shape[:-1], 1) + parents
-    return _set_slots(_take(state, rows), state, slot_keys)
+    return _set_slots(take(state, rows), state, slot_keys)
 
 
 def _set_slots(state: TensorDictBase, slots: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
     for key in keys:
         state.set(key, slots.get(key))
     return state
-
-
-def _take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None = None) -> TensorDictBase:
-    """Rows of the flattened batch, in a batch of the shape of `rows`."""
-    dims = tensordict.batch_dims if dims is None else dims
-    taken = {
-        key: _take(value, rows, dims) if isinstance(value, TensorDictBase) else _take_rows(value, rows, dims)
-        for key, value in tensordict.items()
-    }
-    return TensorDict(taken, [*rows.shape, *tensordict.batch_size[dims:]], device=tensordict.device)
-
-
-def _take_rows(values: Shaped[Tensor, "*_"], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*_"]:
-    # index_select on whole rows is many times faster than gather or advanced indexing on wide entries.
-    taken = values.flatten(0, dims - 1).index_select(0, rows.flatten())
-    return taken.reshape(*rows.shape, *values.shape[dims:])
 
 
 def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) -> Int[Tensor, "*b L T"]:

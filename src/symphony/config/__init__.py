@@ -7,7 +7,7 @@ of a training; what an agent is and how it is simulated travels with the agent.
 from __future__ import annotations
 
 from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
-from symphony.config.evaluation import EvaluateConfig, PaperData, Search, Setting, TableColumns, TableFormat
+from symphony.config.evaluation import EvaluateConfig, PaperData, Score, Search, Setting, TableColumns, TableFormat
 from symphony.config.files import FORMAT, from_dict, read_json, to_json
 from symphony.config.profiles import PROFILES, Profile
 from symphony.config.training import (
@@ -39,6 +39,7 @@ __all__ = [
     "Profile",
     "RunConfig",
     "SamplingConfig",
+    "Score",
     "Search",
     "SearchConfig",
     "Setting",

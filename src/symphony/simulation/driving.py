@@ -29,8 +29,8 @@ from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.importance import Tilt
 from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
-from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
-from symphony.simulation.search import aggregate_of, pruning_rule, search
+from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of, simulate, start_states
+from symphony.simulation.search import aggregate_of, going_back, pruning_rule, search
 
 RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
@@ -45,7 +45,8 @@ class Simulation(NamedTuple):
     Attributes:
         rollouts: [B, K, ...].
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
-        search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
+        search: the trees of which the rollouts are the leaves, [B, trees]; None without any.
+        steps: that were simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
         log_weight: [B, K] logarithm of what each rollout weighs after a tilt; None without one.
@@ -54,6 +55,7 @@ class Simulation(NamedTuple):
     rollouts: Rollouts
     goal: Int[Tensor, "B K N"]
     search: BeamSearchResult | None
+    steps: int = 0
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
     log_weight: Float[Tensor, "B K"] | None = None
@@ -119,25 +121,34 @@ def simulation(
         goals_per=config.pruning(agent.search).goals,
         personas=given_personas(agent.personas, config.persona),
     )
-    start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
-    settings, planned = config.pruning(agent.search), None
+    along_log = config.others == "idm"
+    start = _with_fixed_goals(env, start, given, along_log=along_log)
+    settings, planned, kind = config.pruning(agent.search), None, search_kind(agent, config)
+
+    def begin(state: TensorDictBase) -> TensorDictBase:
+        if goals is None or config.logged_goals:
+            return state
+        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
+        return _with_fixed_goals(env, env.with_goals(state, goal), given, along_log=along_log)
+
     if egos is not None:
-        kind = search_kind(agent, config)
+        if kind == "backtrack":
+            raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
         # Nothing else simulates a period again.
-        keep_every = settings.prune_every if config.retries and kind in ("tree", "oracle") else 0
+        keep_every = settings.prune_every if config.retries and kind == "tree" else 0
         forked = kind not in ("none", "log")
         start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
-    drawn = goal
-    if search_kind(agent, config) in ("none", "log"):
+    drawn, steps = goal, start.numel() * env.decisions
+    if kind in ("none", "log"):
         found = simulate(
             env, TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor), start
         )
     else:
-        best = config.search == "best"
-        scorer = None
-        if config.search != "oracle" and agent.discriminator is not None:
+        best, scorer = kind == "best", None
+        rules = {"best": KeepAll, "backtrack": lambda: going_back(env, settings.threshold, begin)}
+        if agent.discriminator is not None:
             scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
             result = search(
@@ -146,32 +157,35 @@ def simulation(
                 scorer,
                 start,
                 seed=config.seed,
-                rule=KeepAll() if best else pruning_rule(settings),
+                rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
+                score=config.score,
                 aggregate=aggregate_of(settings),
                 leaves=None if best else taken,
-                retries=0 if best else config.retries,
+                retries=config.retries if kind == "tree" else 0,
                 retry_above=config.retry_above,
-                keep_tree=keep_tree and not best,
+                keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
                 tilt=Tilt(env, config.tilt, config.tilt_on, ego=planned is None) if config.tilt else None,
             )
-        found = rollouts_of(env, start, result.trajectories)
+        found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         # A copy of a branch follows the goals of its parent.
         goal = result.trajectories.get(keys.GOAL)[..., -1, :]
         number = result.trajectories.get(keys.PLANNER, None)
         number = None if number is None else number[..., -1, :]
         if best:
             order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
-            found, result = Rollouts(*(_branches(part, order) for part in found)), None
+            found = Rollouts(*(_branches(part, order) for part in found))
             goal = _branches(goal, order)
             number = None if number is None else _branches(number, order)
+        result = result if kind == "tree" else None
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
     weights = None if result is None or result.log_weights is None else result.log_weights.flatten(1)
-    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn, log_weight=weights)
+    of_tree = None if result is None else drawn
+    whole = Simulation(rollouts, goal, result, steps=steps, drawn=of_tree, log_weight=weights)
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
@@ -248,14 +262,16 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
 
 
 def search_kind(agent: Agent, config: EvaluateConfig) -> str:
-    """How the rollouts come about: ``none``, ``tree``, ``oracle`` or ``best``; ``log`` for playback."""
+    """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
     if agent.policy is None:
         return "log"
+    blind = config.score == "discriminator" and agent.discriminator is None
     if config.search == "agent":
-        return "tree" if agent.searches and agent.discriminator is not None else "none"
-    if config.search in ("tree", "best") and agent.discriminator is None:
+        return "tree" if agent.searches and not blind else "none"
+    if config.search != "none" and blind:
         raise ConfigError(
-            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none"
+            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
+            "score: --score flags or rule"
         )
     return config.search
 
@@ -263,7 +279,7 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
 def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
-    if kind in ("none", "log"):
+    if kind in ("none", "log", "backtrack"):
         if config.tilt:
             raise ConfigError("a tilt needs a search: the agent has none, see --search")
         return config.rollouts, 1, 1
@@ -300,7 +316,7 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
-        trees = max(config.trees, -(-each // branches)) if kind in ("tree", "oracle") else 1
+        trees = max(config.trees, -(-each // branches)) if kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
     exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
