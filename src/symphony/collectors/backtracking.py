@@ -44,16 +44,21 @@ class Backtrack:
             the step they go back to and how often each line [R] has gone back so far, and must give them other random
             numbers than before, and what was not kept of the entries that the start state has. None where everything is
             kept and numbers come from a global generator.
+        width: lines simulated at a time, the next of which begin as others end: few steps are then of few lines. None for
+            all. It changes memory and speed only.
     """
 
     threshold: float
     back: tuple[int, ...] = (3, 5, 10, 0, 0)
     cap: float = 4.0
     renew: Renew | None = None
+    width: int | None = None
 
     def __post_init__(self) -> None:
         if not self.back or min(self.back) < 0 or self.back[0] < 1:
             raise ConfigError(f"back is periods, the first at least 1, is {self.back}")
+        if self.width is not None and self.width < 1:
+            raise ConfigError(f"width must be at least 1 line, is {self.width}")
         if not self.cap >= 0 or self.threshold != self.threshold:  # NaN
             raise ConfigError(f"cap and threshold must be numbers, are {self.cap} and {self.threshold}")
 
@@ -135,8 +140,10 @@ def follow(
     periods, short = -(-steps // every), steps % every
     entries, length = list(start.keys(True, True)), periods * every
     course = Course(rule, lines, periods, device)
-    line = torch.arange(lines, device=device)
+    everyone = torch.arange(lines, device=device)
+    line = everyone[: rule.width]
     now, simulated = take(start, line[:, None]), line.new_zeros(())
+    begun = len(line)
     history: TensorDictBase | None = None
     while len(line):
         at = course.at[line]
@@ -163,8 +170,13 @@ def follow(
             root = root if rule.renew is None else rule.renew(root, course.times[who])
             now = _with_rows(now, goes, root, entries)
         on = (course.at[line] < periods).nonzero().squeeze(-1)
-        if len(on) < len(line):
+        ended = len(line) - len(on)
+        if ended:
             line, now = line[on], take(now, on[:, None])
+        if ended and begun < lines:
+            others = everyone[begun : begun + ended]
+            line, begun = torch.cat([line, others]), begun + len(others)
+            now = torch.cat([now, take(start, others[:, None]).select(*entries)])
     assert history is not None  # noqa: S101  (a search has a line and a step)
     order = torch.arange(lines * length, device=device).reshape(*start.shape, length)[..., :steps]
     return Lines(

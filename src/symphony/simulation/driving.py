@@ -147,7 +147,7 @@ def simulation(
         )
     else:
         best, scorer = kind == "best", None
-        rules = {"best": KeepAll, "backtrack": lambda: going_back(env, settings.threshold, begin)}
+        rules = {"best": KeepAll, "backtrack": lambda: going_back(env, settings.threshold, start.numel(), begin)}
         if agent.discriminator is not None:
             scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():

@@ -41,6 +41,10 @@ _PRUNING = (1 << 40) + 1
 _RETRIES = (1 << 40) + 2
 _BACK = 1 << 41
 """Numbers of the streams that prunings, repeats and lines that went back draw from, far above those of rollouts and agents."""
+FILL, FEW = 4, 256
+"""Where lines go back, those of so many times the usual run segments are simulated one after the other, as many at a time
+as usual: else the last ones of every batch would be steps of few lines.
+"""
 AHEAD = 0.5
 """Seconds that :func:`rule_score` looks ahead."""
 OUTCOME: Sequence[keys.Key] = [
@@ -273,13 +277,14 @@ def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:
 
 
 def going_back(
-    env: DrivingEnv, threshold: float, begin: Callable[[TensorDictBase], TensorDictBase]
+    env: DrivingEnv, threshold: float, lines: int, begin: Callable[[TensorDictBase], TensorDictBase]
 ) -> Backtrack:
     """The rule by which lines go back in the driving environment, with random numbers of their own at every try.
 
     Args:
         env: the environment.
         threshold: of the totals.
+        lines: how many there are; one in :data:`FILL` is simulated at a time, at least :data:`FEW`.
         begin: from first states [R, 1] to others with goals drawn anew: those kept may not be met by anybody.
     """
 
@@ -292,4 +297,4 @@ def going_back(
             found[first] = begin(found[first])
         return found
 
-    return Backtrack(threshold, renew=renew)
+    return Backtrack(threshold, renew=renew, width=max(FEW, lines // FILL))
