@@ -33,8 +33,7 @@ class Backtrack:
 
     A line is bad that ends a period with a total above the threshold, or NaN. The first time it goes back `back[0]` periods
     from there, and if it is bad again before it has come `back[0]` periods past that place, `back[1]`, and so on. After the
-    last try, or once it was simulated `cap` times over, it goes on as it is until a period is good, and may then go back
-    again unless the cap is reached.
+    last try, or once it was simulated `cap` times over, it goes on as it is.
 
     Args:
         threshold: in the units of the totals.
@@ -87,16 +86,16 @@ class Course:
         left = self.left[line] & bad
         asks = bad & ~left
         over = (tries >= len(self.back)) | (self.again[line] >= self.rule.cap * self.periods)
-        goes, gives_up = asks & ~over, asks & over
+        goes = asks & ~over
         back = self.back[tries.clamp_max(len(self.back) - 1)]
         to = torch.where(back == 0, 0, (at + 1 - back).clamp_min(0))
-        # Past the place of its trouble, or left alone with it, a line begins to count anew.
-        anew = gives_up | (~bad & (at >= front + self.rule.back[0]))
+        # Past the place of its trouble a line begins to count anew.
+        anew = ~bad & (at >= front + self.rule.back[0])
         self.tries[line] = torch.where(anew, 0, tries + goes)
         self.front[line] = torch.where(anew, 0, torch.where(goes, torch.maximum(front, at), front))
         self.again[line] += torch.where(goes, at + 1 - to, 0)
         self.times[line] += goes
-        self.left[line] = left | gives_up
+        self.left[line] = left | (asks & over)
         self.at[line] = torch.where(goes, to, at + 1)
         return goes
 
