@@ -37,7 +37,7 @@ from symphony.simulation.search import AGGREGATES, ENDED, flag_score, search
 
 EVERY = 2
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=EVERY)
-KINDS = ("none", "tree", "oracle", "best")
+KINDS = ("none", "tree", "backtrack", "best")
 at_the_end = Aggregate("last")
 
 
@@ -347,11 +347,11 @@ def test_trees_of_one_branch_are_independent_rollouts(dataset: SceneDataset, age
     assert same(none, tree)
 
 
-@pytest.mark.parametrize("kind", ["tree", "oracle"])
-def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
+@pytest.mark.parametrize("score", ["discriminator", "flags", "rule"])
+def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, score: Any) -> None:
     scenes = dataset.scenes(range(4))
-    few = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2))
-    many = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=6, trees=3))
+    few = simulated(agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=4, trees=2))
+    many = simulated(agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=6, trees=3))
     assert same(few, part(many, slice(None), slice(0, 4)))
 
 
@@ -421,9 +421,10 @@ def test_neither_discriminator_nor_search_touches_the_goals(
     assert len(reference[1, :, 0].unique()) > 1  # else there is nothing to bias
     strict = replace(agent, discriminator=make_agent(discriminator=1).discriminator)
     driven = []
-    for kind, scorer in (("tree", agent), ("tree", strict), ("oracle", agent), ("best", strict)):
+    ways: list[tuple[Any, Any, Agent]] = [("tree", "discriminator", scorer) for scorer in (agent, strict)]
+    for kind, score, scorer in (*ways, ("tree", "flags", agent), ("best", "discriminator", strict)):
         trees = 1 if kind == "best" else 5
-        config = EvaluateConfig(search=kind, rollouts=5, trees=trees, branches=3, rule="best")
+        config = EvaluateConfig(search=kind, score=score, rollouts=5, trees=trees, branches=3, rule="best")
         goals, state = goals_of(monkeypatch, scorer, scenes, config)
         assert torch.equal(goals, reference)
         driven.append(state)
@@ -512,11 +513,12 @@ def test_the_oracle_lowers_what_it_measures() -> None:
 
     def bad(kind: Any) -> tuple[float, float]:
         """Share of rollouts with a collision, and of agent-steps with a collision or off the road."""
-        found = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=16, trees=2, branches=8))
+        config = EvaluateConfig(search=kind, score="flags", rollouts=16, trees=2, branches=8)
+        found = simulated(agent, scenes, config)
         flags = (found.collision | found.offroad) & found.counted
         return found.collision.any(-1).any(-1).float().mean().item(), flags.float().mean().item()
 
-    none, oracle = bad("none"), bad("oracle")
+    none, oracle = bad("none"), bad("tree")
     assert none[0] > 0.3
     assert oracle[0] < 0.7 * none[0]
     assert oracle[1] < 0.5 * none[1]
@@ -537,7 +539,7 @@ def test_the_oracle_scores_flags_of_real_agents_alone() -> None:
 
 def test_kinds_and_sizes_that_do_not_fit_are_refused(store: SegmentStore, agent: Agent) -> None:
     without = replace(agent, discriminator=None)
-    for kind in ("tree", "best"):
+    for kind in ("tree", "best", "backtrack"):
         with pytest.raises(ConfigError, match="needs an agent with a discriminator"):
             evaluate(without, store, EvaluateConfig(search=kind))
     with pytest.raises(ConfigError, match="less than 16 rollouts"):
