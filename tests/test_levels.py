@@ -17,6 +17,7 @@ from symphony.data.levels import LEVEL, Levels, dense, levels_of
 from symphony.data.overlaps import overlapping
 from symphony.data.segment import Polylines, RunSegment, validate
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.objects import levels_apart
 from symphony.envs.points import nearest_points
 from symphony.envs.road import road_distance
 from symphony.envs.scene import PointType
@@ -169,8 +170,9 @@ def test_cars_that_follow_each_other_up_a_ramp_are_never_apart() -> None:
         -1,
     )
     found = levels.at(place)
-    apart = (found[1:, 1] != found[:-1, 1]) & (np.abs(np.diff(found[:, 0])) >= LEVEL)
-    assert not apart.any()
+    one, other = torch.from_numpy(found[1:]), torch.from_numpy(found[:-1])
+    assert (one[:, 1] != other[:, 1]).any()
+    assert not levels_apart(one, other).any()
     assert {1.0, 2.0} <= set(found[:, 1].tolist())
 
 
@@ -215,3 +217,19 @@ def test_points_and_edges_are_those_of_ones_own_level(count: int) -> None:
             seen = set(flat[k, agent][mask[k, agent]].tolist())
             away = (scenes.point[0, mine] - where[k, agent]).square().sum(-1)
             assert seen == set(mine[away.argsort(stable=True)[:count]].tolist())
+
+
+def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is done where nothing may wait for the device, on the CPU."""
+    segments = overpass(), straight_road(3, steps=STEPS)
+    found = drive(*segments)[1]
+    for name in ("flags", "points", "road", "driving"):
+        monkeypatch.setattr(f"symphony.envs.{name}.on_host", lambda _: False)
+    there = drive(*segments)[1]
+    for flag in (keys.COLLISION, keys.OFFROAD, ("agents", "observation", "objects_mask")):
+        assert torch.equal(found.get(flag), there.get(flag))
+    for name in ("road", "road_ahead", "points"):
+        one, other = (each.get(("agents", "observation", name)) for each in (found, there))
+        if name == "points":  # in any order
+            one, other = one.sort(-2).values, other.sort(-2).values
+        torch.testing.assert_close(one, other)
