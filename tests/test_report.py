@@ -443,7 +443,8 @@ def test_the_command_writes_page_numbers_and_table(
     table = list(csv.DictReader(io.StringIO((tmp_path / "sim" / "report.csv").read_text())))
     assert [row["segment"] for row in table] == ["a&b <i>", "free"]
     page = (tmp_path / "sim" / "report.html").read_text()
-    assert "view.html#segment=a%26b+%3Ci%3E&rollout=0&t=1.2" in page
+    # Two seconds before the first event, at 1.2 s, there was nothing yet.
+    assert "view.html#segment=a%26b+%3Ci%3E&rollout=0&t=0&follow=ego" in page
     assert "<i>" not in page.split("<body>")[1].split("<script>")[0]
     assert "src=" not in page
     assert "http" not in page

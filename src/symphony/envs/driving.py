@@ -444,7 +444,8 @@ class DrivingEnv(EnvBase):
         if seen.road is not None:
             return collision, (seen.road[..., 0] > 0) & valid
         position = _rows_of(objects.state, index)[..., :2]
-        return collision, offroad_flags(self.scenes, scene, position, self._kept()) & valid
+        height = None if objects.height is None else _rows_of(objects.height, index)
+        return collision, offroad_flags(self.scenes, scene, position, self._kept(), height) & valid
 
     def _kept(self) -> Tables:
         """What is looked up at each step of the present scenes."""

@@ -42,6 +42,8 @@ COLUMNS = {
     "log_distance": "to log m",
 }
 """Of the table of runs: a number's name and its heading."""
+LEAD = 2.0
+"""Seconds before the first event of a run at which its replay begins."""
 
 
 def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> str:
@@ -114,6 +116,7 @@ def _run(row: Mapping[str, Any], viewer: str | None) -> dict[str, Any]:
     shown["what"] = ", ".join(what)
     # A run of which nothing was saved has no replay.
     if viewer is not None and row.get("steps") is not None:
-        place = {"segment": row["segment"], "rollout": row["rollout"], "t": row.get("first_event") or 0}
+        begin = max((row.get("first_event") or 0) - LEAD, 0)
+        place = {"segment": row["segment"], "rollout": row["rollout"], "t": round(begin, 2), "follow": "ego"}
         shown["link"] = f"{viewer}#{urlencode(place)}"
     return shown
