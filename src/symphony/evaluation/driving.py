@@ -12,7 +12,8 @@ import numpy as np
 import shapely
 
 from symphony.data.segment import RunSegment, SignalState
-from symphony.evaluation.contacts import Bools, Indices, Reals, lane_widths
+from symphony.evaluation.contacts import Bools, Indices, Reals
+from symphony.evaluation.fault import Lights, lane_widths
 from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph
@@ -28,14 +29,6 @@ IN_LANE = 2.0
 """Metres from a centre line within which an agent is in the lane."""
 _FOLLOWED = 3.0
 """Metres from a centre line, on average, within which a path follows the lane."""
-
-
-class Lights(NamedTuple):
-    """Lights that were red when agents drove past, all [E]: row of A, state, light."""
-
-    agent: Indices
-    step: Indices
-    light: Indices
 
 
 def red_lights(world: World, evaluated: Indices, segment: RunSegment, start: int) -> Lights:
