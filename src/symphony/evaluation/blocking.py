@@ -32,7 +32,7 @@ _LANE = 2.5
 def blocking(world: World, evaluated: Indices, segment: RunSegment, graph: LaneGraph, start: int) -> Bools:
     """[M, U] when evaluated agents block traffic.
 
-    That is, they stand (:data:`symphony.metrics.kinds.STANDING`) in a lane that goes on, for :data:`SECONDS` at least,
+    That is, they stand (:data:`symphony.metrics.kinds.STANDING`) in a lane that goes on, for :data:`SECONDS` or more,
     while nobody is in their way ahead or crosses it, no light ahead is other than green, and the log, where it has
     the agent, moves.
 

@@ -287,6 +287,7 @@ def _add(
         means = values.double().nanmean(-1).tolist()
         evaluation.own.setdefault(path, {}).update(zip(names, means, strict=True))
     kinds = _kinds(scenes, evaluated, exists)
+    bounded = scenes.edge_valid.any(1)
     single = AgentSteps(
         evaluated.counted.transpose(2, 3),
         log_valid[:, 1:].transpose(1, 2),
@@ -294,6 +295,7 @@ def _add(
         _kinds(scenes, both, exists),
         rollouts.state[..., 1:, :, 3].transpose(2, 3),
         log[:, 1:, :, 3].transpose(1, 2),
+        bounded,
     )
     there = exists.transpose(2, 3) & ~scenes.background[:, None, None]
     driven, counted, there, log_valid = (
@@ -308,6 +310,7 @@ def _add(
         collided=rollouts.collision.transpose(2, 3).cpu(),
         at_states=found.at_states.transpose(2, 3).cpu(),
         offroad=rollouts.offroad.transpose(2, 3).cpu(),
+        bounded=bounded,
         displacement=away.transpose(2, 3).cpu(),
         simulated=counted.transpose(2, 3),
         logged=log_valid[:, 1:].transpose(1, 2),

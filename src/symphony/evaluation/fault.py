@@ -1,9 +1,9 @@
 """Whose fault a collision is, judged at the time of contact.
 
-The rules follow the sense of nuPlan's at-fault collisions (https://github.com/motional/nuplan-devkit): an agent answers
-for what it drives into, not for being driven into. To these come red lights, lanes that an agent leaves, and lane
-changes in front of others that are too close by RSS (Shalev-Shwartz et al., "On a formal model of safe and scalable
-self-driving cars", 2017, definition 1). ``docs/rollouts.md`` has them in a table.
+The rules follow the sense of nuPlan's at-fault collisions (https://github.com/motional/nuplan-devkit): an agent
+answers for what it drives into, not for being driven into. To these come red lights, lanes that an agent leaves, and
+lane changes in front of others that are too close by RSS (Shalev-Shwartz et al., "On a formal model of safe and
+scalable self-driving cars", 2017, definition 1). ``docs/rollouts.md`` has them in a table.
 
 Metres, radians, seconds. Legend: A agents, U states of a rollout, E contacts, W states of a window.
 """
@@ -35,6 +35,10 @@ CUT_IN_SECONDS = 4.0
 RESPONSE, SPEED_UP, BRAKE_LEAST, BRAKE_MOST = 1.0, 3.5, 4.0, 8.0
 """Of RSS: seconds until the one behind brakes, its acceleration until then, its braking then, and the braking of the
 one ahead, m/s^2 (defaults of Intel's ad-rss-lib)."""
+CORNER = 0.5
+"""Metres behind the front bumper that are its corner."""
+_TIE = 1e-3
+"""Metres by which the normals of the other must part the boxes more than the own ones."""
 _EDGE = 0.1
 """Metres an agent may reach over the edge of its lane and still count as within it."""
 _AHEAD = 30.0
@@ -51,7 +55,7 @@ class Lights(NamedTuple):
 
 
 class _Party(NamedTuple):
-    """One of the two at each contact: rows [E], positions [E, 2], headings [E], speeds along them [E], boxes [E, 2]."""
+    """One of the two at each contact: row [E], position [E, 2], heading [E], speed along it [E], box [E, 2]."""
 
     row: Indices
     position: Reals
@@ -129,7 +133,7 @@ def _party(world: World, row: Indices, found: Contacts) -> _Party:
 
 def _face(me: _Party, it: _Party) -> Indices:
     """With which side each agent touches [E]: that whose normal parts the boxes last, or of a corner that meets the
-    other's side, the end it is at.
+    other's side, the end it is at. Who is only beside the last :data:`CORNER` before the front touches that.
     """
     away = from_numpy(it.position - me.position)
     pair = relation(away[:, 0], away[:, 1], from_numpy(me.heading), from_numpy(it.heading))
@@ -143,11 +147,9 @@ def _face(me: _Party, it: _Party) -> Indices:
     towards = np.sign(places[2:]) * np.stack([np.cos(turn), -np.sin(turn)])
     corner = np.where(np.where(which == 2, towards[0], towards[1]) > 0, _FRONT, _REAR)
     end = np.where(places[0] > 0, _FRONT, _REAR)
-    return np.where(which == 0, end, np.where(which == 1, _SIDE, corner))
-
-
-_TIE = 1e-3
-"""Metres by which the normals of the other must part the boxes more than the own ones."""
+    rearmost = places[0] - (reach[0].numpy() - 0.5 * me.size[:, 0])
+    side = np.where(rearmost > 0.5 * me.size[:, 0] - CORNER, _FRONT, _SIDE)
+    return np.where(which == 0, end, np.where(which == 1, side, corner))
 
 
 def _ran_red(row: Indices, step: Indices, lights: Lights | None, steps: float) -> Bools:
@@ -204,9 +206,7 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: floa
 
 
 def safe_distance(behind: Reals, ahead: Reals) -> Reals:
-    """Metres between two that follow each other at speeds in m/s, from which on the one behind can always stop in time
-    (RSS).
-    """
+    """Metres between two that follow each other at speeds in m/s, beyond which the one behind can stop (RSS)."""
     faster = behind + RESPONSE * SPEED_UP
     travel = behind * RESPONSE + 0.5 * SPEED_UP * RESPONSE**2 + faster**2 / (2 * BRAKE_LEAST)
     return np.maximum(travel - ahead**2 / (2 * BRAKE_MOST), 0.0)

@@ -22,7 +22,7 @@ from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import search_kind, driven_by
+from symphony.simulation.driving import driven_by, search_kind
 from symphony.simulation.rollouts import Rollouts
 from symphony.simulation.saved import SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import RolloutWriter

@@ -324,9 +324,9 @@ def total_numbers(rows: Sequence[Row]) -> Row:
         ``runs`` (failed ones included), ``failed_runs``, ``segments`` and ``groups``; over the runs that did not fail
         the means, each with its standard error over groups under ``*_se`` (None for a single group) and the segments
         that have such a number under ``*_segments``; the largest ``max_*`` and the smallest ``min_ttc``. ``*_rate``
-        are percent of runs (``collision_rate_at_states``: at states only), ``*_time`` percent of the evaluated agents'
-        time, ``log_distance`` is a mean over steps. ``*_bound`` of a percentage that is zero is the exact bound that
-        95 % of such samples of groups keep (:func:`symphony.metrics.intervals.zero_bound`), else None.
+        are percent of runs (``collision_rate_at_states``: at states only), ``*_time`` percent of the evaluated
+        agents' time, ``log_distance`` is a mean over steps. ``*_bound`` is of a percentage that is zero the exact
+        bound over groups with 95 % confidence (:func:`symphony.metrics.intervals.zero_bound`), else None.
         Where rare manoeuvres were made more frequent, also ``untilted_*`` with errors: what the means would be
         without that, by the weights of the runs; and ``effective_runs``, how many of one weight would tell as much.
     """

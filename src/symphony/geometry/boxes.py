@@ -114,6 +114,7 @@ def relation(
     heading_a: Float[Tensor, "*#b"],
     heading_b: Float[Tensor, "*#b"],
 ) -> _Pair:
+    """Where a box is whose centre is ``x`` and ``y`` metres from that of box a."""
     turn = heading_b - heading_a
     return _Pair(turned(x, y, heading_a), turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
 

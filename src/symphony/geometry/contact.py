@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from symphony.geometry.boxes import covers, relation, turned, boxes_overlap
+from symphony.geometry.boxes import boxes_overlap, covers, relation, turned
 from symphony.geometry.frames import wrap
 
 _TURNED = 0.005

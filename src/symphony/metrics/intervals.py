@@ -1,7 +1,7 @@
 """Exact intervals of rates and of means of few samples.
 
-Sources: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934); "Student", "The probable
-error of a mean", Biometrika 6 (1908); the continued fraction of the incomplete beta function is DLMF 8.17.22.
+Sources: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934); "Student", "The
+probable error of a mean", Biometrika 6 (1908); the incomplete beta function is DLMF 8.17.22.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ def binomial_interval(hits: int, of: int, confidence: float = 0.95) -> tuple[flo
 
 
 def zero_bound(of: int) -> float:
-    """Percent that a rate may have, at most, of which so many independent samples show nothing: with 95 % confidence."""
+    """Percent that a rate has at most, with 95 % confidence, of which so many independent samples show nothing."""
     return 100.0 * binomial_interval(0, of)[1]
 
 
 def t_quantile(probability: float, freedom: int) -> float:
-    """Quantile of Student's t distribution: of the mean of n samples, in standard errors, with n - 1 degrees of freedom.
+    """Quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees of freedom.
 
     Raises:
         ValueError: no degree of freedom, or a probability that is not between 0 and 1.

@@ -26,7 +26,7 @@ class SegmentResult:
         at_states: those of them in which one did at a state; None where not given.
         rollouts: K.
         offroad: agent-steps off the road, over all rollouts.
-        steps: agent-steps simulated, over all rollouts.
+        steps: agent-steps simulated where the map has a boundary, over all rollouts.
         error: [K] displacement error summed over agents and steps, metres.
         logged: [K] agent-steps at which the log is valid and the agent is there.
         histogram: [201] curvatures of the branching regions visited by the rollouts.

@@ -114,9 +114,9 @@ def collisions(
     *,
     at_states: bool = False,
 ) -> Bool[Tensor, "*lead N T"]:
-    """Whether the oriented box of each subject overlaps that of any other agent in each of the U - 1 steps between
-    states, or with ``at_states`` at each of the U states (as the paper and WOSAC count). Leading dimensions broadcast;
-    see :func:`meetings`.
+    """Whether the oriented box of each subject overlaps any other agent's in each of the U - 1 steps between states,
+    or with ``at_states`` at each of the U states (as the paper and WOSAC count), see :func:`meetings`. Leading
+    dimensions broadcast.
 
     Args:
         position: [..., A, U, 2] box centres.
