@@ -17,11 +17,11 @@ import numpy as np
 import shapely
 from torch import from_numpy
 
-from symphony.data.segment import LaneType, RoadMap, RunSegment
+from symphony.data.segment import AgentType, LaneType, RoadMap, RunSegment
 from symphony.evaluation.contacts import STILL, Bools, Contacts, Indices, Reals, poses
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind
-from symphony.metrics.kinds import SAME_WAY, STANDING
+from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph, lane_of
 from symphony.simulation.world import World
 
@@ -41,6 +41,8 @@ _TIE = 1e-3
 """Metres by which the normals of the other must part the boxes more than the own ones."""
 _EDGE = 0.1
 """Metres an agent may reach over the edge of its lane and still count as within it."""
+ENTERING = 0.1
+"""Speed in m/s towards the other from which on an agent is on its way into a lane."""
 _AHEAD = 30.0
 """Metres that a path is thought to go on straight after a contact."""
 _FRONT, _REAR, _SIDE = range(3)
@@ -55,11 +57,14 @@ class Lights(NamedTuple):
 
 
 class _Party(NamedTuple):
-    """One of the two at each contact: row [E], position [E, 2], heading [E], speed along it [E], box [E, 2]."""
+    """One of the two at each contact: row [E], position [E, 2], heading [E], velocity [E, 2], speed along the heading
+    [E], box [E, 2].
+    """
 
     row: Indices
     position: Reals
     heading: Reals
+    velocity: Reals
     speed: Reals
     size: Reals
 
@@ -84,23 +89,20 @@ def at_fault(
     """
     me, it = _party(world, found.agent, found), _party(world, found.other, found)
     kind, face = found.kind, _face(me, it)
-    same_way = np.abs(_wrapped(it.heading - me.heading)) < SAME_WAY
-    # A cyclist's kind is its own, whichever way it goes.
-    ends = np.isin(kind, [CollisionKind.INTO_LEADER, CollisionKind.REAR_ENDED]) | (
-        (kind == CollisionKind.CYCLIST) & same_way & (face != _SIDE)
-    )
-    behind = np.where(kind == CollisionKind.CYCLIST, face == _FRONT, kind == CollisionKind.INTO_LEADER)
+    ends = np.isin(kind, [CollisionKind.INTO_LEADER, CollisionKind.REAR_ENDED])
+    behind = kind == CollisionKind.INTO_LEADER
     rows, others = np.where(behind, me.row, it.row), np.where(behind, it.row, me.row)
+    # Who is on foot changes no lanes.
+    driving = ends & (segment.agent_type[others] != AgentType.PEDESTRIAN)
     cut_in = np.zeros(len(kind), bool)
-    cut_in[ends] = _cut_in(world, rows[ends], others[ends], found.step[ends], segment.dt)
-    across = ~ends & (kind != CollisionKind.SIDESWIPE) & (kind != CollisionKind.OTHER)
+    cut_in[driving] = _cut_in(world, rows[driving], others[driving], found.step[driving], segment.dt)
+    across = np.isin(kind, [CollisionKind.CROSSING, CollisionKind.ONCOMING])
     red, their_red = (
         across & _ran_red(party.row, found.step, lights, RED_SECONDS / segment.dt) for party in (me, it)
     )
     reaching, their_reaching = (_reaching(one, two, graph, segment.road) for one, two in ((me, it), (it, me)))
     reaching = reaching | offroad[me.row, found.step]
     backing = (me.speed < -STILL) & (face == _REAR)
-    from_behind = ends & ~behind
     beside = np.isin(kind, [CollisionKind.ONCOMING, CollisionKind.SIDESWIPE])
     # The first that holds decides.
     rules = (
@@ -109,9 +111,9 @@ def at_fault(
         (np.abs(me.speed) <= STILL, False),
         (their_red, False),
         (backing, True),
-        (from_behind, False),
+        (ends & ~behind, False),
         (np.abs(it.speed) <= STANDING, True),
-        (kind == CollisionKind.INTO_LEADER, True),
+        (behind, True),
         (beside & reaching, True),
         (beside & their_reaching, False),
         (face == _FRONT, True),
@@ -128,7 +130,7 @@ def _party(world: World, row: Indices, found: Contacts) -> _Party:
     front = world.heading[row, found.step]
     heading = heading + np.pi * (np.cos(heading - front) < 0)
     speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
-    return _Party(row, position, heading, speed, world.size[row])
+    return _Party(row, position, heading, velocity, speed, world.size[row])
 
 
 def _face(me: _Party, it: _Party) -> Indices:
@@ -160,7 +162,9 @@ def _ran_red(row: Indices, step: Indices, lights: Lights | None, steps: float) -
 
 
 def _reaching(me: _Party, it: _Party, graph: LaneGraph, road: RoadMap) -> Bools:
-    """Whether an agent reaches over that edge of its lane which is towards the other, or is in no lane [E]."""
+    """Whether an agent is in no lane, reaches over that edge of its lane which is towards the other, or over the far
+    one on its way in [E].
+    """
     lane = lane_of(graph, me.position, me.heading)
     found = np.ones(len(lane), bool)
     inside = lane >= 0
@@ -173,8 +177,10 @@ def _reaching(me: _Party, it: _Party, graph: LaneGraph, road: RoadMap) -> Bools:
     turn = me.heading[inside] - way
     covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * me.size[inside]).sum(-1)
     side = np.sign(((it.position[inside] - here) * left).sum(-1))
-    beyond = side * ((here - nearest) * left).sum(-1) + covered
-    found[inside] = beyond > 0.5 * lane_widths(road)[lane[inside]] + _EDGE
+    off = side * ((here - nearest) * left).sum(-1)
+    coming = side * (me.velocity[inside] * left).sum(-1) > ENTERING
+    reach = 0.5 * lane_widths(road)[lane[inside]] + _EDGE - covered
+    found[inside] = (off > reach) | (coming & (off < -reach))
     return found
 
 
@@ -225,7 +231,3 @@ def lane_widths(road: RoadMap) -> Reals:
     """[L] metres, nominal ones where the source has none."""
     nominal = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, NOMINAL_WIDTH)
     return np.where(np.isnan(road.lane_width), nominal, road.lane_width).astype(np.float64)
-
-
-def _wrapped(angle: Reals) -> Reals:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
