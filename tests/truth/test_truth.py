@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scenes import Case, cases, segment_of
+from made import Case, segment_of
+from scenes import cases
 
 from helpers_saved import played
 from symphony.data.segment import AgentType

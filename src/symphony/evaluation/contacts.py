@@ -59,10 +59,9 @@ def contacts(world: World, evaluated: Indices) -> Contacts:
         world: everyone.
         evaluated: [M] rows of A.
     """
-    everyone = (
-        torch.from_numpy(part)[None] for part in (world.position, world.heading, world.size, world.valid)
-    )
-    found = meetings(*everyone, torch.from_numpy(evaluated)[None])
+    parts = world.position, world.heading, world.size, world.valid, evaluated
+    position, heading, size, valid, subject = (torch.from_numpy(part)[None] for part in parts)
+    found = meetings(position, heading, size, valid, subject)
     agent, other = evaluated[found.subject.numpy()], found.other.numpy()
     step, share = found.step.numpy() + 1, found.share.numpy()
     if not len(agent):

@@ -91,12 +91,10 @@ def meetings(
         now = step if at_states else step + 1
         before = torch.where(both, step, now)
         times = torch.stack([before, now], -1)
-        poses = [
-            value[row[:, None], agent[:, None], times]
-            for agent in (one, other)
-            for value in (position, heading)
-        ]
-        share = contact_share(*poses[:2], size[row, one], *poses[2:], size[row, other])
+        at = [(row[:, None], agent[:, None], times) for agent in (one, other)]
+        share = contact_share(
+            position[at[0]], heading[at[0]], size[row, one], position[at[1]], heading[at[1]], size[row, other]
+        )
         hit = share < math.inf
         found.append(tuple(value[hit] for value in (row, who, other, step, share)))
     if not found:
