@@ -64,8 +64,7 @@ def _long(flags: Bools, dt: float) -> Bools:
         return np.zeros_like(flags)
     whole = np.lib.stride_tricks.sliding_window_view(flags, least, axis=1).all(-1)
     padded = np.pad(whole, ((0, 0), (least - 1, least - 1)))
-    found: Bools = np.lib.stride_tricks.sliding_window_view(padded, least, axis=1).any(-1)
-    return found
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, least, axis=1).any(-1))
 
 
 def _seen_from(world: World, row: Indices, step: Indices, points: Reals) -> tuple[Reals, Reals]:

@@ -87,6 +87,8 @@ def at_fault(
         offroad: [A, U] whether an agent is off the road; read for the agents of contacts only.
         lights: that anybody ran; None for none.
     """
+    if not len(found.agent):
+        return np.zeros(0, bool)
     me, it = _party(world, found.agent, found), _party(world, found.other, found)
     kind, face = found.kind, _face(me, it)
     ends = np.isin(kind, [CollisionKind.INTO_LEADER, CollisionKind.REAR_ENDED])

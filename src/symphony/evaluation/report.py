@@ -192,7 +192,6 @@ def _row(segment: str, rollout: int, group: str, failed: str, values: Row) -> Ro
 def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> tuple[list[Row], list[Event]]:
     """Numbers of every rollout, and what is to be marked in them."""
     segment, rows = saved.segment, saved.agents[who]
-    everyone = np.arange(segment.num_agents)
     has_road, has_lanes = len(segment.road.boundary) > 0, len(graph.usable_lanes) > 0
     has_lights = len(segment.signal_lane) > 0
     moved, motion = progress(saved, who), comfort(saved, who)
@@ -203,7 +202,8 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
         world = world_of(saved, k)
         off = np.zeros(world.valid.shape, bool)
         off[saved.agents, 1:] = (saved.offroad[k] & saved.counted[k]).T
-        hits, lights = contacts(world, rows), red_lights(world, everyone, segment, saved.start)
+        hits = contacts(world, rows)
+        lights = red_lights(world, np.union1d(rows, hits.other), segment, saved.start)
         fault = at_fault(world, hits, graph, segment, off, lights)
         # Those of others only say whose fault a collision is.
         lights = Lights(*(part[np.isin(lights.agent, rows)] for part in lights))
