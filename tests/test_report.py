@@ -65,7 +65,7 @@ def touched(segment: RunSegment, agent: int = 0, offroad: bool = False) -> list[
     """Other, kind, step and fault of each contact of an agent."""
     world = world_of(played(segment, [agent]), 0)
     off = np.full(world.valid.shape, offroad)
-    found = contacts(world, np.array([agent]))
+    (found,) = contacts([world], np.array([agent]))
     fault = at_fault(world, found, LaneGraph(segment.road), segment, off)
     parts = found.other, found.kind, found.step, fault
     return [

@@ -75,7 +75,7 @@ def check(case: Case, row: dict[str, Any], events: list[Any], saved: SavedRollou
             first = int(saved.segment.agent_type[hits[0].other])
             assert kind_of(saved) == BY_TYPE.get(first, int(KINDS[right["kind"]])), "the evaluator's kind"
         if right["at"] is not None:
-            found = contacts(world_of(saved, 0), np.array([0]))
+            (found,) = contacts([world_of(saved, 0)], np.array([0]))
             times = start + (found.step - 1 + found.share) * dt
             assert times[0] == pytest.approx(right["at"], abs=2e-3), "time of contact"
     assert row["red_lights"] == (right.get("red", 0) if case.light else None)

@@ -48,11 +48,12 @@ def blocking(world: World, evaluated: Indices, segment: RunSegment, graph: LaneG
     logged = np.linalg.norm(segment.velocity[evaluated, within].astype(np.float64), axis=-1) <= STANDING
     excused = logged & segment.valid[evaluated, within]
     stands = world.valid[evaluated] & (np.abs(world.speed[evaluated]) <= STANDING) & ~excused
-    who, step = _long(stands, segment.dt).nonzero()
+    found, (who, step) = np.zeros(stands.shape, bool), _long(stands, segment.dt).nonzero()
+    if not len(who):
+        return found
     row = evaluated[who]
     free = _in_lane(world, row, step, graph) & _nobody_ahead(world, row, step)
     free &= _green(world, row, step, segment, start)
-    found = np.zeros(stands.shape, bool)
     found[who[free], step[free]] = True
     return _long(found, segment.dt)
 

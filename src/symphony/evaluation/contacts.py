@@ -9,6 +9,7 @@ Metres, radians, seconds. Legend: A agents, U states of a rollout, M evaluated a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,31 +53,38 @@ class Contacts(NamedTuple):
     at_state: Bools
 
 
-def contacts(world: World, evaluated: Indices) -> Contacts:
-    """Collisions of the evaluated agents [M] of one rollout, from its second state on.
+def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
+    """Collisions of the evaluated agents [M] of rollouts of one segment, from their second states on.
 
     Args:
-        world: everyone.
+        worlds: everyone in each rollout.
         evaluated: [M] rows of A.
     """
-    parts = world.position, world.heading, world.size, world.valid, evaluated
-    position, heading, size, valid, subject = (torch.from_numpy(part)[None] for part in parts)
+    position, heading, valid = (
+        torch.from_numpy(np.stack([getattr(world, name) for world in worlds]))
+        for name in ("position", "heading", "valid")
+    )
+    size = torch.from_numpy(worlds[0].size).expand(len(worlds), -1, -1)
+    subject = torch.from_numpy(evaluated).expand(len(worlds), -1)
     found = meetings(position, heading, size, valid, subject)
-    agent, other = evaluated[found.subject.numpy()], found.other.numpy()
-    step, share = found.step.numpy() + 1, found.share.numpy()
+    parts = found.subject.numpy(), found.other.numpy(), found.step.numpy() + 1, found.share.numpy()
+    each = [tuple(part[found.row.numpy() == k] for part in parts) for k in range(len(worlds))]
+    return [_first(world, evaluated[who], *pair) for world, (who, *pair) in zip(worlds, each, strict=True)]
+
+
+def _first(world: World, agent: Indices, other: Indices, step: Indices, share: Reals) -> Contacts:
+    """Of each pair the first, in order of time."""
     if not len(agent):
         return Contacts(agent, other, step, share, agent, np.zeros(0, bool))
     one, two = (_boxes(world, row, step) for row in (agent, other))
     overlap = boxes_overlap(*one, *two).numpy()
-    # The first of each pair, in order of time.
     order = np.lexsort((other, agent, share, step))
     pair = (agent * len(world.size) + other)[order]
     _, first, number = np.unique(pair, return_index=True, return_inverse=True)
     at_state = np.bincount(number, overlap[order], len(first)) > 0
-    order_of_first = np.argsort(first)
-    chosen = order[first[order_of_first]]
-    agent, other, step, share = (part[chosen] for part in (agent, other, step, share))
-    return Contacts(agent, other, step, share, _kinds(world, agent, other, step), at_state[order_of_first])
+    turn = np.argsort(first)
+    agent, other, step, share = (part[order[first[turn]]] for part in (agent, other, step, share))
+    return Contacts(agent, other, step, share, _kinds(world, agent, other, step), at_state[turn])
 
 
 def poses(

@@ -197,12 +197,12 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
     moved, motion = progress(saved, who), comfort(saved, who)
     distance, logged = log_distance(saved, who)
     out, events = [], []
-    for k in range(saved.rollouts):
+    worlds = [world_of(saved, k) for k in range(saved.rollouts)]
+    met = contacts(worlds, rows)
+    for k, (world, hits) in enumerate(zip(worlds, met, strict=True)):
         counted = saved.counted[k][:, who]
-        world = world_of(saved, k)
         off = np.zeros(world.valid.shape, bool)
         off[saved.agents, 1:] = (saved.offroad[k] & saved.counted[k]).T
-        hits = contacts(world, rows)
         lights = red_lights(world, np.union1d(rows, hits.other), segment, saved.start)
         fault = at_fault(world, hits, graph, segment, off, lights)
         # Those of others only say whose fault a collision is.
