@@ -34,9 +34,6 @@ AGAIN = {
     "16": "",
     "32": "--branches 32",
     "64": "--branches 64",
-    "retry-0": "--retries 1",
-    "retry-1": "--retries 1 --retry-above 1",
-    "retries-0": "--retries 2",
 }
 FOREST = {"none": "--search none", "one": "", "forest": "--trees 16 --goals tree"}
 ELSEWHERE = ("womd", "argoverse2", "interaction", "nuscenes")
@@ -85,7 +82,6 @@ def commands(agent: str) -> Iterator[tuple[str, str]]:
         yield f"forest/town-included-{name}", whole
     for name, how in AGAIN.items():
         yield f"again/town-{name}", f"evaluate {agent} {how} --data DIR/town/validation --json FILE"
-        if name != "retries-0":
             yield f"again/ngsim-{name}", f"evaluate {agent} {how} --data DIR/ngsim-validation --json FILE"
 
 

@@ -108,7 +108,6 @@ def test_installed_command_prints_the_version() -> None:
         ["evaluate", "playback", "--data", "x", "--planner", "idm", "--figure", "f.png"],
         ["evaluate", "playback", "--data", "x", "--planner", "idm", "--calibrate", "y"],
         ["evaluate", "playback", "--data", "x", "--planner", "idm", "--metrics", "wosac"],
-        ["evaluate", "playback", "--data", "x", "--tilt", "1"],
         ["simulate", "playback", "--data", "x", "--out", "y", "--runs", "5", "--segments", "a"],
         ["simulate", "playback", "--data", "x", "--out", "y", "--runs", "5", "--rollouts", "2"],
     ],

@@ -367,30 +367,6 @@ def test_the_evaluation_decides_the_pruning(
     assert not same(found, simulated(agent, scenes, config))
 
 
-def test_what_nobody_needs_is_not_repeated(dataset: SceneDataset, agent: Agent) -> None:
-    scenes, config = (
-        dataset.scenes(range(4)),
-        EvaluateConfig(search="tree", rollouts=4, retries=1, retry_above=1e9),
-    )
-    assert same(simulated(agent, scenes, config), simulated(agent, scenes, replace(config, retries=0)))
-
-
-def test_repeated_periods_lower_the_score(env: DrivingEnv, agent: Agent) -> None:
-    start = start_of(env, 4)
-    once = look(env, agent, start)
-    above = float(once.totals[:, 0].median())
-    twice = look(env, agent, start, retries=1, retry_above=above)
-    first_once, first_twice = once.totals[:, 0], twice.totals[:, 0]
-    assert (first_twice <= first_once).all()
-    assert (first_twice < first_once).any()
-    assert torch.equal(first_twice[first_once <= above], first_once[first_once <= above])
-    # Whatever was taken is a history of its own: the scores are those of the states.
-    found = rollouts_of(env, start, twice.trajectories)
-    counted = found.counted.any(-1)
-    expected = scored(env, agent, start, found.state)
-    torch.testing.assert_close(twice.scores[counted], expected[counted], atol=1e-6, rtol=1e-5)
-
-
 def test_trees_differ_from_each_other(dataset: SceneDataset, agent: Agent) -> None:
     found = simulated(agent, dataset.scenes([0]), EvaluateConfig(search="tree", rollouts=4, trees=4))
     assert len({tuple(x.flatten().tolist()) for x in found.state[0]}) == 4

@@ -72,10 +72,6 @@ class Evaluate:
             raise ConfigError("--calibrate goes without --planner: give the threshold, --threshold")
         if self.planner and (self.metrics or self.config.metric):
             raise ConfigError("--metrics and --metric go without --planner: they are of the agent")
-        if self.config.tilt:
-            raise ConfigError(
-                "--tilt goes with `symphony simulate`: the report makes up for it, these numbers don't"
-            )
         check_planner_seconds(self.planner_seconds)
 
     def run(self) -> None:

@@ -37,7 +37,6 @@ _MEMORY = ("batch", "device", "workers", "engine")
 _USUAL = {
     "threshold": None,
     "goals": "tree",
-    "retries": 0,
     "logged_goals": False,
     "action_temperature": 1.0,
     "persona": "",
@@ -125,8 +124,6 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "prune_every": 0,
         "temperature": 0.0,
         "threshold": None,
-        "retries": 0,
-        "retry_above": 0.0,
     }
     if result.search not in ("none", "log"):
         filled["branches"] = config.branches or settings.test_branches
@@ -137,8 +134,6 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
         filled["threshold"] = used.threshold if used.rule == "replace" else None
         filled["goals"] = used.goals
-        filled["retries"] = config.retries
-        filled["retry_above"] = config.retry_above if config.retries else 0.0
     return {name: value for name, value in filled.items() if name not in _MEMORY}
 
 

@@ -157,7 +157,6 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
         found |= {"rule": pruning.rule, "prune_every": pruning.prune_every, "goals": pruning.goals}
         found |= {"temperature": pruning.temperature} if pruning.rule == "systematic" else {}
         found |= {"threshold": pruning.threshold} if pruning.rule == "replace" else {}
-        found |= {"retries": settings.retries} if settings.retries else {}
     return found
 
 

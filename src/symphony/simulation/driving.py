@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -26,7 +26,6 @@ from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
 from symphony.simulation.control import Tempered, given_personas
 from symphony.simulation.finite import FiniteWatch
-from symphony.simulation.importance import Tilt
 from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
@@ -48,7 +47,6 @@ class Simulation(NamedTuple):
         search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
-        log_weight: [B, K] logarithm of what each rollout weighs after a tilt; None without one.
     """
 
     rollouts: Rollouts
@@ -56,7 +54,6 @@ class Simulation(NamedTuple):
     search: BeamSearchResult | None
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
-    log_weight: Float[Tensor, "B K"] | None = None
 
 
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
@@ -123,10 +120,8 @@ def simulation(
     settings, planned = config.pruning(agent.search), None
     if egos is not None:
         kind = search_kind(agent, config)
-        # Nothing else simulates a period again.
-        keep_every = settings.prune_every if config.retries and kind in ("tree", "oracle") else 0
         forked = kind not in ("none", "log")
-        start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
+        start, planned = egos.begin(env, start, seed=config.seed, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
     drawn = goal
@@ -150,12 +145,9 @@ def simulation(
                 prune_every=settings.prune_every,
                 aggregate=aggregate_of(settings),
                 leaves=None if best else taken,
-                retries=0 if best else config.retries,
-                retry_above=config.retry_above,
                 keep_tree=keep_tree and not best,
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
-                tilt=Tilt(env, config.tilt, config.tilt_on, ego=planned is None) if config.tilt else None,
             )
         found = rollouts_of(env, start, result.trajectories)
         # A copy of a branch follows the goals of its parent.
@@ -170,8 +162,7 @@ def simulation(
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
-    weights = None if result is None or result.log_weights is None else result.log_weights.flatten(1)
-    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn, log_weight=weights)
+    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn)
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
@@ -264,8 +255,6 @@ def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
     if kind in ("none", "log"):
-        if config.tilt:
-            raise ConfigError("a tilt needs a search: the agent has none, see --search")
         return config.rollouts, 1, 1
     branches = config.branches or agent.search.test_branches
     if kind == "best":
@@ -275,11 +264,6 @@ def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
         raise ConfigError(
             f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
         )
-    if config.tilt and taken < branches:
-        raise ConfigError(
-            f"with a tilt every branch is a rollout: {config.trees} trees of {branches} branches are "
-            f"{config.trees * branches} rollouts, not {config.rollouts}"
-        )
     return config.trees, branches, taken
 
 
@@ -288,15 +272,10 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     each as that takes: what is independent of each other are segments.
 
     It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
-    rollouts than a tree has branches come from as few trees as that takes; with a tilt every branch stays a rollout.
+    rollouts than a tree has branches come from as few trees as that takes.
     """
     kind, least = search_kind(agent, config), -(-runs // segments)
     branches = config.branches or agent.search.test_branches
-    if config.tilt:
-        each = config.rollouts * -(-least // config.rollouts)
-        return -(-runs // each), dataclasses.replace(
-            config, rollouts=each, trees=config.trees * each // config.rollouts
-        )
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""

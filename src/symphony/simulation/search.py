@@ -30,7 +30,6 @@ from symphony.envs.driving import DrivingEnv
 from symphony.imports import build_object, load_object
 from symphony.modules import SeededNoise
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.importance import Tilt
 from symphony.streams import fold_in, uniform
 
 ENDED = -100.0
@@ -180,11 +179,8 @@ def search(
     aggregate: Callable[[Tensor], Tensor] = max_then_sum,
     leaves: int | None = None,
     keep_tree: bool = False,
-    retries: int = 0,
-    retry_above: float = 0.0,
     ego: bool = True,
     also: Sequence[keys.Key] = (),
-    tilt: Tilt | None = None,
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S] to the last logged step. Scenes beside each other change nothing.
 
@@ -199,12 +195,8 @@ def search(
         aggregate: from scores of steps and agents to one per branch.
         leaves: return only so many of each tree, the best of their scene's last period; by default all.
         keep_tree: also return the pruned branches.
-        retries: how often a period is simulated again, from its start, for branches that end it with a total above
-            ``retry_above``.
-        retry_above: that total.
         ego: whether the first agent is scored, too.
         also: what is kept of every step beside :data:`KEPT`.
-        tilt: importance of rare manoeuvres.
     """
     steps, scene = env.decisions, start.get(keys.SCENE)[..., 0, 0]
     return beam_search(
@@ -225,12 +217,4 @@ def search(
         group_key=keys.GOAL if takes_groups(rule) else None,
         keep=kept_keys(env, also),
         keep_tree=keep_tree,
-        retries=retries,
-        retry_above=retry_above if retries else None,
-        reseed=_reseed,
-        tilt=tilt,
     )
-
-
-def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:
-    return state.set(keys.STREAM, fold_in(state.get(keys.STREAM), _RETRIES + attempt))
