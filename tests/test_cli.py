@@ -106,7 +106,6 @@ def test_installed_command_prints_the_version() -> None:
         ["evaluate", "--data", "x"],
         ["evaluate", "playback", "--data", "x", "--unknown", "1"],
         ["evaluate", "playback", "--data", "x", "--planner", "idm", "--figure", "f.png"],
-        ["evaluate", "playback", "--data", "x", "--planner", "idm", "--calibrate", "y"],
         ["evaluate", "playback", "--data", "x", "--planner", "idm", "--metrics", "wosac"],
         ["simulate", "playback", "--data", "x", "--out", "y", "--runs", "5", "--segments", "a"],
         ["simulate", "playback", "--data", "x", "--out", "y", "--runs", "5", "--rollouts", "2"],

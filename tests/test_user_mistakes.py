@@ -201,7 +201,7 @@ def test_an_agent_that_searches_otherwise_is_another_simulation(store: Path, run
     assert told(*command)[0] == 0
     file = Path("own/agent.json")
     spec = json.loads(file.read_text())
-    spec["search"]["keep"] = 0.25
+    spec["search"]["threshold"] = 0.25
     file.write_text(json.dumps(spec))
     code, words = told(*command)
     assert (code, "differs in settings.specification" in words) == (1, True)

@@ -107,8 +107,6 @@ class SceneBatch(TensorClass):
         edge_previous: [B, E] int32 segment that ends where this one starts, -1 if none.
         edge_following: [B, E] int32.
         edge_valid: [B, E].
-        point_lists: [B, W] int32 lists of near points, see :mod:`symphony.envs.map_lists`; W = 0 without.
-        edge_lists: [B, V] int32 likewise of near boundary segments.
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
         segment: [B] int64 number of the run segment among those that scenes are drawn from.
         dt: [B] float64 seconds per step, the same in all scenes of a batch.
@@ -141,8 +139,6 @@ class SceneBatch(TensorClass):
     edge_previous: Tensor
     edge_following: Tensor
     edge_valid: Tensor
-    point_lists: Tensor
-    edge_lists: Tensor
     stream: Tensor
     segment: Tensor
     dt: Tensor
@@ -213,8 +209,6 @@ def scene(
         "edge_previous": previous.astype(np.int32),
         "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
-        "point_lists": np.zeros(0, np.int32),
-        "edge_lists": np.zeros(0, np.int32),
         "stream": np.array(stream_of(segment.segment_id)),
         "segment": np.array(number),
         "dt": np.array(segment.dt, np.float64),

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import BeamSearchResult, KeepAll
+from symphony.collectors import BeamSearchResult, KeepAll, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.driving import DrivingEnv
@@ -29,7 +29,7 @@ from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
-from symphony.simulation.search import aggregate_of, pruning_rule, search
+from symphony.simulation.search import pruning_rule, search
 
 RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
@@ -143,7 +143,6 @@ def simulation(
                 seed=config.seed,
                 rule=KeepAll() if best else pruning_rule(settings),
                 prune_every=settings.prune_every,
-                aggregate=aggregate_of(settings),
                 leaves=None if best else taken,
                 keep_tree=keep_tree and not best,
                 ego=planned is None,
@@ -155,7 +154,7 @@ def simulation(
         number = result.trajectories.get(keys.PLANNER, None)
         number = None if number is None else number[..., -1, :]
         if best:
-            order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
             found, result = Rollouts(*(_branches(part, order) for part in found)), None
             goal = _branches(goal, order)
             number = None if number is None else _branches(number, order)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,9 +40,6 @@ class Tracker:
         settings: dict[str, Any],
         wandb: Literal["offline", "online", "disabled"] = "offline",
         *,
-        project: str = "symphony",
-        group: str = "",
-        tags: Sequence[str] = (),
         after: int = 0,
     ) -> None:
         self.path = folder / RECORDS
@@ -57,9 +54,7 @@ class Tracker:
             import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
             self._run = tracking.init(
-                project=project,
-                group=group or None,
-                tags=list(tags) or None,
+                project=os.environ.get("WANDB_PROJECT", "symphony"),
                 name=folder.name,
                 dir=str(folder),
                 config=settings,
