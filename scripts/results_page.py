@@ -4,8 +4,8 @@
     python scripts/results_page.py --check    # says what differs, and fails if anything does
 
 A block is `<!-- table NAME -->`, the table, `<!-- end table -->`, and `results/NAME.json` its record: what it is
-`of`, the commit and the command that `made` it, a heading and the digits after the point for each of its `columns`, and its
-`rows`. A cell is text, a number, or a number with its standard error.
+`of`, the commit and the command that `made` it, a heading and the digits after the point for each of its `columns`,
+and its `rows`. A cell is text, a number, or a number with its standard error.
 """
 
 from __future__ import annotations

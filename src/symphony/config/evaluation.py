@@ -147,9 +147,10 @@ class EvaluateConfig:
                 raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
-        """How branches are pruned: as in training, but for what is set here."""
+        """The search: as in training, but for what is set here."""
         return dataclasses.replace(
             trained,
+            test_branches=self.branches or trained.test_branches,
             rule=trained.rule if self.rule == "agent" else self.rule,
             prune_every=self.prune_every or trained.prune_every,
             temperature=self.temperature or trained.temperature,

@@ -112,7 +112,7 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
-    config, settings = result.config, agent.search
+    config, used = result.config, result.config.pruning(agent.search)
     filled = dataclasses.asdict(config) | {
         "search": result.search,
         "interactive": result.interactive,
@@ -126,10 +126,9 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "threshold": None,
     }
     if result.search not in ("none", "log"):
-        filled["branches"] = config.branches or settings.test_branches
+        filled["branches"] = used.test_branches
     if result.search in ("tree", "oracle"):
         filled["trees"] = config.trees
-        used = config.pruning(settings)
         filled["rule"], filled["prune_every"] = used.rule, used.prune_every
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
         filled["threshold"] = used.threshold if used.rule == "replace" else None

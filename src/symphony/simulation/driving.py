@@ -102,7 +102,7 @@ def simulation(
         policy = ConstantVelocity(Bicycle())
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    trees, branches, taken = planned_trees(agent, config)
+    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
@@ -113,11 +113,11 @@ def simulation(
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
-        goals_per=config.pruning(agent.search).goals,
+        goals_per=settings.goals,
         personas=given_personas(agent.personas, config.persona),
     )
     start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
-    settings, planned = config.pruning(agent.search), None
+    planned = None
     if egos is not None:
         kind = search_kind(agent, config)
         forked = kind not in ("none", "log")
@@ -255,7 +255,7 @@ def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     kind = search_kind(agent, config)
     if kind in ("none", "log"):
         return config.rollouts, 1, 1
-    branches = config.branches or agent.search.test_branches
+    branches = config.pruning(agent.search).test_branches
     if kind == "best":
         return config.rollouts, branches, 1
     taken = config.rollouts // config.trees
@@ -274,7 +274,7 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     rollouts than a tree has branches come from as few trees as that takes.
     """
     kind, least = search_kind(agent, config), -(-runs // segments)
-    branches = config.branches or agent.search.test_branches
+    branches = config.pruning(agent.search).test_branches
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""

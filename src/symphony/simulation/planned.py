@@ -23,10 +23,7 @@ from symphony.envs.dynamics import bicycle_step
 from symphony.errors import ConfigError
 from symphony.simulation.planner import Planner, Traffic, checked_plan, fixed, scenario_of
 from symphony.simulation.planner_calls import SECONDS, answer, plans_of
-from symphony.streams import fold_in
-
-_PLANNERS = (1 << 40) + 3
-"""Number of the stream that the seeds of planners come from, far above those of rollouts and agents."""
+from symphony.streams import Stream, fold_in
 
 
 class PlannedEnv(DrivingEnv):
@@ -130,7 +127,7 @@ class EgoPolicy(TensorDictModuleBase):
         self._held: dict[int, Planner | Failure] = {}
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
-        stream = fold_in(fold_in(start.get(keys.STREAM), _PLANNERS), seed).flatten().tolist()
+        stream = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed).flatten().tolist()
         routes = [self._route(row) for row in range(len(egos.segments))]
         for number, row in enumerate(scene):
             made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))

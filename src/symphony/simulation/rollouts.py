@@ -15,10 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from symphony import keys
 from symphony.envs.driving import DrivingEnv
 from symphony.modules import drawn_goals
-from symphony.streams import fold_in, uniform
-
-_GOALS, _PERSONAS = 1 << 40, (1 << 40) + 4
-"""Numbers of the streams that goals and personas draw from, far above those of rollouts and agents."""
+from symphony.streams import Stream, fold_in, uniform
 
 
 class Rollouts(NamedTuple):
@@ -97,7 +94,7 @@ def draw_goals(
     """
     if goals is None:
         return env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)]
-    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _GOALS), tree[..., None])
+    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], Stream.GOALS), tree[..., None])
     noise = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
 
     def drawn(state: TensorDictBase) -> Tensor:
@@ -129,7 +126,7 @@ def draw_personas(
         seed: of the draw.
         number: [...] of the draw within its scene.
     """
-    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _PERSONAS), number[..., None])
+    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], Stream.PERSONAS), number[..., None])
     share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
     return personas[(share * len(personas)).long()]
 

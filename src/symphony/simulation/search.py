@@ -28,13 +28,10 @@ from symphony.envs.driving import DrivingEnv
 from symphony.imports import build_object
 from symphony.modules import SeededNoise
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.streams import fold_in, uniform
+from symphony.streams import Stream, fold_in, uniform
 
 ENDED = -100.0
 """Score past a scene's last logged step, below all others: it decides no maximum, and other totals leave it out."""
-_PRUNING = (1 << 40) + 1
-_RETRIES = (1 << 40) + 2
-"""Numbers of the streams that prunings and repeats draw from, far above those of rollouts and agents."""
 OUTCOME: Sequence[keys.Key] = [
     ("next", *key) for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
 ]
@@ -111,7 +108,7 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 
     def noise(start: TensorDictBase, periods: int) -> Float[Tensor, "*b P"]:
         root = start.get(keys.STREAM)[..., 0, :]
-        return uniform(seed, fold_in(root, _PRUNING), torch.arange(periods, device=start.device))
+        return uniform(seed, fold_in(root, Stream.PRUNING), torch.arange(periods, device=start.device))
 
     return noise
 
