@@ -17,7 +17,6 @@ from symphony.config.training import (
     PerturbConfig,
     PreviewConfig,
     RunConfig,
-    SamplingConfig,
     TrainConfig,
     ValidationConfig,
 )
@@ -38,7 +37,6 @@ __all__ = [
     "PreviewConfig",
     "Profile",
     "RunConfig",
-    "SamplingConfig",
     "Search",
     "SearchConfig",
     "Setting",
