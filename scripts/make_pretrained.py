@@ -191,9 +191,6 @@ def without_paths(config: TrainConfig) -> TrainConfig:
         validation=evaluated,
         resume=False,
         wandb="disabled",
-        wandb_project="symphony",
-        wandb_group="",
-        wandb_tags=(),
         device="cpu",
     )
 
@@ -369,9 +366,7 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
     rows += [(f"`agent.{key}`", value) for key, value in asdict(config.agent).items()]
     rows += [("`learning_rate`", config.learning_rate)]
     if spec.discriminator is not None:
-        rows += [
-            (f"`discriminator.{key}`", getattr(config.discriminator, key)) for key in ("features", "radius")
-        ]
+        rows += [("`discriminator.features`", config.discriminator.features)]
     if spec.action_space == "displacement":
         rows += [
             (f"`mgail.{key}`", getattr(config.mgail, key))
@@ -380,7 +375,7 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
     if spec.searches:
         rows += [
             (f"`search.{key}`", getattr(config.search, key))
-            for key in ("test_branches", "prune_every", "rule", "goals", "survivors")
+            for key in ("test_branches", "prune_every", "rule", "goals")
         ]
     return {key: str(value) for key, value in rows}
 
@@ -392,7 +387,7 @@ def _scores_of(record: dict[str, Any]) -> dict[str, Any]:
     ways = {
         "none": f"{how['rollouts']} independent rollouts",
         "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned {_pruning(how)}",
-        "oracle": "trees pruned by the true collision and off-road flags",
+        "backtrack": f"{how['rollouts']} rollouts that go back where they are bad",
         "best": f"the best of {how['branches']} independent rollouts by the discriminator",
     }
     numbers = [name for key, _, _ in COLUMNS for name in (key, f"{key}_se")]

@@ -40,7 +40,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
     return SegmentStore(path)
 
 
-def driven(store: SegmentStore, items: list[int], config: EvaluateConfig = LINES, **changes: Any) -> Simulation:
+def driven(
+    store: SegmentStore, items: list[int], config: EvaluateConfig = LINES, **changes: Any
+) -> Simulation:
     agent = make_agent(**changes)
     return simulation(agent, crowd_dataset(store, agent, config).scenes(items), config)
 
@@ -97,7 +99,7 @@ def test_lines_avoid_what_they_are_judged_by(store: SegmentStore) -> None:
 
 def test_who_begins_again_draws_goals_anew(store: SegmentStore, monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules["symphony.simulation.search"]
-    monkeypatch.setattr(module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0, 0)))
+    monkeypatch.setattr(module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0)))
     config = replace(LINES, score="flags", threshold=-1.0, rollouts=16)  # bad whatever happens
     none, lines, logged = (
         driven(store, [0, 1, 2], how)
@@ -114,9 +116,14 @@ def test_who_begins_again_draws_goals_anew(store: SegmentStore, monkeypatch: pyt
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_rule_is_that_of_the_gaps_agents_may_observe(seed: int) -> None:
-    scenes = scene(crossing(6, seed=seed, steps=12) if seed % 2 else straight_road(6, seed=seed, steps=12), [0, 1, 2])
+    scenes = scene(
+        crossing(6, seed=seed, steps=12) if seed % 2 else straight_road(6, seed=seed, steps=12), [0, 1, 2]
+    )
     seeing = ObservationConfig(num_objects=5, num_points=0, clearance=True, foresight=(0.5,))
-    env, blind = DrivingEnv(scenes, observation=seeing), DrivingEnv(scenes, observation=ObservationConfig.nothing())
+    env, blind = (
+        DrivingEnv(scenes, observation=seeing),
+        DrivingEnv(scenes, observation=ObservationConfig.nothing()),
+    )
     state = env.start(torch.zeros(200, dtype=torch.int64))
     generator = torch.Generator().manual_seed(seed)
     moved = state.get(keys.STATE) + torch.randn(200, 3, 4, generator=generator) * torch.tensor([6.0, 3, 1, 4])
@@ -134,7 +141,12 @@ def test_the_rule_is_that_of_the_gaps_agents_may_observe(seed: int) -> None:
 def test_what_is_searched_for_is_on_record(store: SegmentStore) -> None:
     agent, how = make_agent(), EvaluateConfig(rollouts=4)
     names = set()
-    for changes in ({}, {"search": "backtrack"}, {"score": "flags"}, {"search": "backtrack", "score": "rule"}):
+    for changes in (
+        {},
+        {"search": "backtrack"},
+        {"score": "flags"},
+        {"search": "backtrack", "score": "rule"},
+    ):
         found = evaluate(agent, store, replace(how, **changes))
         record = evaluation_record(agent, found, store)
         names.add(simulation_way(record["config"]))

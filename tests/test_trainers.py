@@ -42,7 +42,7 @@ from symphony.simulation.experts import experts
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 from symphony.training.logging import read_metrics
 
-TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
+TINY = AgentConfig(num_points=20, hidden=8)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,12 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
     where[rows] = torch.cat([done.state, done.state[..., :1]], -1).transpose(2, 3)
     valid[rows] = True
     hit = collisions(
-        where[..., :2], where[..., 2], scenes.box_size[:, None], valid, scenes.interactive[:, None]
+        where[..., :2],
+        where[..., 2],
+        scenes.box_size[:, None],
+        valid,
+        scenes.interactive[:, None],
+        at_states=True,
     )[..., 1:]
     assert torch.equal(hit.transpose(2, 3), done.collision)
     assert 0 < hit.float().mean() < 1
@@ -246,7 +251,7 @@ def test_command_line_trains_and_evaluates(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, file, picture = tmp_path / "run", tmp_path / "numbers.json", tmp_path / "rollouts.png"
-    small = ["--agent.hidden", "8", "--agent.head", "8", "--agent.num-points", "20", "--wandb", "disabled"]
+    small = ["--agent.hidden", "8", "--agent.num-points", "20", "--wandb", "disabled"]
     command = ["train", "bc", "--data", store, "--out", out, "--steps", "3", "--seed", "4", *small]
     assert main([str(c) for c in command]) == 0
     command = ["evaluate", out, "--data", store, "--json", file, "--figure", picture, "--rollouts", "2"]

@@ -1,8 +1,9 @@
 """Backtracking: independent lines, of which a bad one goes back in its own past and draws again.
 
-Copying good branches over bad ones makes rollouts alike; here nothing is copied from another line. After every T_p steps
-the lines whose total is above a threshold go back, the first time a little and with every failed try farther, in the end to
-the start; only the lines that are still under way are simulated. Like the beam search it knows nothing of what is simulated.
+Copying good branches over bad ones makes rollouts alike; here nothing is copied from another line. After every T_p
+steps the lines whose total is above a threshold go back, the first time a little and with every failed try farther,
+in the end to the start; only the lines that are still under way are simulated. Like the beam search it knows nothing
+of what is simulated.
 
 Legend: M lines (all rows and branches), R lines under way, P periods of T_p steps, N agents.
 """
@@ -29,27 +30,27 @@ Renew = Callable[[TensorDictBase, Tensor], TensorDictBase]
 
 @dataclass(frozen=True)
 class Backtrack:
-    """Rule of :func:`symphony.collectors.beam_search`: branches are independent lines that go back where they are bad.
+    """Rule of :func:`symphony.collectors.beam_search`: branches are lines that go back where they are bad.
 
-    A line is bad that ends a period with a total above the threshold, or NaN. The first time it goes back `back[0]` periods
-    from there, and if it is bad again before it has come `back[0]` periods past that place, `back[1]`, and so on. After the
-    last try, or once it was simulated `cap` times over, it goes on as it is.
+    A line is bad that ends a period with a total above the threshold, or NaN. The first time it goes back `back[0]`
+    periods from there; if it is bad again before it has come `back[0]` good periods past that place `back[1]`, and so
+    on, and then the last of them again and again. Once it was simulated `cap` times over, it goes on as it is.
 
     Args:
         threshold: in the units of the totals.
         back: periods, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
         cap: of what is simulated again, in lengths of a line: bounds the cost of starts from which nothing goes well.
-        renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept entries of
-            the step they go back to and how often each line [R] has gone back so far, and must give them other random
-            numbers than before, and what was not kept of the entries that the start state has. None where everything is
-            kept and numbers come from a global generator.
-        width: lines simulated at a time, the next of which begin as others end: few steps are then of few lines. None for
-            all. It changes memory and speed only.
+        renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept
+            entries of the step they go back to and how often each line [R] has gone back so far, and must give them
+            other random numbers than before, and what was not kept of the entries that the start state has. None
+            where everything is kept and numbers come from a global generator.
+        width: lines simulated at a time, the next of which begin as others end: few steps are then of few lines. None
+            for all. It changes memory and speed only.
     """
 
     threshold: float
-    back: tuple[int, ...] = (3, 5, 10, 0, 0)
-    cap: float = 4.0
+    back: tuple[int, ...] = (3, 5, 10, 0)
+    cap: float = 6.0
     renew: Renew | None = None
     width: int | None = None
 
@@ -78,24 +79,19 @@ class Course:
         self.at, self.tries, self.times, self.front, self.again = torch.zeros(
             5, lines, dtype=torch.int64, device=device
         )
-        self.left = torch.zeros(lines, dtype=torch.bool, device=device)
 
     def judge(self, line: Int[Tensor, " R"], bad: Bool[Tensor, " R"]) -> Bool[Tensor, " R"]:
         """Move lines to their next periods by whether the one they ended was bad; True for those that go back."""
         at, tries, front = self.at[line], self.tries[line], self.front[line]
-        left = self.left[line] & bad
-        asks = bad & ~left
-        over = (tries >= len(self.back)) | (self.again[line] >= self.rule.cap * self.periods)
-        goes = asks & ~over
+        goes = bad & (self.again[line] < self.rule.cap * self.periods)
         back = self.back[tries.clamp_max(len(self.back) - 1)]
         to = torch.where(back == 0, 0, (at + 1 - back).clamp_min(0))
         # Past the place of its trouble a line begins to count anew.
-        anew = ~bad & (at >= front + self.rule.back[0])
-        self.tries[line] = torch.where(anew, 0, tries + goes)
-        self.front[line] = torch.where(anew, 0, torch.where(goes, torch.maximum(front, at), front))
+        past = ~bad & (at >= front + self.rule.back[0])
+        self.tries[line] = torch.where(past, 0, tries + goes)
+        self.front[line] = torch.where(goes, torch.maximum(front, at), front)
         self.again[line] += torch.where(goes, at + 1 - to, 0)
         self.times[line] += goes
-        self.left[line] = left | (asks & over)
         self.at[line] = torch.where(goes, to, at + 1)
         return goes
 
@@ -128,7 +124,7 @@ def follow(
     """Simulate lines [*b, S] until all have come to their ends.
 
     Args:
-        simulate: steps of lines [R, 1]: their records, scores [R, 1, T_p, N], totals [R, 1] and the states after them.
+        simulate: steps of lines [R, 1]: their records, scores [R, 1, T_p, N], totals [R, 1] and the last states.
         aggregate: of scores, for a last period that is shorter.
         start: [*b, S].
         rule: when lines go back, and how far.
@@ -202,7 +198,9 @@ def _with_rows(
     for key in entries:
         value = other.get(key, None)
         if value is None:
-            raise ConfigError(f"lines can't go back: their kept states have no {key!r}, and `renew` gave none")
+            raise ConfigError(
+                f"lines can't go back: their kept states have no {key!r}, and `renew` gave none"
+            )
         # Not in place: an environment may hand out one tensor for several states.
         state.set(key, state.get(key).index_copy(0, rows, value))
     return state

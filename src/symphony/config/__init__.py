@@ -7,7 +7,15 @@ of a training; what an agent is and how it is simulated travels with the agent.
 from __future__ import annotations
 
 from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
-from symphony.config.evaluation import EvaluateConfig, PaperData, Score, Search, Setting, TableColumns, TableFormat
+from symphony.config.evaluation import (
+    EvaluateConfig,
+    PaperData,
+    Score,
+    Search,
+    Setting,
+    TableColumns,
+    TableFormat,
+)
 from symphony.config.files import FORMAT, from_dict, read_json, to_json
 from symphony.config.profiles import PROFILES, Profile
 from symphony.config.training import (
@@ -17,7 +25,6 @@ from symphony.config.training import (
     PerturbConfig,
     PreviewConfig,
     RunConfig,
-    SamplingConfig,
     TrainConfig,
     ValidationConfig,
 )
@@ -38,7 +45,6 @@ __all__ = [
     "PreviewConfig",
     "Profile",
     "RunConfig",
-    "SamplingConfig",
     "Score",
     "Search",
     "SearchConfig",

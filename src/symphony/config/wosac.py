@@ -24,8 +24,8 @@ class WosacSettings:
     """`agent`: as it was trained; `none`; `tree`: beam search; `backtrack`: rollouts that go back where they are bad;
     `best`: the best of independent rollouts. Each of the 32 rollouts of a search comes from a tree of its own."""
     score: WosacScore = "discriminator"
-    """What a search looks for: what the `discriminator` calls unreal, or collisions and time off the road, now or, were
-    everyone to keep speed and course, within half a second (`rule`)."""
+    """What a search looks for: what the `discriminator` calls unreal, or collisions, also those within half a second,
+    were everyone to keep speed and course, and time off the road (`rule`)."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: str = "agent"
@@ -41,11 +41,6 @@ class WosacSettings:
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the
     future."""
-    retries: int = 0
-    """How often the steps between two prunings are simulated again for branches that end them with a score above
-    `retry-above`."""
-    retry_above: float = 0.0
-    """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     action_temperature: float = 1.0
     """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
     horizon: float = 8.0

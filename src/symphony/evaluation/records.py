@@ -38,7 +38,6 @@ _USUAL = {
     "score": "discriminator",
     "threshold": None,
     "goals": "tree",
-    "retries": 0,
     "logged_goals": False,
     "action_temperature": 1.0,
     "persona": "",
@@ -69,11 +68,10 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
 
     Returns:
         The numbers of ``result`` themselves; ``playback`` and ``constant_velocity``: those of baselines; ``cost``:
-        seconds of CPU time for ``simulation``, all rollouts of all segments together, and the ``steps`` of single rollouts
-        or branches in it; ``run``: ``method``, ``seed``,
-        ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether
-        that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
-        store; ``config``: the settings of the evaluation, with what was left to the agent filled in; ``horizon``:
+        seconds of CPU time for ``simulation``, all rollouts of all segments together, and the ``steps`` of single
+        rollouts or branches in it; ``run``: ``method``, ``seed``, ``interactive``,
+        ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether that is ``named``,
+        not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the store; ``config``: the settings of the evaluation, with what was left to the agent filled in; ``horizon``:
         seconds of the longest rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy``
         and ``log``, and ``parts``, pseudo-values of the divergence by recording (see
         :func:`symphony.metrics.sampled_divergence`); ``per_segment``: a row for each run segment. `symphony evaluate
@@ -115,7 +113,7 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
-    config, settings = result.config, agent.search
+    config, used = result.config, result.config.pruning(agent.search)
     filled = dataclasses.asdict(config) | {
         "search": result.search,
         "score": "discriminator",
@@ -128,14 +126,11 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "prune_every": 0,
         "temperature": 0.0,
         "threshold": None,
-        "retries": 0,
-        "retry_above": 0.0,
     }
-    used = config.pruning(settings)
     if result.search not in ("none", "log"):
         filled["score"] = config.score
     if result.search in ("tree", "best"):
-        filled["branches"] = config.branches or settings.test_branches
+        filled["branches"] = used.test_branches
     if result.search == "backtrack":
         filled["prune_every"], filled["threshold"] = used.prune_every, used.threshold
     if result.search == "tree":
@@ -144,8 +139,6 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
         filled["threshold"] = used.threshold if used.rule == "replace" else None
         filled["goals"] = used.goals
-        filled["retries"] = config.retries
-        filled["retry_above"] = config.retry_above if config.retries else 0.0
     return {name: value for name, value in filled.items() if name not in _MEMORY}
 
 

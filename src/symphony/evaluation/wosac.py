@@ -160,12 +160,11 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
     if kind == "backtrack":
         found |= {"prune_every": pruning.prune_every, "threshold": pruning.threshold}
     if kind in ("tree", "best"):
-        found["branches"] = settings.branches or agent.search.test_branches
+        found["branches"] = pruning.test_branches
     if kind == "tree":
         found |= {"rule": pruning.rule, "prune_every": pruning.prune_every, "goals": pruning.goals}
         found |= {"temperature": pruning.temperature} if pruning.rule == "systematic" else {}
         found |= {"threshold": pruning.threshold} if pruning.rule == "replace" else {}
-        found |= {"retries": settings.retries} if settings.retries else {}
     return found
 
 

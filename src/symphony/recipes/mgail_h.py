@@ -8,7 +8,7 @@ from torch.optim import Adam
 
 from symphony.agents import Agent, discriminator_network, goal_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
-from symphony.config import TrainConfig
+from symphony.config.training import GOALS, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.envs import Displacement, DrivingEnv
 from symphony.modules import SeededNoise
@@ -33,20 +33,20 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: nothing is pruned; rollouts follow the routes of the log.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.search.segments, len(data))]),
+        with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=KeepAll(),
         prepare=lambda start: env.with_goals(branched_streams(start)),
-        **collector_settings(config.search, env, seed, data),
+        **collector_settings(config.search, env, seed, data, config.segments),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
     regression_loss = processes.share(BCLoss(policy))
     mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
     goal_loss = processes.share(GoalLoss(goals))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
     optimizers = {name: Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
     inputs, begin = observation_of(spec, discriminator=False), config.mgail.regression
@@ -56,14 +56,14 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
         items = data.draw(config.segments, rng)
         experts = data.sample_states(items, config.states, inputs, rng, device, config.perturb.at(step))
         yield "policy", regression_loss(experts)
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, inputs, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, inputs, rng, device))
 
     def head_start(step: int) -> Updates:
         yield "search", replay.refresh(step)
         for _ in range(config.mgail.discriminator_updates):
             yield "discriminator", realism_loss(replay.both_kinds(rng))
         items = data.draw(config.segments, rng)
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, inputs, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, inputs, rng, device))
 
     def adversarial(step: int) -> Updates:
         yield from head_start(step)

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import BeamSearchResult, KeepAll
+from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.driving import DrivingEnv
@@ -26,11 +26,18 @@ from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
 from symphony.simulation.control import Tempered, given_personas
 from symphony.simulation.finite import FiniteWatch
-from symphony.simulation.importance import Tilt
 from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
-from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of, simulate, start_states
-from symphony.simulation.search import aggregate_of, going_back, pruning_rule, search
+from symphony.simulation.rollouts import (
+    Rollouts,
+    between_states,
+    draw_goals,
+    existing,
+    rollouts_of,
+    simulate,
+    start_states,
+)
+from symphony.simulation.search import going_back, pruning_rule, search
 
 RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
@@ -48,17 +55,17 @@ class Simulation(NamedTuple):
         search: the trees of which the rollouts are the leaves, [B, trees]; None without any.
         steps: that were simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
+        at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
-        log_weight: [B, K] logarithm of what each rollout weighs after a tilt; None without one.
     """
 
     rollouts: Rollouts
     goal: Int[Tensor, "B K N"]
     search: BeamSearchResult | None
+    at_states: Bool[Tensor, "B K T N"]
     steps: int = 0
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
-    log_weight: Float[Tensor, "B K"] | None = None
 
 
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
@@ -67,7 +74,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
     Raises:
         ConfigError, NotFiniteError: as :func:`simulation`.
     """
-    return simulation(agent, scenes, config).rollouts
+    return driven_by(agent, scenes, config).rollouts
 
 
 def simulation(
@@ -107,7 +114,7 @@ def simulation(
         policy = ConstantVelocity(Bicycle())
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    trees, branches, taken = planned_trees(agent, config)
+    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
@@ -118,12 +125,12 @@ def simulation(
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
-        goals_per=config.pruning(agent.search).goals,
+        goals_per=settings.goals,
         personas=given_personas(agent.personas, config.persona),
     )
     along_log = config.others == "idm"
     start = _with_fixed_goals(env, start, given, along_log=along_log)
-    settings, planned, kind = config.pruning(agent.search), None, search_kind(agent, config)
+    planned, kind = None, search_kind(agent, config)
 
     def begin(state: TensorDictBase) -> TensorDictBase:
         if goals is None or config.logged_goals:
@@ -134,10 +141,8 @@ def simulation(
     if egos is not None:
         if kind == "backtrack":
             raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
-        # Nothing else simulates a period again.
-        keep_every = settings.prune_every if config.retries and kind == "tree" else 0
         forked = kind not in ("none", "log")
-        start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
+        start, planned = egos.begin(env, start, seed=config.seed, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
     drawn, steps = goal, start.numel() * env.decisions
@@ -147,7 +152,10 @@ def simulation(
         )
     else:
         best, scorer = kind == "best", None
-        rules = {"best": KeepAll, "backtrack": lambda: going_back(env, settings.threshold, start.numel(), begin)}
+        rules: dict[str, Callable[[], PruningRule | Backtrack]] = {
+            "best": KeepAll,
+            "backtrack": lambda: going_back(env, settings.threshold, start.numel(), begin),
+        }
         if agent.discriminator is not None:
             scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
@@ -160,14 +168,10 @@ def simulation(
                 rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
                 score=config.score,
-                aggregate=aggregate_of(settings),
                 leaves=None if best else taken,
-                retries=config.retries if kind == "tree" else 0,
-                retry_above=config.retry_above,
                 keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
-                tilt=Tilt(env, config.tilt, config.tilt_on, ego=planned is None) if config.tilt else None,
             )
         found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         # A copy of a branch follows the goals of its parent.
@@ -175,7 +179,7 @@ def simulation(
         number = result.trajectories.get(keys.PLANNER, None)
         number = None if number is None else number[..., -1, :]
         if best:
-            order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
             found = Rollouts(*(_branches(part, order) for part in found))
             goal = _branches(goal, order)
             number = None if number is None else _branches(number, order)
@@ -183,9 +187,8 @@ def simulation(
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
-    weights = None if result is None or result.log_weights is None else result.log_weights.flatten(1)
     of_tree = None if result is None else drawn
-    whole = Simulation(rollouts, goal, result, steps=steps, drawn=of_tree, log_weight=weights)
+    whole = Simulation(rollouts, goal, result, at_states=rollouts.collision, steps=steps, drawn=of_tree)
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
@@ -280,21 +283,14 @@ def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
     if kind in ("none", "log", "backtrack"):
-        if config.tilt:
-            raise ConfigError("a tilt needs a search: the agent has none, see --search")
         return config.rollouts, 1, 1
-    branches = config.branches or agent.search.test_branches
+    branches = config.pruning(agent.search).test_branches
     if kind == "best":
         return config.rollouts, branches, 1
     taken = config.rollouts // config.trees
     if taken > branches:
         raise ConfigError(
             f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-        )
-    if config.tilt and taken < branches:
-        raise ConfigError(
-            f"with a tilt every branch is a rollout: {config.trees} trees of {branches} branches are "
-            f"{config.trees * branches} rollouts, not {config.rollouts}"
         )
     return config.trees, branches, taken
 
@@ -304,15 +300,10 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     each as that takes: what is independent of each other are segments.
 
     It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
-    rollouts than a tree has branches come from as few trees as that takes; with a tilt every branch stays a rollout.
+    rollouts than a tree has branches come from as few trees as that takes.
     """
     kind, least = search_kind(agent, config), -(-runs // segments)
-    branches = config.branches or agent.search.test_branches
-    if config.tilt:
-        each = config.rollouts * -(-least // config.rollouts)
-        return -(-runs // each), dataclasses.replace(
-            config, rollouts=each, trees=config.trees * each // config.rollouts
-        )
+    branches = config.pruning(agent.search).test_branches
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
@@ -339,20 +330,23 @@ def driven_by(
     egos: EgoPlanners | None = None,
     given: Int[Tensor, "B N"] | None = None,
 ) -> Simulation:
-    """What an agent does: :func:`playback` of the log, or a :func:`simulation`."""
+    """What an agent does: :func:`playback` of the log, or a :func:`simulation`; collisions of the rollouts are found
+    between states, too.
+    """
     if agent.policy is not None or egos is not None:
-        return simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        rollouts = found.rollouts
+        between = between_states(scenes, rollouts.state, existing(scenes, rollouts))
+        return found._replace(rollouts=rollouts._replace(collision=between))
     _check_given(agent, scenes, config, given)
-    found = playback(scenes)
-    return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
+    log = playback(scenes)
+    at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
+    return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:
     """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
     log, valid = logged(scenes)
-    position, heading = scenes.log_state[..., :2].transpose(1, 2), scenes.log_state[..., 2].transpose(1, 2)
-    everyone = scenes.log_valid.transpose(1, 2)
-    hit = collisions(position, heading, scenes.box_size, everyone, scenes.interactive).transpose(1, 2) & valid
     edges = (
         scenes.edge_start,
         scenes.edge_end,
@@ -361,4 +355,13 @@ def playback(scenes: SceneBatch) -> Rollouts:
         scenes.edge_following,
     )
     off = offroad(log[..., :2], *edges) & valid
-    return Rollouts(log[:, None], hit[:, None, 1:], off[:, None, 1:], valid[:, None, 1:])
+    hit = _logged_collisions(scenes)
+    return Rollouts(log[:, None], hit[:, None], off[:, None, 1:], valid[:, None, 1:])
+
+
+def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[Tensor, "B T N"]:
+    """See :func:`symphony.metrics.collisions`; what an agent does that is not there is no collision."""
+    moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
+    subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
+    hit = collisions(moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, at_states=at_states)
+    return hit.transpose(1, 2)
