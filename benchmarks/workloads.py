@@ -39,7 +39,7 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.evaluation import evaluate
 from symphony.geometry import boxes_overlap
 from symphony.modules import ElementGroup, discrete_policy, discriminator
-from symphony.recipes import RECIPES
+from symphony.recipes import recipe_of
 from symphony.simulation import SceneDataset
 from symphony.training import Processes
 
@@ -210,7 +210,7 @@ def update(method: str, *, states: int = 1024, points: int = 200, count: int = 1
         agent=AgentConfig(num_points=points),
         wandb="disabled",
     )
-    trainer = RECIPES[method](config, Processes(torch.device("cpu")))
+    trainer = recipe_of(method)(config, Processes(torch.device("cpu")))
     steps = itertools.count()
 
     def once() -> None:
