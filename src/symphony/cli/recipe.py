@@ -44,9 +44,7 @@ def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = N
     from symphony.recipes import train
 
     words = [recipe.__name__, *args]
-    settings = tyro.cli(
-        Arguments, description=description, args=expanded(words), registry=PARAGRAPHS
-    )
+    settings = tyro.cli(Arguments, description=description, args=expanded(words), registry=PARAGRAPHS)
     store = SegmentStore(settings.test)  # or complain now, not after the training
     folder = train(settings.training, recipe)
     config = EvaluateConfig(
