@@ -173,7 +173,7 @@ def flattered() -> Grid:
             if (one["crowd"], one["planner"]) == (record["crowd"], record["planner"])
             and one["search"] is None
         )
-        apart, error = paired_difference(record, other)
+        apart, error, _ = paired_difference(record, other)
         cells = [f"{search[name]:.2f}" for name in ("simulated", "kept")]
         cells += [f"{one['collision_rate']:.1f}" for one in (other, record)]
         grid.append([crowd_name(record), planner_title(record), *cells, f"{apart:+.1f} ± {error:.1f}"])

@@ -125,3 +125,18 @@ def test_a_grid_has_an_action_that_does_nothing() -> None:
         grid = Bicycle(num_acceleration=count)
         acceleration, steering = (part.numpy() for part in grid.grid(torch.zeros(1)))
         assert np.flatnonzero((acceleration == 0) & (steering == 0)).tolist() == [grid.num_actions // 2]
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_an_action_that_is_not_finite_ends_the_episode_of_its_scene(bad: float) -> None:
+    scenes = collate(
+        [scene(straight_road(3, steps=11), [0, 1]), scene(straight_road(3, steps=11, seed=1), [0, 1])]
+    )
+    env = DrivingEnv(scenes, Displacement(), ObservationConfig.nothing())
+    action = torch.zeros(2, 2, 2)
+    action[..., 0] = 1.0
+    action[1, 1, 0] = bad
+    after = env.step(env.start(torch.tensor([0, 1])).set(keys.ACTION, action))["next"]
+    assert after["terminated"].tolist() == after["done"].tolist() == [[False], [True]]
+    assert after["truncated"].tolist() == [[False], [False]]
+    assert after[keys.REWARD].squeeze(-1).tolist() == [[0, 0], [0, -1]]

@@ -30,11 +30,14 @@ from symphony.envs.routes import (
     FollowedRoutes,
     Routes,
     RouteWindow,
+    drivable,
     route_ahead,
     route_choices,
     route_table,
 )
+from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
+from symphony.geometry.stations import stations_along
 from symphony.roadgraph import LaneGraph
 from symphony.roadgraph.assign import LATERAL
 from test_env import actions, moved, run
@@ -475,3 +478,73 @@ def test_tied_routes_are_drawn_evenly_and_by_segment_and_agent_alone():
                 drawn.append(tied.tolist().index(table.logged) / (len(tied) - 1))
     assert len(drawn) > 40
     assert abs(np.mean(drawn) - 0.5) < 4 * 0.5 / np.sqrt(len(drawn))
+
+
+def loop(turns: float = 2.2, radius: float = 12.0) -> NDArray[np.float64]:
+    """A straight line of points 3 m apart, then more than two rounds of a circle, then straight on."""
+    angle = np.concatenate([np.zeros(8), np.arange(0, 2 * np.pi * turns, SPACING / radius)])
+    angle = np.concatenate([angle, np.repeat(angle[-1], 60)])
+    return np.cumsum(SPACING * np.stack([np.cos(angle), np.sin(angle)], -1), 0)
+
+
+@given(st.floats(1.0, 8.0), st.floats(-2.5, 2.5), st.floats(0.5, 3.0))
+@settings(max_examples=25)
+def test_a_route_that_passes_itself_is_followed_in_order(speed: float, aside: float, dt: float) -> None:
+    line = loop()
+    stations = np.arange(0.0, SPACING * (len(line) - 2), min(speed * dt, 9.0))
+    place = np.stack([np.interp(stations, SPACING * np.arange(len(line)), line[:, k]) for k in (0, 1)], -1)
+    way = np.gradient(place, axis=0)
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    path = torch.from_numpy(place + aside * np.stack([-way[:, 1], way[:, 0]], -1))
+    routes, come, found = one_route(line), torch.zeros(1, 1, dtype=torch.float64), []
+    for before, here in zip(path[:1].repeat(2, 1).tolist() + path[1:-1].tolist(), path, strict=False):
+        moved = (here - torch.tensor(before, dtype=torch.float64)).norm()[None, None]
+        come = routes.progress(here[None, None], come, moved)
+        found.append(float(come))
+    # Chords cut a circle of 12 m radius by up to 0.1 m; beside it the way is as much longer or shorter.
+    np.testing.assert_allclose(found, stations[: len(found)], atol=1.5)
+    reference = stations_along(line[None], path.numpy()[None], np.ones((1, len(path)), bool))[0]
+    np.testing.assert_allclose(found, reference[: len(found)], atol=0.5)
+    # What is seen ahead belongs to the pass that the agent is on.
+    middle = len(found) // 2
+    seen = routes.window(torch.tensor([[found[middle]]], dtype=torch.float64))
+    first = round(found[middle] / SPACING) - int(seen.own)
+    assert torch.equal(seen.points[0, 0, 0], torch.from_numpy(line[first]))
+
+
+def test_progress_is_part_of_the_state() -> None:
+    segment = straight_road(3, steps=61)
+    env = make_env(segment)
+    start = env.with_goals(env.start(torch.tensor([0])))
+    assert (start[keys.PROGRESS].abs() < 1e-3).all()
+    out = run(env, start, actions(env, (1, 20)))
+    # The road leads along x.
+    driven = out[keys.STATE][0, ..., 0] - start[keys.STATE][0, :, 0]
+    torch.testing.assert_close(out[keys.PROGRESS][0], driven, atol=0.05, rtol=0)
+    # Without a route there is no progress.
+    free = run(env, env.start(torch.tensor([0])), actions(env, (1, 20)))
+    assert (free[keys.PROGRESS] == 0).all()
+
+
+def test_routes_reach_what_can_be_driven_and_two_hundred_metres_more() -> None:
+    slow, fast = straight_road(2, steps=51), straight_road(2, steps=151)
+    for segment in (slow, fast):
+        table = route_table(segment, LaneGraph(segment.road), 0)
+        lane = max(LaneGraph(segment.road).length)
+        reach = SPACING * (table.count[table.logged] - 1)
+        start = segment.position[0, 0, 0] - segment.road.lanes[0][0, 0]
+        assert reach >= min(drivable(segment) + 200.0, lane - start) - SPACING
+
+
+def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    segment = crossing(4)
+
+    def broken(*_: Any, **__: Any) -> Any:
+        raise ValueError("no such line")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("symphony.envs.routes.route_lines", broken)
+        with pytest.warns(DataWarning, match=f"agent {segment.agent_id[0]} can't be built: no such line"):
+            batch = scene(segment, [0], LaneGraph(segment.road))
+    assert batch.route_logged.tolist() == [[-1]]
+    assert scene(segment, [0], LaneGraph(segment.road)).route_logged[0, 0] >= 0

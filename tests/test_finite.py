@@ -90,7 +90,9 @@ def test_weights_that_are_not_finite_are_found_at_once(
         return
     name = {"goals": "goal policy"}.get(network, network)
     step = 1 if network == "discriminator" else 0
-    expected = f"segment straight-0: the {name} put out a number that is not finite at step {step}"
+    expected = (
+        f"segment straight-0: the {name} put out a number that is not finite for agent 0 at step {step}"
+    )
     with pytest.raises(NotFiniteError, match=expected) as caught:
         evaluate(broken, store, config)
     assert isinstance(caught.value, SymphonyError)

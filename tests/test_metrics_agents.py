@@ -28,6 +28,7 @@ def steps_of(
         kinds,
         torch.as_tensor(speed, dtype=torch.float32),
         torch.as_tensor(speed_log, dtype=torch.float32),
+        torch.ones(len(there), dtype=torch.bool),
     )
 
 

@@ -36,7 +36,7 @@ def stage(*agents, subjects=(0,), size=(4.5, 2.0)):
 def scene(log, speed, size, subject):
     """With the flags that belong to it."""
     valid = torch.ones(log.shape[:-1], dtype=torch.bool)
-    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)[..., 1:]
+    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)
     state = torch.cat([log[..., :3], speed[..., None]], -1)
     rows = subject.clamp(min=0)[..., None]
     exists = (subject >= 0)[..., None].expand(*subject.shape, log.shape[-2])
@@ -218,7 +218,7 @@ def test_the_log_of_interactive_agents_is_not_read_and_leading_dimensions_broadc
     log[rows] = driven
     size = inputs["size"][:, :1]
     valid = torch.ones(log.shape[:-1], dtype=torch.bool)
-    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)[..., 1:]
+    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)
     shared = inputs["log_state"][:, :1].clone()
     shared[torch.arange(3)[:, None, None], 0, subject] = torch.nan
     arguments = {**inputs, "collided": flags, "size": size, "subject": subject}

@@ -30,7 +30,7 @@ def scene(seed, lead=(2,), agents=7, steps=5, spread=14.0):
 def test_collisions_agree_with_shapely(seed):
     position, heading, size, valid, subject = scene(seed)
     boxes = shapely.polygons(box_corners(position, heading, size[..., None, :]).numpy())
-    found = collisions(position, heading, size, valid, subject)
+    found = collisions(position, heading, size, valid, subject, at_states=True)
     assert found.shape == (2, 3, 5)
     for b, n, t in np.ndindex(2, 3, 5):
         me = int(subject[b, n])
@@ -48,8 +48,9 @@ def test_collisions_by_hand():
     position[2, :, 0] = torch.tensor([10.5, 8.875])
     heading, size = torch.zeros(3, 2), torch.tensor([[4.5, 2.0]]).expand(3, 2)
     valid, subject = torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 1, 2])
-    found = collisions(position, heading, size, valid, subject)
+    found = collisions(position, heading, size, valid, subject, at_states=True)
     assert found.tolist() == [[False, True], [False, True], [False, False]]
+    assert collisions(position, heading, size, valid, subject).tolist() == [[True], [True], [False]]
     valid[1, 1] = False
     assert not collisions(position, heading, size, valid, subject).any()
 
@@ -72,7 +73,7 @@ def test_padding_and_order_of_agents_change_nothing():
 def test_leading_dimensions_broadcast():
     position, heading, size, valid, subject = scene(4, lead=(2, 3))
     whole = collisions(position, heading, size[:, :1], valid, subject[:, :1])
-    assert whole.shape == (2, 3, 3, 5)
+    assert whole.shape == (2, 3, 3, 4)
     for b, k in np.ndindex(2, 3):
         one = collisions(position[b, k], heading[b, k], size[b, 0], valid[b, k], subject[b, 0])
         assert torch.equal(whole[b, k], one)

@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex, to_rgba
+from matplotlib.colors import to_hex, to_rgb, to_rgba
 
 from helpers_segments import crossing, hide, straight_road
 from symphony.data.segment import MarkType, Polylines, RunSegment, SignalState
@@ -25,6 +25,7 @@ from symphony.render.agents import CORNERS, NOSE, draw_trails, pieces, place
 from symphony.render.roads import lane_arrows, road_ribbon
 from symphony.render.style import (
     AGENT_COLORS,
+    INK,
     PLAYBACK,
     ROAD,
     free_corner,
@@ -342,6 +343,18 @@ def test_caption_names_the_segment_and_legend_the_agents() -> None:
     assert f"ego vehicle {segment.agent_id[0]}" in labels(axes)
     assert f"interactive vehicle {segment.agent_id[1]}" in labels(axes)
     assert plot_segment(segment, blank(), legend=False).get_legend() is None
+
+
+def test_the_ego_keeps_its_colour_and_an_outline_and_a_crowds_legend_is_short() -> None:
+    segment = straight_road(30)
+    axes = plot_segment(segment, blank(), interactive=list(range(1, 30)))
+    faces = {k: tuple(by_gid(axes, f"box-{k}").get_facecolor()[0]) for k in range(30)}
+    assert [k for k, face in faces.items() if face[:3] == to_rgb(AGENT_COLORS[0])] == [segment.ego]
+    edges = {k: tuple(by_gid(axes, f"box-{k}").get_edgecolor()[0][:3]) for k in range(30)}
+    assert [k for k, edge in edges.items() if edge == to_rgb(INK)] == [segment.ego]
+    named = [label for label in labels(axes) if label.startswith(("ego", "interactive"))]
+    assert len(named) == 8
+    assert "and 22 more in colour" in labels(axes)
 
 
 def test_interest_is_highlighted_by_default_and_the_ego_once() -> None:

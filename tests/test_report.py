@@ -29,6 +29,7 @@ from symphony.envs.scene import scene
 from symphony.errors import DataError
 from symphony.evaluation.contacts import HORIZON, contacts, time_to_collision
 from symphony.evaluation.driving import red_lights, wrong_way
+from symphony.evaluation.fault import at_fault
 from symphony.evaluation.report import Report, add_segment, report, total_numbers
 from symphony.geometry import box_gap
 from symphony.metrics import CollisionKind
@@ -52,7 +53,10 @@ def driving(
     velocity = np.repeat((start[:, 3:] * direction)[:, None], steps, 1)
     position = start[:, None, :2] + time[:, None] * velocity
     x = np.arange(-100, 200, 2.0)
-    road = make_road([np.stack([x, np.full_like(x, k * LANE_WIDTH)], -1) for k in range(lanes)])
+    lines = [np.stack([x, np.full_like(x, k * LANE_WIDTH)], -1) for k in range(lanes)]
+    # Far away; left of its direction is the road.
+    boundary = [np.array([[-500, -500], [500, -500], [500, 500], [-500, 500], [-500, -500.0]])]
+    road = make_road(lines, boundary=boundary)
     heading = np.repeat(start[:, 2:3], steps, 1)
     return make_segment(road, position, heading, velocity, DT, **changes)
 
@@ -61,10 +65,12 @@ def touched(segment: RunSegment, agent: int = 0, offroad: bool = False) -> list[
     """Other, kind, step and fault of each contact of an agent."""
     world = world_of(played(segment, [agent]), 0)
     off = np.full(world.valid.shape, offroad)
-    found = contacts(world, np.array([agent]), LaneGraph(segment.road), segment.road, off)
+    (found,) = contacts([world], np.array([agent]))
+    fault = at_fault(world, found, LaneGraph(segment.road), segment, off)
+    parts = found.other, found.kind, found.step, fault
     return [
-        (other, CollisionKind(kind).name, step, fault)
-        for _, other, step, kind, fault in zip(*(part.tolist() for part in found), strict=True)
+        (other, CollisionKind(kind).name, step, mine)
+        for other, kind, step, mine in zip(*(part.tolist() for part in parts), strict=True)
     ]
 
 
@@ -443,7 +449,8 @@ def test_the_command_writes_page_numbers_and_table(
     table = list(csv.DictReader(io.StringIO((tmp_path / "sim" / "report.csv").read_text())))
     assert [row["segment"] for row in table] == ["a&b <i>", "free"]
     page = (tmp_path / "sim" / "report.html").read_text()
-    assert "view.html#segment=a%26b+%3Ci%3E&rollout=0&t=1.2" in page
+    # Two seconds before the first event, at 1.2 s, there was nothing yet.
+    assert "view.html#segment=a%26b+%3Ci%3E&rollout=0&t=0&follow=ego" in page
     assert "<i>" not in page.split("<body>")[1].split("<script>")[0]
     assert "src=" not in page
     assert "http" not in page

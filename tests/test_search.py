@@ -522,6 +522,24 @@ def test_the_oracle_lowers_what_it_measures() -> None:
     assert oracle[1] < 0.5 * none[1]
 
 
+@pytest.mark.parametrize("trained", [1.0, -3.0])
+def test_an_oracle_replaces_what_is_flagged_whatever_the_agent_was_trained_with(trained: float) -> None:
+    """Flags are 1, as is a usual threshold of a discriminator's scores; one agent that is bad makes a branch bad."""
+    settings = SearchConfig(rule="replace", threshold=trained)
+    assert EvaluateConfig(search="oracle").pruning(settings).threshold == 0.0
+    assert EvaluateConfig(search="oracle", threshold=2.0).pruning(settings).threshold == 2.0
+    assert EvaluateConfig(search="tree").pruning(settings).threshold == trained
+    agent, scenes = make_agent(goals=False), scene(blocked(), [0, 1])
+    how: dict[str, Any] = {"rollouts": 16, "trees": 2, "branches": 8, "rule": "replace", "prune_every": 2}
+    rates = []
+    kinds: tuple[Any, ...] = ("none", "oracle")
+    for kind in kinds:
+        found = simulation(agent, scenes, EvaluateConfig(search=kind, **how)).rollouts
+        rates.append(float((found.collision & found.counted).any(-1).any(-1).float().mean()))
+    assert rates[0] > 0.3
+    assert rates[1] < 0.5 * rates[0]
+
+
 def test_the_oracle_scores_flags_of_real_agents_alone() -> None:
     shape = (3, 2)
     flags = TensorDict(

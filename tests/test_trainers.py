@@ -170,7 +170,12 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
     where[rows] = torch.cat([done.state, done.state[..., :1]], -1).transpose(2, 3)
     valid[rows] = True
     hit = collisions(
-        where[..., :2], where[..., 2], scenes.box_size[:, None], valid, scenes.interactive[:, None]
+        where[..., :2],
+        where[..., 2],
+        scenes.box_size[:, None],
+        valid,
+        scenes.interactive[:, None],
+        at_states=True,
     )[..., 1:]
     assert torch.equal(hit.transpose(2, 3), done.collision)
     assert 0 < hit.float().mean() < 1

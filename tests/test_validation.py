@@ -101,7 +101,8 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
             self.metrics, self.value = self, value
 
         def compute(self) -> dict[str, float]:
-            return {**dict.fromkeys(METRICS, 1.0), "collision_rate": self.value, "offroad_time": 0.0}
+            found = {"collision_rate": self.value, "offroad_time": 0.0, "offroad_segments": 1}
+            return {**dict.fromkeys(METRICS, 1.0), **found}
 
     def script(*values: float) -> None:
         left = iter(values)

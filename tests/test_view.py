@@ -270,6 +270,41 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_link_follows_the_ego_and_the_legend_says_what_is_what(tmp_path: Path) -> None:
+    segment = crossing(num_agents=12)
+    segment = segment.replace(ego=3, segment_id="crossing")
+    goal = np.zeros((1, 12), np.int64)
+    saved = played(segment, list(range(12)), 1, routes=segment.road.lanes, goal=goal)
+    script = """
+      location.hash = "#segment=crossing&rollout=0&t=1.4&follow=ego";
+      await fromPlace(); frame(0);
+      const r = scene.replay, there = r.state(0, r.ego, view.t);
+      out.follow = view.follow; out.agent = view.agent; out.t = view.t; out.hash = location.hash;
+      out.camera = [camera.x - there.x, camera.y - there.y];
+      out.colors = Array.from(r.agents, row => r.color(row)); out.legend = $("legend").textContent;
+      const strokes = [];
+      const noted = (_, name, value) => { if (name === "strokeStyle") strokes.push(value); return true; };
+      const pen = new Proxy({}, { get: () => () => {}, set: noted });
+      for (const row of [r.ego, 0]) scene.box(pen, row, there, "red", 1);
+      out.strokes = strokes;
+      select(0); out.other = view.follow;
+    """
+    out = json.loads(driven_page(tmp_path, script, [saved]))
+    assert "error" not in out, out
+    assert (out["follow"], out["agent"], out["t"]) == (3, 3, pytest.approx(1.4 / segment.dt))
+    assert f"follow={segment.agent_id[3]}" in out["hash"]
+    np.testing.assert_allclose(out["camera"], 0, atol=1e-9)
+    mine = out["colors"][3]
+    assert out["colors"].count(mine) == 1
+    assert len(set(out["colors"])) == 8
+    assert out["strokes"] == ["#2b2f36", "white"]
+    assert out["other"] == 0
+    for text in ("light: stop", "light: go", "goal", "playback", "log"):
+        assert text in out["legend"]
+    assert "stop sign" not in out["legend"]
+
+
+@pytest.mark.slow
 def test_what_is_drawn_is_seen(tmp_path: Path) -> None:
     save_rollouts(tmp_path / "sim", ABOUT, [crash()])
     assert main(["view", str(tmp_path / "sim")]) == 0

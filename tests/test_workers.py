@@ -245,7 +245,7 @@ def test_what_is_sent_comes_back_whole(store: SegmentStore) -> None:
     for name in ("interactive", "dynamics", "indices", "routes", "duration", "keep", "dt"):
         assert getattr(copy, name) == getattr(dataset, name)
     assert copy.store.path == store.path
-    error = NotFiniteError("policy", 1, 4).named("s")
+    error = NotFiniteError("policy", 1, 4, 2).named("s")
     again = pickle.loads(pickle.dumps(error))  # noqa: S301
     assert (str(again), vars(again)) == (str(error), vars(error))
 

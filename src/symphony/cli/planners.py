@@ -61,9 +61,9 @@ class Planners:
 
 def table_text(records: Sequence[dict[str, Any]], form: Literal["text", "markdown"] = "text") -> str:
     """The table of some records, and which planner is first in each crowd."""
-    from symphony.evaluation.planners import planner_grid, winners
+    from symphony.evaluation.planners import counted_at_states, planner_grid, winners
 
-    grid, sentences = planner_grid(records), winners(records)
+    grid, sentences = planner_grid(records), [*winners(records), *counted_at_states(records)]
     if form == "markdown":
         lines = [f"| {' | '.join(line)} |" for line in grid]
         return "\n".join([lines[0], "| --- " * len(grid[0]) + "|", *lines[1:], "", *sentences]) + "\n"

@@ -49,15 +49,22 @@ class Report:
         table = Table(
             "",
             "",
+            "",
             title=f"{found.agent}: {plain['runs']} runs, {plain['failed_runs']} failed",
             show_header=False,
         )
-        for name, value in found.totals().items():
-            if not name.endswith("_se") and isinstance(value, float):
-                error = plain.get(f"{name}_se")
-                table.add_row(name, number_cell(value, error, 2))
+        totals = found.totals()
+        for name, value in totals.items():
+            if name.endswith(("_se", "_bound", "_segments")) or not (
+                isinstance(value, float) or f"{name}_segments" in totals
+            ):
+                continue
+            count = totals.get(f"{name}_segments", totals["segments"])
+            of = "" if count == totals["segments"] else f"{count} of {totals['segments']} segments"
+            cell = number_cell(value, totals.get(f"{name}_se"), 2, totals.get(f"{name}_bound"))
+            table.add_row(name, cell, of)
         print_table(table, Console())
-        if not table.row_count:
+        if plain["runs"] == plain["failed_runs"]:
             Console().print("no run could be evaluated")
         Console().print(f"written: {out / 'report.html'}", soft_wrap=True, markup=False)
         if plain["runs"] and plain["failed_runs"] == plain["runs"]:

@@ -74,7 +74,10 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         errors = {name: row.get(f"{name}_se") for name, _, _ in COLUMNS if name != "curvature_jsd"}
-        cells = [number_cell(row[name], errors.get(name), digits) for name, _, digits in COLUMNS]
+        cells = [
+            number_cell(row[name], errors.get(name), digits, row.get(f"{name}_bound"))
+            for name, _, digits in COLUMNS
+        ]
         table.add_row(escape(short_name(str(row["agent"]))), *cells)
     console = Console(stderr=aside)
     print_table(table, console)
@@ -99,7 +102,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
         driven = f"up to {driven}"
     console.print(
         f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
-        f"± standard error over recordings; seed {first['seed']}",
+        f"± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}",
         style="dim",
     )
 
@@ -116,6 +119,16 @@ def _more(row: dict[str, Any]) -> list[str]:
     """What else there is to say of an agent, in lines."""
     own = (name for name in row if ":" in name and not name.endswith("_se"))
     lines = [f"{name} {number_cell(row[name], row.get(f'{name}_se'), 4)}" for name in own]
+    at_states = row.get("collision_rate_at_states", math.nan)
+    if not math.isnan(at_states) and at_states != row["collision_rate"]:
+        lines.append(
+            f"collisions between states count; at states only, as the paper and WOSAC count: {at_states:.1f} %"
+        )
+    bounded = row.get("offroad_segments", row.get("segments"))
+    if bounded != row.get("segments"):
+        lines.append(
+            f"off-road time is of {bounded} of {row['segments']} segments: other maps have no boundary"
+        )
     if row.get("search") == "log":
         return lines
     if not math.isnan(row.get("curvature_jsd_floor", math.nan)):
@@ -153,16 +166,20 @@ def _agents_of(row: dict[str, Any]) -> str:
     """What becomes of single agents, in words."""
     found = ((row[f"agent_collision_{kind}"], text) for kind, text in KINDS)
     kinds = ", ".join(f"{value:.1f} {text}" for value, text in found if value > 0)
-    rate = number_cell(row["agent_collision_rate"], row["agent_collision_rate_se"], 1)
+    rate = number_cell(
+        row["agent_collision_rate"], row["agent_collision_rate_se"], 1, row.get("agent_collision_rate_bound")
+    )
     return (
         f"{rate} % of agents collide while their log exists: {kinds}; they drive {row['agent_progress']:.0f} % of "
         f"the log's way, at speeds {row['agent_speed_distance']:.2f} m/s from the log's"
     )
 
 
-def number_cell(value: float | None, error: float | None, digits: int) -> str:
-    """A number with its standard error; a dash for none."""
+def number_cell(value: float | None, error: float | None, digits: int, bound: float | None = None) -> str:
+    """A number with its standard error, or zero with a bound that is known; a dash for none."""
     if value is None or math.isnan(value):
         return "–"
     text = f"{value:.{digits}f}"
+    if bound is not None and not math.isnan(bound):
+        return f"{text} (≤ {bound:.{digits}f})"
     return text if error is None or math.isnan(error) else f"{text} ± {error:.{digits}f}"

@@ -89,7 +89,8 @@ class EvaluateConfig:
     temperature: float = 0.0
     """Of rule `systematic`; 0: as the agent was trained."""
     threshold: float | None = None
-    """Of rule `replace`; by default as the agent was trained."""
+    """Of rule `replace`; by default as the agent was trained, and 0 for an oracle, whose scores are 1 for an agent
+    that collides or is off the road."""
     goals: Goals = "agent"
     """Who draws goals together: all branches of a `tree` (the paper), or each `branch` alone; `agent`: as it is
     meant."""
@@ -168,11 +169,13 @@ class EvaluateConfig:
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
         """How branches are pruned: as in training, but for what is set here."""
+        # A threshold learned for a discriminator says nothing of flags: with one of them a branch is bad.
+        threshold = 0.0 if self.search == "oracle" else trained.threshold
         return dataclasses.replace(
             trained,
             rule=trained.rule if self.rule == "agent" else self.rule,
             prune_every=self.prune_every or trained.prune_every,
             temperature=self.temperature or trained.temperature,
-            threshold=trained.threshold if self.threshold is None else self.threshold,
+            threshold=threshold if self.threshold is None else self.threshold,
             goals=trained.goals if self.goals == "agent" else self.goals,
         )

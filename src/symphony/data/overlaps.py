@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from symphony.data.levels import LEVEL, ground
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
 from symphony.geometry import boxes_overlap
@@ -24,7 +25,7 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
     """[P, 2] pairs of agents, rows in order, whose oriented boxes overlap at some step.
 
     At least one of the two is a vehicle that moves (more than :data:`~symphony.data.selection.MOVING` metres).
-    Touching does not count.
+    Touching does not count, nor do boxes whose logged heights differ by :data:`~symphony.data.levels.LEVEL`.
     """
     drivers = np.flatnonzero((segment.agent_type == AgentType.VEHICLE) & (travel(segment) > MOVING))
     rows = max(BLOCK // segment.valid.size, 1)
@@ -42,6 +43,8 @@ def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]
     # Boxes can only overlap where the circles around them do. [drivers, A, T]
     near = (away**2).sum(-1) < (reach**2)[..., None]
     near &= segment.valid[drivers, None] & segment.valid
+    height = ground(segment)[..., 2]
+    near &= np.abs(height[drivers, None] - height) < LEVEL
     near[np.arange(len(drivers)), drivers] = False
     driver, other, step = near.nonzero()
     one = drivers[driver]

@@ -33,9 +33,14 @@ EVENTS = {"collision": keys.COLLISION, "offroad": keys.OFFROAD}
 
 
 def penalty(before: TensorDictBase, after: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Reward of -1 for an agent that collides or is off the road, else 0."""
+    """Reward of -1 for an agent that collides, is off the road or nowhere (see :class:`DrivingEnv`), else 0."""
     bad = after.get(keys.COLLISION) | after.get(keys.OFFROAD)
-    return -bad.squeeze(-1).to(after.get(keys.STATE).dtype)
+    state = after.get(keys.STATE)
+    return -(bad.squeeze(-1) | _nowhere(state, after.get(keys.VALID))).to(state.dtype)
+
+
+def _nowhere(state: Float[Tensor, "*b N 4"], valid: Bool[Tensor, "*b N"]) -> Bool[Tensor, "*b N"]:
+    return valid & ~state.isfinite().all(-1)
 
 
 class State(NamedTuple):
@@ -72,7 +77,9 @@ class DrivingEnv(EnvBase):
     constants, so forking a branch is an index and one instance serves every batch shape. Where the scenes say where
     their maps end, traffic is open: agents enter where the log brings them in, once there is room for them (they wait
     beside the road), and leave at the edge of the map; who is not there is not ``valid``. An episode ends at the last
-    logged step (``truncated``), or at what ``ends_on`` names (``terminated``).
+    logged step (``truncated``), or at what ``ends_on`` names (``terminated``). An action that is not finite leaves
+    its agent nowhere, which ends the episode, too (``terminated``): no step waits for a device to tell. Simulations
+    with an agent's networks raise an error at their end that names agent and step (:class:`NotFiniteError`).
 
     Args:
         scenes: static data of B segments, all with the same number of interactive agents; or a source, from which
@@ -390,7 +397,7 @@ class DrivingEnv(EnvBase):
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
-        terminated = torch.zeros_like(truncated)
+        terminated = _nowhere(moved, real).any(-1)
         for key in self.ends_on:
             terminated = terminated | flags[key].any(-1)
         observation = {name: value for name, value in seen._asdict().items() if value is not None}
@@ -444,7 +451,8 @@ class DrivingEnv(EnvBase):
         if seen.road is not None:
             return collision, (seen.road[..., 0] > 0) & valid
         position = _rows_of(objects.state, index)[..., :2]
-        return collision, offroad_flags(self.scenes, scene, position, self._kept()) & valid
+        height = None if objects.height is None else _rows_of(objects.height, index)
+        return collision, offroad_flags(self.scenes, scene, position, self._kept(), height) & valid
 
     def _kept(self) -> Tables:
         """What is looked up at each step of the present scenes."""

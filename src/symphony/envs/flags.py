@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.envs.objects import Objects
-from symphony.envs.road import road_distance
+from symphony.envs.objects import Objects, levels_apart
+from symphony.envs.road import on_levels, road_distance
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import Tables
 from symphony.geometry.boxes import boxes_overlap
@@ -22,13 +22,18 @@ _ROUNDING = 4e-6
 
 
 def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
-    """Whether the oriented box of each agent ``index`` overlaps any other valid box (touching does not count)."""
+    """Whether the oriented box of each agent ``index`` overlaps any other valid box on its level (touching does not
+    count).
+    """
     if on_host(objects.state):
         return torch.from_numpy(_where_circles_meet(objects, index.numpy()))
     wide = index[..., None]
     state = objects.state.gather(1, wide.expand(*index.shape, 5))
     size = objects.size.gather(1, wide.expand(*index.shape, 2))
     other = objects.valid[:, None] & (torch.arange(objects.valid.shape[1], device=index.device) != wide)
+    if objects.height is not None:
+        mine = objects.height.gather(1, wide.expand(*index.shape, 2))
+        other &= ~levels_apart(objects.height[:, None], mine[:, :, None])
     hit = boxes_overlap(
         state[:, :, None, :2],
         state[:, :, None, 2],
@@ -78,6 +83,9 @@ def _where_circles_meet(objects: Objects, index: NDArray[np.int64]) -> NDArray[n
             two[:, 2],
             size.index_select(0, other),
         )
+        if objects.height is not None:
+            height = objects.height.flatten(0, 1)
+            hit &= ~levels_apart(height.index_select(0, own), height.index_select(0, other))
         result[subject[hit.numpy()]] = True
     return result.reshape(index.shape)
 
@@ -87,12 +95,16 @@ def offroad_flags(
     scene: Int[Tensor, " M"],
     position: Float[Tensor, "M N 2"],
     tables: Tables | None = None,
+    height: Float[Tensor, "M N 2"] | None = None,
 ) -> Bool[Tensor, "M N"]:
     """Whether each box centre lies off the drivable area (nowhere, in a scene without boundary).
 
     With ``tables``, which cost little to keep, the distance is measured only where a position's cell of the map does
-    not tell.
+    not tell. With heights and levels, edges on other levels do not count.
     """
+    if height is not None:
+        flat = offroad_flags(scenes, scene, position, tables)
+        return on_levels(scenes, scene, position, height, flat, tables, lambda away: away > 0)
     if tables is None or not on_host(position) or scenes.edge_start.shape[1] == 0:
         return road_distance(scenes, scene, position, tables) > 0
     cells = tables.edge_cells

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from symphony.data.levels import LEVEL
 from symphony.envs.routes import RouteWindow, along_route
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, Tables
@@ -31,12 +32,20 @@ class Objects(NamedTuple):
         valid: [M, A].
         size: [M, A, 2].
         kind: [M, A] int64, ``AgentType``.
+        height: [M, A, 2] height and level, see :func:`levels_apart`; None where no scene has levels.
     """
 
     state: Tensor
     valid: Tensor
     size: Tensor
     kind: Tensor
+    height: Tensor | None = None
+
+
+def levels_apart(one: Float[Tensor, "*b 2"], other: Float[Tensor, "*b 2"]) -> Bool[Tensor, "*b"]:
+    """Whether two places, by height and level (0 for none), are on two of them, see :mod:`symphony.data.levels`."""
+    levels = (one[..., 1] != other[..., 1]) & (one[..., 1] > 0) & (other[..., 1] > 0)
+    return levels & ((one[..., 0] - other[..., 0]).abs() >= LEVEL)
 
 
 def objects_at(
@@ -62,10 +71,27 @@ def objects_at(
     logged = scenes.log_state.flatten(0, 1).index_select(0, row)
     valid = scenes.log_valid.flatten(0, 1).index_select(0, row)
     valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
+    height = None
+    if scenes.agent_height.shape[1]:
+        height = scenes.agent_height.flatten(0, 1).index_select(0, row)
+        if state is not None and index is not None:
+            wide = index[..., None].expand(*index.shape, 2)
+            height = height.scatter(1, wide, _height(scenes, scene, state.detach()[..., :2], index))
     if state is not None and index is not None and index_valid is not None:
         logged, valid = _put(logged, valid, state, index, index_valid)
     size, kind = (value.index_select(0, scene) for value in (scenes.box_size, scenes.agent_type))
-    return Objects(logged, valid, size, kind)
+    return Objects(logged, valid, size, kind, height)
+
+
+def _height(
+    scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M N 2"], index: Int[Tensor, "M N"]
+) -> Float[Tensor, "M N 2"]:
+    """Height and level of simulated agents: those of the nearest place of their own log."""
+    row, agent = scene[:, None], index
+    # [M, N, T]
+    away = (scenes.log_state[row, :, agent, :2] - position[..., None, :]).square().sum(-1)
+    step = away.masked_fill(~scenes.log_valid[row, :, agent], torch.inf).argmin(-1)
+    return scenes.agent_height[row, step, agent]
 
 
 def _put(
@@ -160,6 +186,9 @@ def _nearest(
     x, y = (objects.state[:, None, :, k] - own[..., k, None] for k in (0, 1))
     place = torch.arange(objects.valid.shape[1], device=index.device)
     hidden = ~objects.valid[:, None] | (place == index[..., None])
+    if objects.height is not None:
+        mine = objects.height.gather(1, index[..., None].expand(*index.shape, 2))
+        hidden |= levels_apart(objects.height[:, None], mine[:, :, None])
     return nearest((x.square() + y.square()).masked_fill(hidden, torch.inf), count)
 
 

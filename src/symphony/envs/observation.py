@@ -186,6 +186,7 @@ def observe(
     origin, heading = own[..., :2], own[..., 2]
     turn = -heading
     speed = turn.cos() * own[..., 3] - turn.sin() * own[..., 4]
+    height = None if objects.height is None else _take(objects.height, index)
     features, points, points_mask, road, route = None, None, None, None, None
     lights, lights_mask, road_ahead = None, None, None
     if config.own:
@@ -202,9 +203,9 @@ def observe(
     if config.num_objects:
         seen = observed_objects(tables, scene, objects, index, own, own_size, routes)
     if config.num_points:
-        points, points_mask = observed_points(tables, scene, step, origin, heading, speed)
+        points, points_mask = observed_points(tables, scene, step, origin, heading, speed, height)
     if config.num_lights:
-        lights, lights_mask = observed_lights(tables, scene, step, origin, heading, speed)
+        lights, lights_mask = observed_lights(tables, scene, step, origin, heading, speed, height)
     if config.route and routes is not None:
         pose = torch.cat([own[..., :3], speed[..., None]], -1)
         route = route_ahead(pose, routes, config.distance_scale)
@@ -214,7 +215,9 @@ def observe(
             times = constant(config.foresight, own.dtype, own.device)[:, None]
             places.append(origin[..., None, :] + times * own[..., None, 3:])
         queried = torch.cat(places, -2)
-        away = road_distance(scenes, scene, queried.flatten(1, 2), tables).unflatten(1, queried.shape[1:3])
+        of_each = None if height is None else height.repeat_interleave(queried.shape[2], 1)
+        away = road_distance(scenes, scene, queried.flatten(1, 2), tables, of_each)
+        away = away.unflatten(1, queried.shape[1:3])
         road, ahead = away[..., :5], away[..., 5:]
         road_ahead = ahead if config.road and config.foresight else None
     return Observation(

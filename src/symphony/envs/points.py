@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from symphony.envs.objects import levels_apart
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
@@ -28,9 +29,10 @@ def observed_points(
     origin: Float[Tensor, "M N 2"],
     heading: Float[Tensor, "M N"],
     speed: Float[Tensor, "M N"],
+    height: Float[Tensor, "M N 2"] | None = None,
 ) -> tuple[Float[Tensor, "M N K F"], Bool[Tensor, "M N K"]]:
-    """Features of the nearest points in each agent's frame, and which of them exist."""
-    flat, mask = nearest_points(tables, scene, origin.detach())
+    """Features of the nearest points in each agent's frame, on its level, and which of them exist."""
+    flat, mask = nearest_points(tables, scene, origin.detach(), height)
     return _seen(tables, scene, step, flat, mask, origin, heading, speed), mask
 
 
@@ -41,8 +43,9 @@ def observed_lights(
     origin: Float[Tensor, "M N 2"],
     heading: Float[Tensor, "M N"],
     speed: Float[Tensor, "M N"],
+    height: Float[Tensor, "M N 2"] | None = None,
 ) -> tuple[Float[Tensor, "M N L F"], Bool[Tensor, "M N L"]]:
-    """Features of the nearest lights in each agent's frame, however far, and which of them exist."""
+    """Features of the nearest lights in each agent's frame, however far, on its level, and which of them exist."""
     count, position, number = tables.config.num_lights, *tables.light_points
     if position.shape[1] == 0:
         shape = (*origin.shape[:2], count)
@@ -51,6 +54,9 @@ def observed_lights(
         )
     with torch.no_grad():
         squared = (position[scene][:, None] - origin[..., None, :]).square().sum(-1)
+        if height is not None:
+            lights = tables.scenes.point_height.flatten(0, 1)[number[scene]]
+            squared = squared.masked_fill(levels_apart(lights[:, None], height[:, :, None]), torch.inf)
         chosen, mask = nearest(squared, count)
         flat = number[scene].gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
     return _seen(tables, scene, step, flat, mask, origin, heading, speed), mask
@@ -71,17 +77,27 @@ def _seen(
 
 @torch.no_grad()
 def nearest_points(
-    tables: Tables, scene: Int[Tensor, " M"], origin: Float[Tensor, "M N 2"]
+    tables: Tables,
+    scene: Int[Tensor, " M"],
+    origin: Float[Tensor, "M N 2"],
+    height: Float[Tensor, "M N 2"] | None = None,
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
-    """Numbers of the nearest points among all points of all scenes, and which of them exist."""
+    """Numbers of the nearest points among all points of all scenes, and which of them exist.
+
+    With heights and levels, points on other levels do not (see :func:`symphony.envs.objects.levels_apart`).
+    """
     x, y = tables.position
     count, total = tables.config.num_points, x.shape[1]
+    if height is not None and on_host(origin) and total > count:
+        # Cells do not know of levels: where one of the nearest is on another, all are looked at.
+        flat, mask = nearest_points(tables, scene, origin)
+        heights = tables.scenes.point_height.flatten(0, 1)[flat]
+        some = levels_apart(heights, height[:, :, None]).flatten(1).any(1).nonzero().squeeze(-1)
+        for rows in some.split(max(_DISTANCES // (total * origin.shape[1]), 1)):
+            flat[rows], mask[rows] = _of_all(tables, scene[rows], origin[rows], height[rows])
+        return flat, mask
     if not on_host(origin) or total <= count:
-        squared = (x[scene][:, None] - origin[..., :1]).square() + (
-            y[scene][:, None] - origin[..., 1:]
-        ).square()
-        index, mask = nearest(squared, count)
-        return index + (scene * total)[:, None, None], mask
+        return _of_all(tables, scene, origin, height)
     agents = origin.shape[1]
     row = scene.repeat_interleave(agents).numpy()
     here = origin.reshape(-1, 2).numpy()
@@ -97,6 +113,19 @@ def nearest_points(
     _among_all(found, rest, row, here_x, here_y, x.numpy(), y.numpy())
     flat = flat.view(*origin.shape[:2], count)
     return flat, _exist(tables, flat)
+
+
+def _of_all(
+    tables: Tables, scene: Int[Tensor, " M"], origin: Float[Tensor, "M N 2"], height: Tensor | None
+) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
+    """The same, from the distances to all points of a scene."""
+    x, y = tables.position
+    squared = (x[scene][:, None] - origin[..., :1]).square() + (y[scene][:, None] - origin[..., 1:]).square()
+    if height is not None:
+        away = levels_apart(tables.scenes.point_height[scene][:, None], height[:, :, None])
+        squared = squared.masked_fill(away, torch.inf)
+    index, mask = nearest(squared, tables.config.num_points)
+    return index + (scene * x.shape[1])[:, None, None], mask
 
 
 def _among_all(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tensordict import TensorClass
 from torch import Tensor
 
+from symphony.data.levels import Levels, ground, levels_of
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.envs.edge import MapEdge, beyond
@@ -109,6 +110,10 @@ class SceneBatch(TensorClass):
         edge_valid: [B, E].
         point_lists: [B, W] int32 lists of near points, see :mod:`symphony.envs.map_lists`; W = 0 without.
         edge_lists: [B, V] int32 likewise of near boundary segments.
+        agent_height: [B, T, A, 2] height on the ground and level of logged agents, see :mod:`symphony.data.levels`;
+            empty, as are the next two, where no map has roads above each other.
+        point_height: [B, P, 2] those of points.
+        edge_height: [B, E, 2] those of the middle of boundary segments.
         stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
         segment: [B] int64 number of the run segment among those that scenes are drawn from.
         dt: [B] float64 seconds per step, the same in all scenes of a batch.
@@ -145,6 +150,9 @@ class SceneBatch(TensorClass):
     edge_valid: Tensor
     point_lists: Tensor
     edge_lists: Tensor
+    agent_height: Tensor
+    point_height: Tensor
+    edge_height: Tensor
     stream: Tensor
     segment: Tensor
     dt: Tensor
@@ -209,7 +217,8 @@ def scene(
     log = np.concatenate(
         [segment.position[..., :2], segment.heading[..., None], segment.velocity], axis=-1
     ).swapaxes(0, 1)
-    start, end, previous, following = _edges(segment.road.boundary)
+    levels = levels_of(segment)
+    start, end, previous, following, middle = _edges(segment.road.boundary, levels)
     fields: dict[str, NDArray[Any]] = {
         "log_state": log,
         "log_valid": segment.valid.T,
@@ -231,10 +240,12 @@ def scene(
         "edge_valid": np.ones(len(start), bool),
         "point_lists": np.zeros(0, np.int32),
         "edge_lists": np.zeros(0, np.int32),
+        "agent_height": _heights(segment, levels),
+        "edge_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(middle),
         "stream": np.array(stream_of(segment.segment_id)),
         "segment": np.array(number),
         "dt": np.array(segment.dt, np.float64),
-        **_points(segment),
+        **_points(segment, levels),
         **_routes(tables, len(chosen)),
     }
     return SceneBatch(
@@ -255,6 +266,8 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
         lengths = ", ".join(f"{dt:g} s" for dt in sorted(set(steps.tolist())))
         raise DataError(f"segments of different time steps in one batch: {lengths}", field="dt")
     parts, fields = [dict(item.items()) for item in scenes], {}
+    if any(part["point_height"].shape[1] for part in parts):
+        parts = [part if part["point_height"].shape[1] else part | _no_heights(part) for part in parts]
     for name in SceneBatch.__annotations__:
         values = [part[name] for part in parts]
         shapes = {value.shape[1:] for value in values}
@@ -320,13 +333,36 @@ def _first_inside(segment: RunSegment, chosen: NDArray[np.int64], edge: MapEdge)
     return there.argmax(1)
 
 
-def _edges(boundary: Polylines) -> tuple[NDArray[Any], ...]:
-    lines = shapely.linestrings(boundary.points[:, :2].astype(np.float64), indices=boundary.line_index)
-    points, line = shapely.get_coordinates(shapely.simplify(lines, BOUNDARY_TOLERANCE), return_index=True)
-    return segments_of(points.astype(np.float32), np.searchsorted(line, np.arange(len(boundary) + 1)))
+def _edges(boundary: Polylines, levels: Levels) -> tuple[NDArray[Any], ...]:
+    """Segments as :func:`segments_of` has them, and the middle [E, 3] of each where there are levels."""
+    numbers = boundary.points[:, : 2 if levels.flat else 3].astype(np.float64)
+    lines = shapely.simplify(shapely.linestrings(numbers, indices=boundary.line_index), BOUNDARY_TOLERANCE)
+    found, line = shapely.get_coordinates(lines, include_z=not levels.flat, return_index=True)
+    points = found.astype(np.float32)
+    edges = segments_of(points, np.searchsorted(line, np.arange(len(boundary) + 1)))
+    # Of two points of a line that differ one after the other.
+    pair = np.flatnonzero((line[1:] == line[:-1]) & (points[1:, :2] != points[:-1, :2]).any(-1))
+    return *edges, (points[pair] + points[pair + 1]) / 2
 
 
-def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
+def _heights(segment: RunSegment, levels: Levels) -> NDArray[np.float32]:
+    """[T, A, 2] of logged agents; no level where they are not seen."""
+    if levels.flat:
+        return np.zeros((0, 0, 2), np.float32)
+    return np.where(segment.valid[..., None], levels.at(ground(segment)), 0).astype(np.float32).swapaxes(0, 1)
+
+
+def _no_heights(part: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Heights of a scene without levels, beside others that have some."""
+    sizes = {
+        "agent": part["log_valid"].shape,
+        "point": part["point_valid"].shape,
+        "edge": part["edge_valid"].shape,
+    }
+    return {f"{name}_height": torch.zeros(*shape, 2) for name, shape in sizes.items()}
+
+
+def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
     """Lanes, boundary and marks as evenly spaced points, then one point per light."""
     road = segment.road
     bike = np.where(road.lane_type == LaneType.BIKE_LANE, PointType.BIKE_LANE, PointType.LANE)
@@ -347,13 +383,15 @@ def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
     ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32).reshape(
         -1, 2
     )
-    point.append(segment.signal_point[:, :2])
+    point.append(segment.signal_point)
     direction.append(_unit(ends - segment.signal_point[:, :2]))
     kind.append(np.full(lights, PointType.LIGHT))
     speed.append(np.zeros(lights))
     light = np.concatenate([np.full(sum(map(len, point[:-1])), -1), np.arange(lights)])
+    place = np.concatenate(point).astype(np.float32)
     return {
-        "point": np.concatenate(point).astype(np.float32),
+        "point": place[:, :2],
+        "point_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(place),
         "point_direction": np.concatenate(direction).astype(np.float32),
         "point_type": np.concatenate(kind).astype(np.uint8),
         "point_speed": np.concatenate(speed).astype(np.float32),
@@ -365,16 +403,16 @@ def _points(segment: RunSegment) -> dict[str, NDArray[Any]]:
 def resample_lines(
     lines: Polylines, spacing: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Points [P, 2] at most ``spacing`` metres apart along each line (ends included), unit directions [P, 2] and
+    """Points [P, 3] at most ``spacing`` metres apart along each line (ends included), unit directions [P, 2] and
     the line each belongs to [P]. A line without length is one point with direction 0.
     """
-    xy = lines.points[:, :2].astype(np.float64)
+    xy = lines.points.astype(np.float64)
     owner = lines.line_index
     if len(xy) == 0:
-        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
+        return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
     step = np.zeros(len(xy))
     inside = owner[1:] == owner[:-1]
-    step[1:][inside] = np.linalg.norm(np.diff(xy, axis=0), axis=-1)[inside]
+    step[1:][inside] = np.linalg.norm(np.diff(xy[:, :2], axis=0), axis=-1)[inside]
     # One running arc length over all lines, a metre apart, lets one interpolation serve all.
     step[1:][~inside] = 1.0
     arc = np.cumsum(step)
@@ -387,7 +425,7 @@ def resample_lines(
     rank = spans(0, count)
     share = rank / np.maximum(count[line] - 1, 1)
     at = first[line] + share * length[line]
-    point = np.stack([np.interp(at, arc, xy[:, axis]) for axis in (0, 1)], -1)
+    point = np.stack([np.interp(at, arc, xy[:, axis]) for axis in (0, 1, 2)], -1)
     half = np.minimum(0.5 * spacing, 0.5 * length[line])
     ahead, behind = np.minimum(at + half, last[line]), np.maximum(at - half, first[line])
     chord = np.stack(

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.objects import Objects
+from symphony.envs.objects import Objects, levels_apart
 from symphony.geometry.boxes import box_gap
 from symphony.geometry.nearest import on_host
 
@@ -48,7 +48,8 @@ def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M
         return ready & ~_blocked(objects, order, index, slot)
     row, place = ready.nonzero(as_tuple=True)
     one = place[:, None]
-    some = Objects(*(value[row] for value in objects))
+    height = None if objects.height is None else objects.height[row]
+    some = Objects(objects.state[row], objects.valid[row], objects.size[row], objects.kind[row], height)
     found = torch.zeros_like(ready)
     found[row, place] = ~_blocked(some, order[row], index[row].gather(1, one), one).squeeze(1)
     return found
@@ -65,6 +66,9 @@ def _blocked(
         for value in (objects.state, objects.size)
     )
     state, sizes = objects.state[:, None], objects.size[:, None]
+    if objects.height is not None:
+        mine = objects.height.gather(1, agent[..., None].expand(*agent.shape, 2))
+        there &= ~levels_apart(objects.height[:, None], mine[:, :, None])
     blocked = torch.zeros_like(there)
     for seconds, least in ((0.0, CLEAR), *((t, 0.0) for t in FORESEEN)):
         here, others = (value[..., :2] + seconds * value[..., 3:] for value in (own, state))

@@ -11,6 +11,7 @@ from typing import Any
 from symphony.config import EvaluateConfig, PaperData, Setting, TableColumns
 from symphony.errors import ConfigError
 from symphony.evaluation.entries import (
+    AT_STATES,
     BASELINES,
     ROWS,
     SETTINGS,
@@ -298,10 +299,11 @@ def _with_best(
 def _number(entry: Entry, column: Column, part: str = "") -> float:
     if column.key == COST.key:
         return float(entry.record["cost"]["simulation"]) / max(1, entry.record["segments"])
-    if column.less is not None:
-        begin, taken = (replace(column, key=key, less=None) for key in column.less)
-        return _number(entry, begin, part) - _number(entry, taken, part)
     where = entry.record[part] if part else entry.record
+    if column.less is not None:
+        # Kinds are of all collisions, those between states included.
+        begin, taken = (where.get(key) for key in column.less)
+        return math.nan if begin is None or taken is None else float(begin) - float(taken)
     return math.nan if column.optional and column.key not in where else number(entry, where, column.key)
 
 
@@ -354,6 +356,13 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     horizons = sorted({round(entry.record["horizon"], 1) for entry in entries if "horizon" in entry.record})
     if any(each != setting_seconds(record) for each in horizons):
         notes.append(f"rollouts last {' or '.join(f'{each:g}' for each in horizons)} s")
+    more = {
+        f"{method_name(entry.method)} {entry.record['collision_rate']:.2f} %": None
+        for entry in entries
+        if entry.record.get(AT_STATES, entry.record["collision_rate"]) != entry.record["collision_rate"]
+    }
+    found = f"; with those between states: {', '.join(more)}" if more else ""
+    notes.append(f"collisions are counted at states only, as the paper counts them{found}")
     ways: dict[str, list[str]] = {}
     for entry in entries:
         config = entry.record["config"]

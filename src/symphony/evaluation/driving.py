@@ -12,7 +12,8 @@ import numpy as np
 import shapely
 
 from symphony.data.segment import RunSegment, SignalState
-from symphony.evaluation.contacts import Bools, Indices, Reals, lane_widths
+from symphony.evaluation.contacts import Bools, Indices, Reals
+from symphony.evaluation.fault import Lights, lane_widths
 from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph
@@ -31,14 +32,6 @@ PAST_END = 5.0
 """Metres from the end of a route beyond which an agent has gone on."""
 _FOLLOWED = 3.0
 """Metres from a centre line, on average, within which a path follows the lane."""
-
-
-class Lights(NamedTuple):
-    """Lights that were red when agents drove past, all [E]: row of A, state, light."""
-
-    agent: Indices
-    step: Indices
-    light: Indices
 
 
 def red_lights(world: World, evaluated: Indices, segment: RunSegment, start: int) -> Lights:

@@ -24,6 +24,8 @@ BASELINES = {"playback": "Playback", "constant_velocity": "Constant velocity"}
 ROWS: tuple[str, ...] = (*BASELINES, *get_args(Method))
 SETTINGS: dict[Setting, tuple[int, int]] = {"main": (2, 10), "long": (2, 20), "many": (8, 10)}
 """Interactive agents and seconds."""
+AT_STATES = "collision_rate_at_states"
+"""The paper's reading of collisions; records from before it had a name have no other."""
 WHOLE_LOG = 10
 """Seconds that the whole of the segments counts as, where nothing says how many they are."""
 
@@ -174,10 +176,14 @@ def _check_distinct(entries: Sequence[Entry]) -> None:
 def number(entry: Entry, where: Mapping[str, Any], key: str) -> float:
     """A number of an evaluation, from its record or a part of it; NaN for a mean over nothing.
 
+    Collisions are those at states only, as the paper and all evaluations of before count them.
+
     Raises:
         DataError: it is none.
     """
     value = where.get(key, "")
+    if key == "collision_rate":
+        value = where.get(AT_STATES, value)
     # JSON has no NaN, which stands for a mean over nothing.
     if value is None:
         return math.nan

@@ -40,7 +40,7 @@ from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
 from symphony.simulation.logged import logged
-from symphony.simulation.rollouts import Rollouts
+from symphony.simulation.rollouts import Rollouts, existing
 from symphony.simulation.workers import batches, naming, segments_together, shared
 
 BASELINES = ("playback", "constant_velocity")
@@ -272,7 +272,9 @@ def _add(
     """Add the rollouts of some run segments to what was found."""
     rollouts, (log, log_valid) = found.rollouts, logged(scenes)
     evaluated = rollouts._replace(counted=rollouts.counted & ~scenes.background[:, None, None])
-    exists = _there(scenes, rollouts, log_valid if evaluation.search == "log" else None)
+    exists = (log_valid[:, None] if evaluation.search == "log" else existing(scenes, rollouts)).transpose(
+        2, 3
+    )
     both = evaluated._replace(counted=evaluated.counted & log_valid[:, None, 1:])
     standing = standing_at_end(rollouts.state, log, log_valid, scenes.last_step, evaluated.counted)
     away = (rollouts.state[..., 1:, :, :2] - log[:, None, 1:, :, :2]).norm(dim=-1)
@@ -285,6 +287,7 @@ def _add(
         means = values.double().nanmean(-1).tolist()
         evaluation.own.setdefault(path, {}).update(zip(names, means, strict=True))
     kinds = _kinds(scenes, evaluated, exists)
+    bounded = scenes.edge_valid.any(1)
     single = AgentSteps(
         evaluated.counted.transpose(2, 3),
         log_valid[:, 1:].transpose(1, 2),
@@ -292,8 +295,9 @@ def _add(
         _kinds(scenes, both, exists),
         rollouts.state[..., 1:, :, 3].transpose(2, 3),
         log[:, 1:, :, 3].transpose(1, 2),
+        bounded,
     )
-    there = (exists & ~scenes.background[:, None, :, None]).transpose(2, 3)
+    there = exists.transpose(2, 3) & ~scenes.background[:, None, None]
     driven, counted, there, log_valid = (
         t.cpu() for t in (rollouts.state, evaluated.counted, there, log_valid)
     )
@@ -304,7 +308,9 @@ def _add(
     evaluation.metrics.update(
         [segment.segment_id for segment in segments],
         collided=rollouts.collision.transpose(2, 3).cpu(),
+        at_states=found.at_states.transpose(2, 3).cpu(),
         offroad=rollouts.offroad.transpose(2, 3).cpu(),
+        bounded=bounded,
         displacement=away.transpose(2, 3).cpu(),
         simulated=counted.transpose(2, 3),
         logged=log_valid[:, 1:].transpose(1, 2),
@@ -333,15 +339,6 @@ def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
         torch.where(scenes.background[:, None], -1, each) for each in (found.drawn.flatten(1, 2), found.goal)
     )
     return choices(drawn.cpu(), goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
-
-
-def _there(scenes: SceneBatch, rollouts: Rollouts, log_valid: Tensor | None) -> Bool[Tensor, "B K N T+1"]:
-    """Which driven agents are there at each state; where the log is played back, those that it has."""
-    if log_valid is not None:
-        return log_valid.transpose(1, 2)[:, None]
-    first = scenes.interactive_valid & (scenes.enter == 0)
-    later = rollouts.counted.transpose(2, 3)
-    return torch.cat([first[:, None, :, None].expand(*later.shape[:-1], 1), later], -1)
 
 
 def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T+1"]) -> CollisionKinds:

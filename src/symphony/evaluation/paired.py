@@ -95,7 +95,7 @@ def _rows(entry: Entry, metrics: Sequence[str]) -> Rows:
         raise DataError("is missing", file=f"{entry.folder}: {entry.name}", field="per_segment")
     found: Rows = {}
     for row in rows:
-        numbers = {key: number(entry, {key: row.get(key)}, key) for key in metrics}
+        numbers = {key: number(entry, {key: None} | row, key) for key in metrics}
         found[str(row["segment"])] = str(row.get("group") or row["segment"]), numbers
     return found
 

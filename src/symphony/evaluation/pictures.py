@@ -22,7 +22,7 @@ from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import search_kind, simulation
+from symphony.simulation.driving import driven_by, search_kind
 from symphony.simulation.rollouts import Rollouts
 from symphony.simulation.saved import SavedRollouts, saved_rollouts
 from symphony.simulation.saved_files import RolloutWriter
@@ -183,7 +183,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
     most = config.trees * (config.branches or settings.test_branches)
     config = dataclasses.replace(config, rollouts=min(config.rollouts, most))
     scene = dataset.scene(item).to(torch.device(config.device))
-    found = simulation(agent, scene, config, keep_tree=True)
+    found = driven_by(agent, scene, config, keep_tree=True)
     result = found.search
     if result is None or result.tree is None or found.drawn is None:
         raise RuntimeError("the search kept no tree")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import grouped_mean, report, total_numbers
 from symphony.files import locating
+from symphony.metrics.intervals import t_quantile
 from symphony.simulation.saved import PLAYBACK, SavedRollouts
 from symphony.simulation.saved_files import LATER, RolloutFolder
 
@@ -127,7 +128,10 @@ def _begun(saved: SavedRollouts) -> NDArray[np.float64]:
         step = period * trees.prune_every
         if step < hit.shape[-1]:
             before[..., step] = np.take_along_axis(hit[..., step - 1], trees.parents[:, period - 1], -1)
-    own = saved.collision[..., 0] & saved.counted[..., 0]
+    # Of leaves as of all slots at states; what is saved of rollouts is also found between them.
+    slot = np.repeat(trees.slots, trees.prune_every, 1)[:, : hit.shape[-1]]
+    own = np.take_along_axis(hit, slot.swapaxes(1, 2), 1).reshape(saved.counted.shape[:2])
+    own &= saved.counted[..., 0]
     own_before = np.zeros_like(own)
     own_before[:, 1:] = own[:, :-1]
     going = saved.counted[..., 0]
@@ -191,10 +195,22 @@ def planner_grid(records: Sequence[Record]) -> list[list[str]]:
         cells = []
         for name, _, digits in COLUMNS:
             value, error = one[name], one.get(f"{name}_se")
-            text = "–" if value is None else f"{value:.{digits}f}"
-            cells.append(text if value is None or error is None else f"{text} ± {error:.{digits}f}")
+            text, bound = "–" if value is None else f"{value:.{digits}f}", one.get(f"{name}_bound")
+            spread = "" if value is None or error is None else f" ± {error:.{digits}f}"
+            cells.append(text + (spread if bound is None else f" (≤ {bound:.{digits}f})"))
         grid.append([crowd_name(one), planner_title(one), *cells])
     return grid
+
+
+def counted_at_states(records: Sequence[Record]) -> list[str]:
+    """How collisions were counted, in a sentence, where some were only between states."""
+    name = "collision_rate_at_states"
+    found = [
+        f"{planner_title(one)} among {crowd_name(one)} {one[name]:.1f} %"
+        for one in records
+        if one.get(name) is not None and one[name] != one["collision_rate"]
+    ]
+    return [f"collisions are found between states, too; at states only: {', '.join(found)}"] if found else []
 
 
 def planner_title(record: Record) -> str:
@@ -239,7 +255,8 @@ def _segments(record: Record) -> set[str]:
 
 def winners(records: Sequence[Record]) -> list[str]:
     """For each crowd a sentence: which planner scores best, by how much over the next one, paired over the runs of
-    the segments that both drove (± standard error over groups), and whether that is more than two standard errors.
+    the segments that both drove (± standard error over groups), and whether 0 is outside of its 95 % interval by
+    Student's t.
     Of two that drove different ones the better is who was better where both did.
     """
     crowds: dict[str, list[Record]] = {}
@@ -251,10 +268,14 @@ def winners(records: Sequence[Record]) -> list[str]:
         if not rest:
             continue
         second = rest[0]
-        difference, error = paired_difference(first, second)
+        difference, error, groups = paired_difference(first, second)
         if difference is not None and difference < 0:
             first, second, difference = second, first, -difference
-        clear = error is not None and difference is not None and difference > 2 * error
+        clear = (
+            error is not None
+            and difference is not None
+            and difference > t_quantile(0.975, groups - 1) * error
+        )
         by = "–" if difference is None else f"{difference:.1f}"
         by += "" if error is None else f" ± {error:.1f}"
         verb = "wins" if clear else "is first, within the error"
@@ -264,8 +285,10 @@ def winners(records: Sequence[Record]) -> list[str]:
     return found
 
 
-def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None]:
-    """Mean score of the first less that of the second, paired over segments, and its standard error over groups."""
+def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None, int]:
+    """Mean score of the first less that of the second, paired over segments, its standard error over groups, and how
+    many of these there are.
+    """
     means = []
     for record in (one, other):
         by_segment: dict[str, list[float]] = {}
@@ -278,4 +301,4 @@ def paired_difference(one: Record, other: Record) -> tuple[float | None, float |
         np.unique([of[segment] for segment in both], return_inverse=True)[1] if both else np.zeros(0, int)
     )
     apart = np.array([means[0][segment] - means[1][segment] for segment in both], np.float64)
-    return grouped_mean(apart, np.ones_like(apart), number)
+    return *grouped_mean(apart, np.ones_like(apart), number), len(np.unique(number))

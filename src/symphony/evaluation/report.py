@@ -18,9 +18,12 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType
 from symphony.errors import DataError
+from symphony.evaluation.blocking import blocking
 from symphony.evaluation.contacts import Contacts, contacts, time_to_collision
 from symphony.evaluation.driving import comfort, log_distance, progress, red_lights, wrong_way
+from symphony.evaluation.fault import Lights, at_fault
 from symphony.metrics import CollisionKind
+from symphony.metrics.intervals import zero_bound
 from symphony.render.viewer import Event
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.saved import SavedRollouts
@@ -39,6 +42,7 @@ _WORST = (
     "red_lights",
     "offroad_time",
     "wrong_way_time",
+    "blocking_time",
     "low_ttc_time",
 )
 """What makes a run that did not fail a bad one, worst first."""
@@ -163,11 +167,13 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
 
 _NUMBERS = (
     "collision",
+    "collision_at_states",
     "at_fault_collision",
     "collisions",
     "red_lights",
     "offroad_time",
     "wrong_way_time",
+    "blocking_time",
     "min_ttc",
     "low_ttc_time",
     "progress",
@@ -191,18 +197,30 @@ def _row(segment: str, rollout: int, group: str, failed: str, values: Row) -> Ro
 
 def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> tuple[list[Row], list[Event]]:
     """Numbers of every rollout, and what is to be marked in them."""
-    dt, rows = saved.segment.dt, saved.agents[who]
+    segment, rows = saved.segment, saved.agents[who]
+    has_road, has_lanes = len(segment.road.boundary) > 0, len(graph.usable_lanes) > 0
+    has_lights = len(segment.signal_lane) > 0
     moved, motion = progress(saved, who), comfort(saved, who)
     distance, logged = log_distance(saved, who)
     out, events = [], []
-    for k in range(saved.rollouts):
+    worlds = [world_of(saved, k) for k in range(saved.rollouts)]
+    met = contacts(worlds, rows)
+    for k, (world, hits) in enumerate(zip(worlds, met, strict=True)):
         counted = saved.counted[k][:, who]
-        world = world_of(saved, k)
         off = np.zeros(world.valid.shape, bool)
         off[saved.agents, 1:] = (saved.offroad[k] & saved.counted[k]).T
-        hits = contacts(world, rows, graph, saved.segment.road, off)
-        lights = red_lights(world, rows, saved.segment, saved.start)
-        found = [*_collision_events(k, hits), *_light_events(k, lights), *_offroad_events(k, rows, off)]
+        lights = red_lights(world, np.union1d(rows, hits.other), segment, saved.start)
+        fault = at_fault(world, hits, graph, segment, off, lights)
+        # Those of others only say whose fault a collision is.
+        lights = Lights(*(part[np.isin(lights.agent, rows)] for part in lights))
+        stands = np.zeros_like(off)
+        stands[rows] = blocking(world, rows, segment, graph, saved.start)
+        found = [
+            *_collision_events(k, hits, fault),
+            *_light_events(k, lights),
+            *_begin_events(k, rows, off, "offroad", "leaves the road", "off road"),
+            *_begin_events(k, rows, stands, "blocking", "blocks traffic", "blocks traffic"),
+        ]
         found.sort(key=lambda event: event.step)
         events += found
         ttc = np.where(counted.T, time_to_collision(world, rows)[:, 1:], math.inf)
@@ -213,11 +231,15 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
         out.append(
             {
                 "collision": len(hits.agent) > 0,
-                "at_fault_collision": bool(hits.fault.any()),
+                "collision_at_states": bool(hits.at_state.any()),
+                "at_fault_collision": bool(fault.any()),
                 "collisions": len(hits.agent),
-                "red_lights": len(lights.agent),
-                "offroad_time": _percent(off[rows].sum(), steps),
-                "wrong_way_time": _percent((wrong_way(world, rows, graph)[:, 1:] & counted.T).sum(), steps),
+                "red_lights": len(lights.agent) if has_lights else None,
+                "offroad_time": _percent(off[rows].sum(), steps * has_road),
+                "wrong_way_time": _percent(
+                    (wrong_way(world, rows, graph)[:, 1:] & counted.T).sum(), steps * has_lanes
+                ),
+                "blocking_time": _percent((stands[rows, 1:] & counted.T).sum(), steps * has_lanes),
                 "min_ttc": _finite(ttc.min(initial=math.inf)),
                 "low_ttc_time": _percent((ttc < LOW_TTC).sum(), steps),
                 "progress": float(moved.driven[k][known].mean()) if known.any() else None,
@@ -230,7 +252,7 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
                 "max_jerk": _peak(np.abs(motion.jerk[k])),
                 "max_lateral_acceleration": _peak(np.abs(motion.lateral[k])),
                 "log_distance": float(distance[k] / logged[k]) if logged[k] else None,
-                "first_event": round(found[0].step * dt, 3) if found else None,
+                "first_event": round(found[0].step * segment.dt, 3) if found else None,
                 "steps": steps,
                 "logged_steps": int(logged[k]),
             }
@@ -255,11 +277,12 @@ def _known(value: Any) -> float:
     return 0.0 if value is None else float(value)
 
 
-def _collision_events(rollout: int, hits: Contacts) -> list[Event]:
+def _collision_events(rollout: int, hits: Contacts, fault: NDArray[np.bool_]) -> list[Event]:
     label = "collision"
+    parts = hits.agent, hits.other, hits.step, hits.kind, fault
     return [
-        Event(rollout, step, agent, label, KIND_NAMES[CollisionKind(kind)], other, fault, label)
-        for agent, other, step, kind, fault in zip(*(part.tolist() for part in hits), strict=True)
+        Event(rollout, step, agent, label, KIND_NAMES[CollisionKind(kind)], other, mine, label)
+        for agent, other, step, kind, mine in zip(*(part.tolist() for part in parts), strict=True)
     ]
 
 
@@ -271,21 +294,23 @@ def _light_events(rollout: int, lights: Any) -> list[Event]:
     ]
 
 
-def _offroad_events(rollout: int, rows: NDArray[np.int64], off: NDArray[np.bool_]) -> list[Event]:
-    begins = off[rows] & ~np.pad(off[rows][:, :-1], ((0, 0), (1, 0)))
+def _begin_events(
+    rollout: int, rows: NDArray[np.int64], flags: NDArray[np.bool_], kind: str, text: str, label: str
+) -> list[Event]:
+    """Where something begins that lasts, of flags [A, U]."""
+    begins = flags[rows] & ~np.pad(flags[rows][:, :-1], ((0, 0), (1, 0)))
     found = zip(*(part.tolist() for part in begins.nonzero()), strict=True)
-    return [
-        Event(rollout, step, int(rows[m]), "offroad", "leaves the road", label="off road")
-        for m, step in found
-    ]
+    return [Event(rollout, step, int(rows[m]), kind, text, label=label) for m, step in found]
 
 
 _MEANS = {
     "collision_rate": ("collision", 100.0, None),
+    "collision_rate_at_states": ("collision_at_states", 100.0, None),
     "at_fault_collision_rate": ("at_fault_collision", 100.0, None),
     "red_light_rate": ("red_lights", 100.0, None),
     "offroad_time": ("offroad_time", 1.0, "steps"),
     "wrong_way_time": ("wrong_way_time", 1.0, "steps"),
+    "blocking_time": ("blocking_time", 1.0, "steps"),
     "low_ttc_time": ("low_ttc_time", 1.0, "steps"),
     "progress": ("progress", 1.0, None),
     "progress_ratio": ("progress_ratio", 1.0, None),
@@ -296,6 +321,8 @@ _MEANS = {
     "mean_max_lateral_acceleration": ("max_lateral_acceleration", 1.0, None),
 }
 """Means over runs: of which number, times what, weighted by what."""
+_SHARES = [name for name in _MEANS if name.endswith(("_rate", "_time", "_states"))]
+"""Those in percent, of runs or of time: of one that is zero an upper bound is known."""
 _PEAKS = ("max_acceleration", "max_braking", "max_jerk", "max_lateral_acceleration")
 
 
@@ -304,9 +331,11 @@ def total_numbers(rows: Sequence[Row]) -> Row:
 
     Returns:
         ``runs`` (failed ones included), ``failed_runs``, ``segments`` and ``groups``; over the runs that did not fail
-        the means, each with its standard error over groups under ``*_se`` (None for a single group); the largest
-        ``max_*`` and the smallest ``min_ttc``. ``collision_rate``, ``at_fault_collision_rate`` and ``red_light_rate``
-        are percent of runs, ``*_time`` percent of the evaluated agents' time, ``log_distance`` is a mean over steps.
+        the means, each with its standard error over groups under ``*_se`` (None for a single group) and the segments
+        that have such a number under ``*_segments``; the largest ``max_*`` and the smallest ``min_ttc``. ``*_rate``
+        are percent of runs (``collision_rate_at_states``: at states only), ``*_time`` percent of the evaluated
+        agents' time, ``log_distance`` is a mean over steps. ``*_bound`` is of a percentage that is zero the exact
+        bound over groups with 95 % confidence (:func:`symphony.metrics.intervals.zero_bound`), else None.
         Where rare manoeuvres were made more frequent, also ``untilted_*`` with errors: what the means would be
         without that, by the weights of the runs; and ``effective_runs``, how many of one weight would tell as much.
     """
@@ -332,6 +361,11 @@ def total_numbers(rows: Sequence[Row]) -> Row:
             value = (value > 0).astype(np.float64)
         weight = known * np.array([1.0 if by is None else row[by] for row in good], np.float64)
         out[name], out[f"{name}_se"] = grouped_mean(scale * value, weight, group)
+        out[f"{name}_segments"] = len(
+            {row["segment"] for row, some in zip(good, weight > 0, strict=True) if some}
+        )
+        if name in _SHARES:
+            out[f"{name}_bound"] = zero_bound(len(np.unique(group[weight > 0]))) if out[name] == 0 else None
         if tilted:
             found = grouped_mean(scale * value, weight * heavy, group)
             out[f"untilted_{name}"], out[f"untilted_{name}_se"] = found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from symphony.geometry.boxes import box_corners, box_gap, boxes_overlap
+from symphony.geometry.contact import contact_share, meeting_time, pose_at
 from symphony.geometry.frames import forward_speed, rotate, with_speed, wrap
 from symphony.geometry.polylines import NO_BOUNDARY, segments_of, signed_distance
 
@@ -11,7 +12,10 @@ __all__ = [
     "box_corners",
     "box_gap",
     "boxes_overlap",
+    "contact_share",
     "forward_speed",
+    "meeting_time",
+    "pose_at",
     "rotate",
     "segments_of",
     "signed_distance",

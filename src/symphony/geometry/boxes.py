@@ -42,7 +42,7 @@ def boxes_overlap(
     reaches strictly inside that one; two coincident points do not overlap. The result is the same with the
     boxes swapped, and true exactly where :func:`box_gap` is negative.
     """
-    pair = _relation(*_way(center_a, center_b), heading_a, heading_b)
+    pair = relation(*_way(center_a, center_b), heading_a, heading_b)
     return _separations(pair, size_a, size_b) < 0
 
 
@@ -71,7 +71,7 @@ def gap_between(
     size_b: Float[Tensor, "*#batch 2"],
 ) -> Float[Tensor, "*batch"]:
     """:func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
-    pair = _relation(x, y, heading_a, heading_b)
+    pair = relation(x, y, heading_a, heading_b)
     separation = _separations(pair, size_a, size_b)
     # Of two disjoint convex polygons the nearest points include a corner of one of them.
     apart = torch.minimum(
@@ -108,17 +108,18 @@ def _way(center_a: Float[Tensor, "*#b 2"], center_b: Float[Tensor, "*#b 2"]) -> 
     return center_b[..., 0] - center_a[..., 0], center_b[..., 1] - center_a[..., 1]
 
 
-def _relation(
+def relation(
     x: Float[Tensor, "*#b"],
     y: Float[Tensor, "*#b"],
     heading_a: Float[Tensor, "*#b"],
     heading_b: Float[Tensor, "*#b"],
 ) -> _Pair:
+    """Where a box is whose centre is ``x`` and ``y`` metres from that of box a."""
     turn = heading_b - heading_a
-    return _Pair(_turned(x, y, heading_a), _turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
+    return _Pair(turned(x, y, heading_a), turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
 
 
-def _turned(x: Float[Tensor, "*#b"], y: Float[Tensor, "*#b"], heading: Float[Tensor, "*#b"]) -> _Plane:
+def turned(x: Float[Tensor, "*#b"], y: Float[Tensor, "*#b"], heading: Float[Tensor, "*#b"]) -> _Plane:
     """A vector along and across a heading."""
     cos, sin = torch.cos(heading), torch.sin(heading)
     return cos * x + sin * y, cos * y - sin * x
@@ -131,18 +132,25 @@ def _opposite(plane: _Plane) -> _Plane:
 def _separations(pair: _Pair, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tensor, "*#b 2"]) -> Tensor:
     """Largest separation along the four face normals: negative where the boxes overlap."""
     # Each box's axes are treated alike, so that swapping the boxes gives the same bits.
-    cos, sin = (part.abs() for part in pair.turn)
+    cover = covers(pair.turn, size_a, size_b)
+    places = (pair.in_a[0], pair.in_a[1], pair.in_b[0], pair.in_b[1])
+    gaps = [place.abs() - reach for place, reach in zip(places, cover, strict=True)]
+    return torch.maximum(torch.maximum(gaps[0], gaps[2]), torch.maximum(gaps[1], gaps[3]))
+
+
+def covers(
+    turn: _Plane, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tensor, "*#b 2"]
+) -> tuple[Tensor, ...]:
+    """How far apart centres may be for the boxes to overlap, along and across a, and along and across b."""
+    cos, sin = (part.abs() for part in turn)
     length_a, width_a = 0.5 * size_a[..., 0], 0.5 * size_a[..., 1]
     length_b, width_b = 0.5 * size_b[..., 0], 0.5 * size_b[..., 1]
-    front = torch.maximum(
-        pair.in_a[0].abs() - (length_a + (length_b * cos + width_b * sin)),
-        pair.in_b[0].abs() - (length_b + (length_a * cos + width_a * sin)),
+    return (
+        length_a + (length_b * cos + width_b * sin),
+        width_a + (length_b * sin + width_b * cos),
+        length_b + (length_a * cos + width_a * sin),
+        width_b + (length_a * sin + width_a * cos),
     )
-    side = torch.maximum(
-        pair.in_a[1].abs() - (width_a + (length_b * sin + width_b * cos)),
-        pair.in_b[1].abs() - (width_b + (length_a * sin + width_a * cos)),
-    )
-    return torch.maximum(front, side)
 
 
 def _corner_distance(

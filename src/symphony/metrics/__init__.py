@@ -14,7 +14,7 @@ from symphony.metrics.curvature import (
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
 from symphony.metrics.rates import SegmentResult
-from symphony.metrics.realism import collisions, displacement, offroad
+from symphony.metrics.realism import Meetings, collisions, displacement, meetings, offroad
 from symphony.metrics.summary import RolloutMetrics
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "CollisionKind",
     "CollisionKinds",
     "Divergence",
+    "Meetings",
     "OrderStatistics",
     "RolloutMetrics",
     "SegmentResult",
@@ -34,6 +35,7 @@ __all__ = [
     "curvature_histogram",
     "displacement",
     "jensen_shannon",
+    "meetings",
     "offroad",
     "order_statistics",
     "passing_gap",

@@ -34,6 +34,7 @@ class AgentSteps(NamedTuple):
         kinds: [B, K, N] of their first collisions among the steps that are both.
         speed: [B, K, N, T] m/s.
         speed_log: [B, N, T].
+        bounded: [B] whether the map has a boundary to be off.
     """
 
     there: Bool[Tensor, "B K N T"]
@@ -42,6 +43,7 @@ class AgentSteps(NamedTuple):
     kinds: CollisionKinds
     speed: Float[Tensor, "B K N T"]
     speed_log: Float[Tensor, "B N T"]
+    bounded: Bool[Tensor, " B"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class AgentResult:
     Attributes:
         agents: in all rollouts.
         collided: [kinds, 2] of them by the kind of their first collision, with a driven agent and with playback.
-        offroad: agent-steps.
+        offroad: agent-steps off the road, and those that could be.
         standing: agent-steps, simulated and logged.
         speed: [bins, 2] agent-steps by speed, simulated and logged.
         travel: m/s summed over agent-steps, simulated and logged.
@@ -59,7 +61,7 @@ class AgentResult:
 
     agents: int
     collided: NDArray[np.int64]
-    offroad: int
+    offroad: tuple[int, int]
     standing: tuple[int, int]
     speed: NDArray[np.int64]
     travel: tuple[float, float]
@@ -82,7 +84,7 @@ def agent_results(steps: AgentSteps) -> list[AgentResult]:
             AgentResult(
                 agents=int(both.any(-1).sum()),
                 collided=(same & with_whom).sum((0, 1)),
-                offroad=int((off[b] & both).sum()),
+                offroad=(int((off[b] & both).sum()), int(both.sum()) * bool(steps.bounded[b])),
                 standing=(int((np.abs(own) < STANDING).sum()), int((np.abs(log) < STANDING).sum())),
                 speed=np.stack([_histogram(own), _histogram(log)], -1),
                 travel=(float(own.sum(dtype=np.float64)), float(log.sum(dtype=np.float64))),
@@ -99,7 +101,7 @@ def agent_rates(found: Sequence[AgentResult]) -> Ratios:
 
     agents, collided = column([r.agents for r in found]), column([100 * r.collided for r in found])
     travel, steps = column([r.travel for r in found]), column([r.speed[:, 0].sum() for r in found])
-    standing = 100 * column([r.standing for r in found])
+    off, standing = column([r.offroad for r in found]), 100 * column([r.standing for r in found])
     return {
         "agent_collision_rate": (collided.sum((1, 2)), agents),
         **{
@@ -107,7 +109,7 @@ def agent_rates(found: Sequence[AgentResult]) -> Ratios:
             for kind in CollisionKind
         },
         "agent_collision_with_playback": (collided[..., 1].sum(-1), agents),
-        "agent_offroad_time": (100 * column([r.offroad for r in found]), steps),
+        "agent_offroad_time": (100 * off[:, 0], off[:, 1]),
         "agent_progress": (100 * travel[:, 0], travel[:, 1]),
         "agent_speed": (travel[:, 0], steps),
         "agent_speed_log": (travel[:, 1], steps),

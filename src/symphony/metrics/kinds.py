@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from symphony.geometry import box_gap, rotate, wrap
+from symphony.geometry import box_gap, contact_share, pose_at, rotate, wrap
 
 SAME_WAY = math.radians(45)
 """Largest angle between the headings of two agents that go the same way."""
@@ -31,7 +31,7 @@ class CollisionKind(IntEnum):
     """Kinds of collision, from the agent's point of view.
 
     The headings before contact decide the way. Of two agents that go the same way the sides that met are those whose
-    gap closed last: ends (one ahead of the other) or flanks (one beside the other).
+    gap closed last, at the time of contact: ends (one ahead of the other) or flanks (one beside the other).
 
     Attributes:
         INTO_LEADER: same way, its front met the tail of one ahead.
@@ -118,12 +118,13 @@ def collision_kinds(
 ) -> CollisionKinds:
     """With whom, when and how each interactive agent collides first. Leading dimensions broadcast.
 
-    The other one is the valid agent whose box reaches deepest into the agent's at that step. The states one step
-    before decide the kind, because at contact fast boxes lie far inside each other; where the other is not valid
-    then, those at contact.
+    The other one is the valid agent whose box meets the agent's first within that step; of several at once the one
+    that reaches deepest into it at its end. The states one step before and those at the time of contact decide the
+    kind, because after the step fast boxes lie far inside each other, or beyond; where the other is not valid before,
+    those after it.
 
     Args:
-        collided: [..., N, T] whether an agent collides at a step, as :func:`symphony.metrics.collisions` finds it.
+        collided: [..., N, T] whether an agent collides in a step, as :func:`symphony.metrics.collisions` finds it.
         state: [..., N, T+1, 4] x, y, heading, speed of the interactive agents.
         exists: [..., N, T+1] whether they are there.
         subject: [..., N] their rows of A; a negative one stands for no agent.
@@ -161,14 +162,11 @@ def collision_kinds(
         return _Poses(logged[..., :2], logged[..., 2], logged[..., 3:], valid)
 
     boxes = size.expand(*lead, *size.shape[-2:])[tuple(where)]
-    contact, before = poses(step + 1), poses(step)
-    other = _deepest(contact, boxes, agent)
+    other, share, before, after = _first_met(poses(step), poses(step + 1), boxes, agent)
     ours, theirs = (boxes[torch.arange(len(row), device=row.device), row] for row in (agent, other))
-    one, two = before.of(agent), before.of(other)
-    one_hit, two_hit = contact.of(agent), contact.of(other)
-    seen = one.valid & two.valid
-    one, two = _chosen(seen, one, one_hit), _chosen(seen, two, two_hit)
-    kind = _classify(one, two, one_hit, two_hit, ours, theirs)
+    ends = [(before.of(row), after.of(row)) for row in (agent, other)]
+    one_hit, two_hit = (_at_contact(*end, share) for end in ends)
+    kind = _classify(ends[0][0], ends[1][0], one_hit, two_hit, ours, theirs)
     if agent_type is not None:
         types = agent_type.expand(*lead, agent_type.shape[-1])[tuple(where)]
         hit_type = types.gather(-1, other[:, None])[:, 0]
@@ -194,33 +192,73 @@ def _placed(
     return values.scatter(1, index, driven)[:, :count]
 
 
-def _deepest(contact: _Poses, boxes: Float[Tensor, "M A 2"], agent: Int[Tensor, " M"]) -> Int[Tensor, " M"]:
+def _first_met(
+    before: _Poses, after: _Poses, boxes: Float[Tensor, "M A 2"], agent: Int[Tensor, " M"]
+) -> tuple[Int[Tensor, " M"], Float[Tensor, " M"], _Poses, _Poses]:
+    """Whom each agent [M] meets first in a step, after which share of it, and the poses of everyone: before the step,
+    or after it of those that were not both there before.
+    """
     me = torch.arange(len(agent), device=agent.device), agent
-    gap = box_gap(
-        contact.position[me][:, None],
-        contact.heading[me][:, None],
+    seen = before.valid & before.valid[me][:, None]
+    start = _chosen(seen, before, after)
+    mine = _Poses(
+        *(
+            torch.where(_like(seen, b), b[me][:, None], a[me][:, None])
+            for b, a in zip(before, after, strict=True)
+        )
+    )
+    others = after.valid & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
+    share = contact_share(
+        torch.stack([mine.position, after.position[me][:, None].expand_as(mine.position)], -2),
+        torch.stack([mine.heading, after.heading[me][:, None].expand_as(mine.heading)], -1),
         boxes[me][:, None],
-        contact.position,
-        contact.heading,
+        torch.stack([start.position, after.position], -2),
+        torch.stack([start.heading, after.heading], -1),
         boxes,
     )
-    others = contact.valid & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
-    least, other = torch.where(others, gap, torch.inf).min(-1)
-    if bool((least > _SLACK).any()):
+    gap = box_gap(
+        after.position[me][:, None],
+        after.heading[me][:, None],
+        boxes[me][:, None],
+        after.position,
+        after.heading,
+        boxes,
+    )
+    share, gap = (torch.where(others, value, torch.inf) for value in (share, gap))
+    first = share.amin(-1, keepdim=True)
+    # Flags of states may differ by rounding from what is found between them.
+    least, other = torch.where((share <= first + 1e-6) | first.isinf(), gap, torch.inf).min(-1)
+    first = first[:, 0]
+    if bool((first.isinf() & (least > _SLACK)).any()):
         raise ValueError(
-            f"an agent that is said to collide is {float(least.max()):.2f} m away from all others: "
+            f"an agent that is said to collide is {float(least[first.isinf()].max()):.2f} m away from all others: "
             "flags and states do not belong together"
         )
-    return other
+    pair = torch.arange(len(agent), device=agent.device), other
+    start = _chosen(seen[pair][:, None].expand_as(seen), before, after)
+    return other, first.clamp(max=1.0), start, after
 
 
-def _chosen(condition: Bool[Tensor, " M"], yes: _Poses, no: _Poses) -> _Poses:
-    return _Poses(
-        *(
-            torch.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-            for a, b in zip(yes, no, strict=True)
-        )
+def _at_contact(before: _Poses, after: _Poses, share: Float[Tensor, " M"]) -> _Poses:
+    centers, headings = (
+        torch.stack([before.position, after.position], -2),
+        torch.stack([before.heading, after.heading], -1),
     )
+    position, heading = pose_at(centers, headings, share.to(centers.dtype))
+    return _Poses(
+        position,
+        heading,
+        torch.lerp(before.velocity, after.velocity, share[:, None].to(centers.dtype)),
+        after.valid,
+    )
+
+
+def _like(mask: Bool[Tensor, "M ..."], value: Shaped[Tensor, "M ..."]) -> Bool[Tensor, "M ..."]:
+    return mask.reshape(*mask.shape, *(1,) * (value.ndim - mask.ndim))
+
+
+def _chosen(condition: Bool[Tensor, "M ..."], yes: _Poses, no: _Poses) -> _Poses:
+    return _Poses(*(torch.where(_like(condition, a), a, b) for a, b in zip(yes, no, strict=True)))
 
 
 def _classify(

@@ -22,10 +22,11 @@ class SegmentResult:
     """What one run segment adds to the table.
 
     Attributes:
-        collided: rollouts in which an interactive agent collided at some step.
+        collided: rollouts in which an interactive agent collided, in some step or at some state.
+        at_states: those of them in which one did at a state; None where not given.
         rollouts: K.
         offroad: agent-steps off the road, over all rollouts.
-        steps: agent-steps simulated, over all rollouts.
+        steps: agent-steps simulated where the map has a boundary, over all rollouts.
         error: [K] displacement error summed over agents and steps, metres.
         logged: [K] agent-steps at which the log is valid and the agent is there.
         histogram: [201] curvatures of the branching regions visited by the rollouts.
@@ -57,6 +58,7 @@ class SegmentResult:
     single: AgentResult | None = None
     standing: tuple[int, int, int] | None = None
     choice: Choice | None = None
+    at_states: int | None = None
 
     @property
     def nearest(self) -> tuple[float, float]:

@@ -6,65 +6,135 @@ left out by the caller. Legend: A agents, N interactive agents, E boundary segme
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.geometry import box_corners, boxes_overlap, signed_distance
+from symphony.geometry import box_corners, contact_share, signed_distance
 
 _SLACK = 1e-3
+_PAIRS = 1 << 22
+"""Pairs of agents, times states, that are looked at together: more would not stay in the processor's cache."""
+
+
+class Meetings(NamedTuple):
+    """Boxes that touch in a step, in no particular order, all [E].
+
+    Attributes:
+        row: of R worlds.
+        subject: of N subjects.
+        other: of A agents.
+        step: from state ``step`` to the next one; with ``at_states`` the state.
+        share: of the step after which they first overlap, see :func:`symphony.geometry.contact_share`.
+    """
+
+    row: Int[Tensor, " E"]
+    subject: Int[Tensor, " E"]
+    other: Int[Tensor, " E"]
+    step: Int[Tensor, " E"]
+    share: Float[Tensor, " E"]
+
+
+def meetings(
+    position: Float[Tensor, "R A U 2"],
+    heading: Float[Tensor, "R A U"],
+    size: Float[Tensor, "R A 2"],
+    valid: Bool[Tensor, "R A U"],
+    subject: Int[Tensor, "R N"],
+    *,
+    at_states: bool = False,
+) -> Meetings:
+    """Whose boxes overlap at some time of each step, or at each state, of all subjects and all other agents.
+
+    Between two states centres move straight and headings turn evenly; who was not there at the first of them is
+    looked at where it is at the second. Boxes that only touch do not overlap.
+
+    Args:
+        position: of box centres.
+        heading: of boxes.
+        size: length and width.
+        valid: an agent that is not valid meets nobody, whatever its other numbers are.
+        subject: rows of A; a negative one stands for no agent.
+        at_states: look at states only, not at what is between them.
+    """
+    last = slice(None) if at_states else slice(1, None)
+    first = last if at_states else slice(-1)
+    seen = valid[..., first] & valid[..., last]
+    x, y = position.unbind(-1)
+    # A circle around all that a box covers in a step.
+    place = [torch.where(seen, 0.5 * (p[..., first] + p[..., last]), p[..., last]) for p in (x, y)]
+    half = 0.5 * torch.hypot(x[..., last] - x[..., first], y[..., last] - y[..., first])
+    reach = torch.where(seen, half, 0.0) + 0.5 * size.norm(dim=-1)[..., None] + 0.5 * _SLACK
+    there, agents = valid[..., last], valid.shape[1]
+    everyone = torch.arange(agents, device=valid.device)
+    found = []
+    steps = there.shape[-1]
+    each = max(1, _PAIRS // max(1, subject.shape[1] * agents * steps))
+    for begin in range(0, len(valid), each):
+        rows = torch.arange(begin, min(begin + each, len(valid)), device=valid.device)[:, None]
+        own = subject[rows[:, 0]]
+        index = own.clamp(min=0)
+        near = torch.zeros(*own.shape, agents, steps, device=valid.device, dtype=position.dtype)
+        for part in place:
+            near += (part[rows[:, 0], None] - part[rows, index][:, :, None]).square_()
+        near = near <= (reach[rows[:, 0], None] + reach[rows, index][:, :, None]).square_()
+        near &= there[rows[:, 0], None] & there[rows, index][:, :, None]
+        near &= ((own[..., None] != everyone) & (own >= 0)[..., None])[..., None]
+        row, who, other, step = near.nonzero(as_tuple=True)
+        one = index[row, who]
+        row = row + begin
+        # Who was not there before stays where it is now, and so does who meets it.
+        both = seen[row, one, step] & seen[row, other, step]
+        now = step if at_states else step + 1
+        before = torch.where(both, step, now)
+        times = torch.stack([before, now], -1)
+        at = [(row[:, None], agent[:, None], times) for agent in (one, other)]
+        share = contact_share(
+            position[at[0]], heading[at[0]], size[row, one], position[at[1]], heading[at[1]], size[row, other]
+        )
+        hit = share < math.inf
+        found.append(tuple(value[hit] for value in (row, who, other, step, share)))
+    if not found:
+        none = torch.zeros(0, dtype=torch.int64, device=valid.device)
+        return Meetings(none, none, none, none, position.new_zeros(0))
+    return Meetings(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
 
 def collisions(
-    position: Float[Tensor, "*#lead A T 2"],
-    heading: Float[Tensor, "*#lead A T"],
+    position: Float[Tensor, "*#lead A U 2"],
+    heading: Float[Tensor, "*#lead A U"],
     size: Float[Tensor, "*#lead A 2"],
-    valid: Bool[Tensor, "*#lead A T"],
+    valid: Bool[Tensor, "*#lead A U"],
     subject: Int[Tensor, "*#lead N"],
+    *,
+    at_states: bool = False,
 ) -> Bool[Tensor, "*lead N T"]:
-    """Whether the oriented box of each subject overlaps that of any other valid agent, per step.
-
-    Boxes that only touch do not overlap. Leading dimensions broadcast.
+    """Whether the oriented box of each subject overlaps any other agent's in each of the U - 1 steps between states,
+    or with ``at_states`` at each of the U states (as the paper and WOSAC count), see :func:`meetings`. Leading
+    dimensions broadcast.
 
     Args:
-        position: [..., A, T, 2] box centres.
-        heading: [..., A, T].
+        position: [..., A, U, 2] box centres.
+        heading: [..., A, U].
         size: [..., A, 2] length and width.
-        valid: [..., A, T]; a subject that is not valid collides with nothing, whatever the other numbers are.
+        valid: [..., A, U].
         subject: [..., N] indices into A; a negative one stands for no agent.
+        at_states: look at states only.
     """
     lead = torch.broadcast_shapes(
         position.shape[:-3], heading.shape[:-2], size.shape[:-2], valid.shape[:-2], subject.shape[:-1]
     )
-    agents, steps = valid.shape[-2:]
-    position = position.expand(*lead, agents, steps, 2).reshape(-1, agents, steps, 2)
-    heading = heading.expand(*lead, agents, steps).reshape(-1, agents, steps)
-    valid = valid.expand(*lead, agents, steps).reshape(-1, agents, steps)
-    size = size.expand(*lead, agents, 2).reshape(-1, agents, 2)
-    subject = subject.expand(*lead, subject.shape[-1]).reshape(-1, subject.shape[-1])
-
-    scene = torch.arange(len(position), device=position.device)[:, None]
-    index = subject.clamp(min=0)
-    other = subject[..., None] != torch.arange(agents, device=position.device)
-    pairs = valid[:, None] & valid[scene, index][:, :, None] & (other & (subject >= 0)[..., None])[..., None]
-    # Boxes can only overlap where the circles around them do: of all pairs few are left to look at closely.
-    radius = 0.5 * size.norm(dim=-1)
-    reach = radius[scene, index][..., None] + radius[:, None] + _SLACK
-    away = position[:, None] - position[scene, index][:, :, None]
-    pairs &= away.square().sum(-1) <= reach.square()[..., None]
-
-    row, who, agent, step = pairs.nonzero(as_tuple=True)
-    first = index[row, who]
-    overlap = boxes_overlap(
-        position[row, first, step],
-        heading[row, first, step],
-        size[row, first],
-        position[row, agent, step],
-        heading[row, agent, step],
-        size[row, agent],
-    )
-    result = torch.zeros(*subject.shape, steps, dtype=torch.bool, device=position.device)
-    result[row[overlap], who[overlap], step[overlap]] = True
+    flat = [
+        value.expand(*lead, *value.shape[-inner:]).reshape(-1, *value.shape[-inner:])
+        for value, inner in ((position, 3), (heading, 2), (size, 2), (valid, 2), (subject, 1))
+    ]
+    found = meetings(*flat, at_states=at_states)
+    steps = valid.shape[-1] - (not at_states)
+    result = torch.zeros(*flat[4].shape, steps, dtype=torch.bool, device=position.device)
+    result[found.row, found.subject, found.step] = True
     return result.reshape(*lead, subject.shape[-1], steps)
 
 

@@ -24,6 +24,7 @@ from symphony.metrics.curvature import (
     sampled_divergence,
     sampling_floor,
 )
+from symphony.metrics.intervals import zero_bound
 from symphony.metrics.kinds import CollisionKinds
 from symphony.metrics.rates import (
     SegmentResult,
@@ -64,12 +65,14 @@ class RolloutMetrics:
         single: AgentSteps | None = None,
         standing: Standing | None = None,
         choices: Sequence[Choice] | None = None,
+        at_states: Bool[Tensor, "B K N T"] | None = None,
+        bounded: Bool[Tensor, " B"] | None = None,
     ) -> None:
         """Add the rollouts of some segments.
 
         Args:
             segment_ids: [B], each seen once in all updates.
-            collided: whether an agent's box overlaps another.
+            collided: whether an agent's box overlaps another at some time of a step.
             offroad: whether its centre is off the road.
             displacement: metres from the log.
             simulated: agent-steps that exist; the rest counts for nothing.
@@ -82,6 +85,8 @@ class RolloutMetrics:
             single: what single agents did, for all segments or for none.
             standing: who stands at the end, for all segments or for none.
             choices: [B] what the search made of the goals, for all segments or for none.
+            at_states: whether boxes overlap at the state after each step, for all segments or for none.
+            bounded: whether the map of a segment has a boundary: where it has none nobody is off or on the road.
 
         Raises:
             ValueError: for a segment that was added before, shapes that do not fit together, a displacement or
@@ -105,6 +110,9 @@ class RolloutMetrics:
         ends = None if standing is None else count_standing(standing)
         hits = hit.sum(1)
         off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
+        if bounded is not None:
+            steps = steps * bounded.to(steps.device)
+        touched = None if at_states is None else (at_states & simulated).flatten(2).any(-1).sum(1).tolist()
         count = compared.sum((2, 3))
         for b, (name, seen, seen_log) in enumerate(zip(segment_ids, curvature, curvature_log, strict=True)):
             if name in self.segments:
@@ -125,6 +133,7 @@ class RolloutMetrics:
                 single=None if singles is None else singles[b],
                 standing=None if ends is None else ends[b],
                 choice=None if choices is None else choices[b],
+                at_states=None if touched is None else touched[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -142,7 +151,8 @@ class RolloutMetrics:
         """One row per segment, ordered by its id, for paired comparisons; ``group`` is the recording it is part of.
 
         ``collision_rate`` and ``offroad_time`` in percent, ``ade`` and ``min_sade`` in metres (NaN where the log is
-        valid at no step); where given ``collision_with_playback``, ``standing`` and ``standing_log`` in percent, and
+        valid at no step, and off-road time where the map has no boundary); where given ``collision_rate_at_states``,
+        ``collision_with_playback``, ``standing`` and ``standing_log`` in percent, and
         ``goals_variation``.
         """
         return [
@@ -194,7 +204,11 @@ class RolloutMetrics:
             ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
             all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
             standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
-            ``segments`` and ``rollouts`` (per segment). ``curvature_jsd_floor`` is what the
+            ``segments`` and ``rollouts`` (per segment); ``offroad_segments``, those with a boundary, of which alone
+            the off-road time is (NaN without any). Of each percentage that is zero ``*_bound`` is the exact one-sided
+            bound with 95 % confidence over these samples (:func:`symphony.metrics.intervals.zero_bound`), else NaN.
+            ``collision_rate_at_states`` (where given) counts overlaps at states only, as the paper and WOSAC do, and
+            not those between states. ``curvature_jsd_floor`` is what the
             log's finite size alone gives, ``curvature_jsd_corrected`` the divergence without its bias by sampling
             (its error is that of the divergence; NaN for a single segment or group). Where kinds were given, likewise
             the percent of rollouts whose first collision is of a kind, ``collision_into_leader`` and so on for every
@@ -234,6 +248,7 @@ class RolloutMetrics:
             "offroad_time": (100 * column([s.offroad for s in found]), column([s.steps for s in found])),
             "ade": (column([s.error.mean() for s in found]), column([s.logged.mean() for s in found])),
             "min_sade": (column([error for error, _ in nearest]), column([steps for _, steps in nearest])),
+            **_touching(found),
             **kind_rates(found),
             **role_rates(found),
             **(agent_rates(single) if single else {}),
@@ -243,6 +258,9 @@ class RolloutMetrics:
         out: dict[str, Any] = {}
         for name, (total, weight) in parts.items():
             out[name], out[f"{name}_se"] = ratio(total, weight, member)
+            if name in _SHARES:
+                samples = int((summed(weight, member) > 0).sum())
+                out[f"{name}_bound"] = zero_bound(samples) if out[name] == 0 else math.nan
         divergence, _ = self.curvature_divergence()
         out["curvature_jsd"], out["curvature_jsd_se"] = divergence.value, divergence.error
         out["curvature_jsd_floor"] = sampling_floor(np.stack([s.histogram_log for s in found]))
@@ -252,15 +270,39 @@ class RolloutMetrics:
         if single:
             out["agent_speed_distance"] = speed_distance(single)
         out["segments"] = len(found)
+        out["offroad_segments"] = sum(s.steps > 0 for s in found)
         if member is not None:
             out["groups"] = int(member.max()) + 1
         out["rollouts"] = max(s.rollouts for s in found)
         return out
 
 
+_SHARES = (
+    "collision_rate",
+    "collision_rate_at_states",
+    "offroad_time",
+    "agent_collision_rate",
+    "agent_offroad_time",
+)
+"""Percentages of which a bound is known where they are zero."""
+
+
+def _touching(found: Sequence[SegmentResult]) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Collisions at states only, of all segments or of none."""
+    given = [s.at_states for s in found if s.at_states is not None]
+    if not given:
+        return {}
+    if len(given) < len(found):
+        raise ValueError(f"collisions at states were given for {len(given)} of {len(found)} segments")
+    rollouts = np.array([s.rollouts for s in found], np.float64)
+    return {"collision_rate_at_states": (100 * np.array(given, np.float64), rollouts)}
+
+
 def _more(s: SegmentResult) -> dict[str, float]:
     """What a row has where it was asked for."""
     out: dict[str, float] = {}
+    if s.at_states is not None:
+        out["collision_rate_at_states"] = 100.0 * s.at_states / s.rollouts
     if s.kinds is not None:
         out["collision_with_playback"] = 100.0 * float(s.kinds[:, 1].sum()) / s.rollouts
     if s.standing is not None:

@@ -10,6 +10,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
+from symphony.render.style import AGENT_COLORS, INK
+
 CORNERS = np.array([(0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5)])
 NOSE = np.array([(0.46, 0.0), (0.12, 0.36), (0.12, -0.36)])
 
@@ -46,14 +48,16 @@ def draw_boxes(
     zorder: float = 10,
     gid: str | None = None,
 ) -> None:
-    """Draw boxes [A] whose pale wedge points ahead; see :func:`place` for the arrays."""
+    """Draw boxes [A] whose pale wedge points ahead (see :func:`place` for the arrays); the ego has a dark outline."""
     boxes = place(CORNERS, position, heading, size)
+    ego = color == AGENT_COLORS[0]
+    edge = INK if ego else "white" if alpha > 0.5 else color
     axes.add_collection(
         PolyCollection(
             list(boxes),
             facecolors=[to_rgba(color, alpha)],
-            edgecolors=[to_rgba("white" if alpha > 0.5 else color, min(1.0, alpha + 0.3))],
-            linewidths=0.7,
+            edgecolors=[to_rgba(edge, min(1.0, alpha + 0.3))],
+            linewidths=1.2 if ego else 0.7,
             zorder=zorder,
             gid=gid,
         ),

@@ -37,6 +37,8 @@ from symphony.render.style import (
 )
 
 LOG_DASHES = (0, (4, 2))
+ENTRIES = 8
+"""Agents that a legend names; a crowd's would hide the picture."""
 EVENTS = (("collision", "collision", "X"), ("offroad", "off road", "^"))
 
 
@@ -381,14 +383,17 @@ def describe(segment: RunSegment) -> str:
 
 
 def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
-    """Legend entries of agents in colour."""
+    """Legend entries of agents in colour, of a crowd the first :data:`ENTRIES`."""
 
     def label(agent: int) -> str:
         role = "ego" if agent == segment.ego else "interactive"
         return f"{role} {AgentType(segment.agent_type[agent]).name.lower()} {segment.agent_id[agent]}"
 
     colors = colors_of(segment, agents)
-    return [Patch(color=color, label=label(int(agent))) for agent, color in zip(agents, colors, strict=True)]
+    shown = list(zip(agents, colors, strict=True))[:ENTRIES]
+    entries = [Patch(color=color, label=label(int(agent))) for agent, color in shown]
+    more = [Patch(color="none", label=f"and {len(agents) - ENTRIES} more in colour")]
+    return entries + more * (len(agents) > ENTRIES)
 
 
 def playback_entry(label: str = "playback") -> Patch:

@@ -11,10 +11,12 @@ from symphony.render.viewer.page import filled, script_json, template
 
 TILES = {
     "collision_rate": ("collisions", "% of runs"),
+    "collision_rate_at_states": ("collisions, at states only", "% of runs"),
     "at_fault_collision_rate": ("at fault", "% of runs"),
     "offroad_time": ("off the road", "% of time"),
     "red_light_rate": ("red lights run", "% of runs"),
     "wrong_way_time": ("wrong way", "% of time"),
+    "blocking_time": ("blocks traffic", "% of time"),
     "low_ttc_time": ("near collision (TTC < 1 s)", "% of time"),
     "progress": ("progress", "m"),
     "progress_ratio": ("progress / log's", ""),
@@ -33,6 +35,7 @@ COLUMNS = {
     "red_lights": "red lights",
     "offroad_time": "off road %",
     "wrong_way_time": "wrong way %",
+    "blocking_time": "blocks %",
     "min_ttc": "least TTC s",
     "progress": "progress m",
     "progress_ratio": "of the log's",
@@ -42,6 +45,8 @@ COLUMNS = {
     "log_distance": "to log m",
 }
 """Of the table of runs: a number's name and its heading."""
+LEAD = 2.0
+"""Seconds before the first event of a run at which its replay begins."""
 
 
 def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> str:
@@ -71,14 +76,18 @@ def _head(found: Mapping[str, Any]) -> str:
     lost = f', <b class="bad">{failed} failed</b>' if failed else ""
     return (
         f"<h1>{escape(found['agent'])}</h1><p>{found['runs']} runs of {found['segments']} segments{lost}; "
-        f"evaluated: {who}. ± is the standard error over {found['groups']} groups.</p>"
+        f"evaluated: {who}. ± is the standard error over {found['groups']} groups, "
+        "≤ the exact 95 % bound of a zero.</p>"
     )
 
 
 def _tile(found: Mapping[str, Any], name: str, label: str, unit: str) -> str:
     value, error = found[name], found[f"{name}_se"]
     number = "–" if value is None else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-    spread = "" if error is None else f"± {error:.2g}"
+    bound, count = found.get(f"{name}_bound"), found[f"{name}_segments"]
+    spread = f"≤ {bound:.2g}" if bound is not None else "" if error is None else f"± {error:.2g}"
+    if count < found["segments"]:
+        spread += f" of {count} segments"
     return f"<div><b>{number}</b><span>{escape(label)}</span><small>{unit} {spread}</small></div>"
 
 
@@ -111,9 +120,12 @@ def _run(row: Mapping[str, Any], viewer: str | None) -> dict[str, Any]:
         what.append("off road")
     if row.get("wrong_way_time"):
         what.append("wrong way")
+    if row.get("blocking_time"):
+        what.append("blocks traffic")
     shown["what"] = ", ".join(what)
     # A run of which nothing was saved has no replay.
     if viewer is not None and row.get("steps") is not None:
-        place = {"segment": row["segment"], "rollout": row["rollout"], "t": row.get("first_event") or 0}
+        begin = max((row.get("first_event") or 0) - LEAD, 0)
+        place = {"segment": row["segment"], "rollout": row["rollout"], "t": round(begin, 2), "follow": "ego"}
         shown["link"] = f"{viewer}#{urlencode(place)}"
     return shown

@@ -31,7 +31,7 @@ AGENT_COLORS = (
     "#FF80FF",
     "#9ADE6B",
 )
-"""Ego first, then the interactive agents; repeats after the last."""
+"""The ego's, which is its alone, then the interactive agents', which repeat after the last."""
 PLAYBACK = "#A9AEB5"
 INK = "#2B2F36"
 LAND = "#F3F1EC"
@@ -54,7 +54,7 @@ View = tuple[float, float, float, float]
 
 def agent_color(rank: int) -> str:
     """Colour of the agent of that rank among the highlighted ones (0: ego)."""
-    return AGENT_COLORS[rank % len(AGENT_COLORS)]
+    return AGENT_COLORS[0 if rank == 0 else 1 + (rank - 1) % (len(AGENT_COLORS) - 1)]
 
 
 def new_figure(width: float = 8.0, height: float = 8.0) -> Figure:

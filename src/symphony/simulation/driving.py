@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -29,7 +29,14 @@ from symphony.simulation.finite import FiniteWatch
 from symphony.simulation.importance import Tilt
 from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
-from symphony.simulation.rollouts import Rollouts, rollouts_of, simulate, start_states
+from symphony.simulation.rollouts import (
+    Rollouts,
+    between_states,
+    existing,
+    rollouts_of,
+    simulate,
+    start_states,
+)
 from symphony.simulation.search import aggregate_of, pruning_rule, search
 
 RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
@@ -47,6 +54,7 @@ class Simulation(NamedTuple):
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
         search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
+        at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
         log_weight: [B, K] logarithm of what each rollout weighs after a tilt; None without one.
     """
@@ -54,6 +62,7 @@ class Simulation(NamedTuple):
     rollouts: Rollouts
     goal: Int[Tensor, "B K N"]
     search: BeamSearchResult | None
+    at_states: Bool[Tensor, "B K T N"]
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
     log_weight: Float[Tensor, "B K"] | None = None
@@ -65,7 +74,7 @@ def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollo
     Raises:
         ConfigError, NotFiniteError: as :func:`simulation`.
     """
-    return simulation(agent, scenes, config).rollouts
+    return driven_by(agent, scenes, config).rollouts
 
 
 def simulation(
@@ -171,7 +180,14 @@ def simulation(
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
     weights = None if result is None or result.log_weights is None else result.log_weights.flatten(1)
-    whole = Simulation(rollouts, goal, result, drawn=None if result is None else drawn, log_weight=weights)
+    whole = Simulation(
+        rollouts,
+        goal,
+        result,
+        at_states=rollouts.collision,
+        drawn=None if result is None else drawn,
+        log_weight=weights,
+    )
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
@@ -323,20 +339,23 @@ def driven_by(
     egos: EgoPlanners | None = None,
     given: Int[Tensor, "B N"] | None = None,
 ) -> Simulation:
-    """What an agent does: :func:`playback` of the log, or a :func:`simulation`."""
+    """What an agent does: :func:`playback` of the log, or a :func:`simulation`; collisions of the rollouts are found
+    between states, too.
+    """
     if agent.policy is not None or egos is not None:
-        return simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        rollouts = found.rollouts
+        between = between_states(scenes, rollouts.state, existing(scenes, rollouts))
+        return found._replace(rollouts=rollouts._replace(collision=between))
     _check_given(agent, scenes, config, given)
-    found = playback(scenes)
-    return Simulation(found, torch.full_like(found.state[:, :, 0, :, 0], -1, dtype=torch.int64), None)
+    log = playback(scenes)
+    at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
+    return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:
     """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
     log, valid = logged(scenes)
-    position, heading = scenes.log_state[..., :2].transpose(1, 2), scenes.log_state[..., 2].transpose(1, 2)
-    everyone = scenes.log_valid.transpose(1, 2)
-    hit = collisions(position, heading, scenes.box_size, everyone, scenes.interactive).transpose(1, 2) & valid
     edges = (
         scenes.edge_start,
         scenes.edge_end,
@@ -345,4 +364,13 @@ def playback(scenes: SceneBatch) -> Rollouts:
         scenes.edge_following,
     )
     off = offroad(log[..., :2], *edges) & valid
-    return Rollouts(log[:, None], hit[:, None, 1:], off[:, None, 1:], valid[:, None, 1:])
+    hit = _logged_collisions(scenes)
+    return Rollouts(log[:, None], hit[:, None], off[:, None, 1:], valid[:, None, 1:])
+
+
+def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[Tensor, "B T N"]:
+    """See :func:`symphony.metrics.collisions`; what an agent does that is not there is no collision."""
+    moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
+    subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
+    hit = collisions(moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, at_states=at_states)
+    return hit.transpose(1, 2)

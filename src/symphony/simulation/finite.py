@@ -21,21 +21,26 @@ class NotFiniteError(SymphonyError):
     """A network put out a number that is not finite.
 
     Attributes:
+        what: the network.
         row: of the scene, in its batch.
+        step: at which it was first.
+        agent: number of the interactive agent, the ego being 0.
         name: of the segment, once it is known.
     """
 
-    def __init__(self, what: str, row: int, step: int, name: str = "") -> None:
+    def __init__(self, what: str, row: int, step: int, agent: int, name: str = "") -> None:
         where = f"segment {name}: " if name else ""
-        super().__init__(f"{where}the {what} put out a number that is not finite at step {step}")
-        self.what, self.row, self.step, self.name = what, row, step, name
+        super().__init__(
+            f"{where}the {what} put out a number that is not finite for agent {agent} at step {step}"
+        )
+        self.what, self.row, self.step, self.agent, self.name = what, row, step, agent, name
 
-    def __reduce__(self) -> tuple[type[NotFiniteError], tuple[str, int, int, str]]:
-        return NotFiniteError, (self.what, self.row, self.step, self.name)
+    def __reduce__(self) -> tuple[type[NotFiniteError], tuple[str, int, int, int, str]]:
+        return NotFiniteError, (self.what, self.row, self.step, self.agent, self.name)
 
     def named(self, segment: str) -> NotFiniteError:
         """The same error, with the segment's name."""
-        return NotFiniteError(self.what, self.row, self.step, segment)
+        return NotFiniteError(self.what, self.row, self.step, self.agent, segment)
 
 
 class FiniteWatch:
@@ -71,7 +76,7 @@ class FiniteWatch:
             bad = (first < _NEVER).nonzero()
             if len(bad):
                 row = int(bad[0])
-                raise NotFiniteError(what, row, int(first[row]))
+                raise NotFiniteError(what, row, *divmod(int(first[row]), self.env.num_agents))
 
     def _see(self, tensordict: TensorDictBase, value: Tensor, what: str, scores: bool) -> None:
         if on_host(value) and bool(value.sum().isfinite()):
@@ -80,8 +85,10 @@ class FiniteWatch:
         finite = value.isfinite()
         finite = finite.flatten(valid.ndim).all(-1) if finite.ndim > valid.ndim else finite
         scene, step = tensordict.get(keys.SCENE).squeeze(-1), tensordict.get(keys.STEP).squeeze(-1)
-        bad = (valid & ~finite).any(-1) & (step < self.env.scenes.last_step[scene] + scores)
-        step = torch.where(bad, step, _NEVER)
+        wrong = valid & ~finite
+        bad = wrong.any(-1) & (step < self.env.scenes.last_step[scene] + scores)
+        # The step, then the first agent of it.
+        step = torch.where(bad, step * self.env.num_agents + wrong.int().argmax(-1), _NEVER)
         first = self._first.get(what)
         if first is None:
             first = torch.full((len(self.env.scenes),), _NEVER, dtype=step.dtype, device=step.device)

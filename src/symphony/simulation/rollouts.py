@@ -10,13 +10,18 @@ from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
 from symphony.envs.driving import DrivingEnv
+from symphony.envs.scene import SceneBatch
+from symphony.metrics import collisions
 from symphony.modules import drawn_goals
 from symphony.streams import fold_in, uniform
 
+_WORLD = 1 << 22
+"""Agents times states of scenes that are looked at together."""
 _GOALS, _PERSONAS = 1 << 40, (1 << 40) + 4
 """Numbers of the streams that goals and personas draw from, far above those of rollouts and agents."""
 
@@ -26,7 +31,7 @@ class Rollouts(NamedTuple):
 
     Attributes:
         state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
-        collision: [..., T, N].
+        collision: [..., T, N]; see :func:`between_states` for what is found between states.
         offroad: [..., T, N].
         counted: [..., T, N] steps that are evaluated: of real agents while they are there, up to the segment's last
             logged step.
@@ -194,3 +199,39 @@ def counted_steps(
     """Where agents are there, of the states after each step, and their segment still has logged steps."""
     step = start.get(keys.STEP) + torch.arange(1, there.shape[-2] + 1, device=start.device)
     return (step <= env.scenes.last_step[start.get(keys.SCENE)])[..., None] & there
+
+
+def existing(scenes: SceneBatch, rollouts: Rollouts) -> Bool[Tensor, "B K T+1 N"]:
+    """Which driven agents of rollouts [B, K, ...] are there at each state."""
+    first = (scenes.interactive_valid & (scenes.enter == 0))[:, None, None]
+    return torch.cat([first.expand(-1, rollouts.counted.shape[1], 1, -1), rollouts.counted], -2)
+
+
+def between_states(
+    scenes: SceneBatch, state: Float[Tensor, "B K T+1 N 4"], there: Bool[Tensor, "B K T+1 N"]
+) -> Bool[Tensor, "B K T N"]:
+    """Whether the box of each driven agent overlaps another's at some time of each step (see
+    :func:`symphony.metrics.collisions`), among all others of its scene as they were driven or logged.
+
+    Args:
+        scenes: B scenes.
+        state: of the driven agents.
+        there: where they are.
+    """
+    steps, count = state.shape[2], scenes.log_state.shape[2]
+    subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
+    # Padding goes to a row more, which is dropped.
+    column = torch.where(scenes.interactive_valid, scenes.interactive, count)
+    each = max(1, _WORLD // max(1, state.shape[1] * steps * count))
+    found = []
+    for part in torch.arange(len(scenes), device=state.device).split(each):
+        rollouts = (len(part), state.shape[1])
+        pose = pad(scenes.log_state[part, None, :steps, :, :3].expand(*rollouts, -1, -1, -1), (0, 0, 0, 1))
+        seen = pad(scenes.log_valid[part, None, :steps].expand(*rollouts, -1, -1), (0, 1))
+        index = column[part, None, None].expand(*rollouts, steps, -1)
+        pose = pose.scatter(-2, index[..., None].expand(*index.shape, 3), state[part, ..., :3].to(pose.dtype))
+        seen = seen.scatter(-1, index, there[part])
+        pose, seen = pose[..., :count, :].transpose(2, 3), seen[..., :count].transpose(2, 3)
+        size = scenes.box_size[part, None]
+        found.append(collisions(pose[..., :2], pose[..., 2], size, seen, subject[part, None]))
+    return torch.cat(found).transpose(2, 3) & there[:, :, 1:]

@@ -81,7 +81,9 @@ class Validator:
         """
         with undisturbed(self.agent, self.device):
             found = evaluate_dataset(self.agent, self.dataset, self.how, progress).metrics.compute()
-        infractions = found["collision_rate"] + found["offroad_time"]
+        # Where no map has a boundary nobody can be off the road.
+        off = found["offroad_time"] if found["offroad_segments"] else 0.0
+        infractions = found["collision_rate"] + off
         # Not a number, and so never the best, if nobody was simulated for a single step.
         if math.isfinite(infractions) and (self.best is None or infractions < self.best.infractions):
             self.best = Best(step, infractions)

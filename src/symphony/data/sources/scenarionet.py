@@ -13,7 +13,8 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
   type OTHER.
 - Velocities of nuScenes are differences to the next position; at the last state of a track, where ScenarioNet writes
   0, that of the state before is taken.
-- Coordinates are taken relative to the ego's first position, rounded to metres, z as logged.
+- Coordinates are taken relative to the ego's first position, rounded to metres, z as logged; maps of nuScenes have
+  none.
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes): see
   :func:`.scenarionet_map.successors` and :func:`.scenarionet_map.neighbors`.
 - The boundary is the road edges, or goes round the union of the drivable areas (``boundary_…``, if all are closed)

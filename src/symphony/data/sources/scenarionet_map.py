@@ -93,6 +93,8 @@ def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
         node = mapping(value, field)
         kind = str(node.get("type"))
         line = points(node.get("polyline", ()), f"{field}: polyline")
+        if dataset == "nuscenes":
+            line = line[:, :2]  # the third number is a heading
         area = points(node.get("polygon", ()), f"{field}: polygon")
         if kind in _LANES and len(line):
             lanes.append(_lane(str(key), node, line, area, dataset))

@@ -42,7 +42,8 @@ class Replay {
     this.states = this.steps + 1;
     this.rank = new Map(Array.from(this.agents, (row, n) => [row, n]));
     const others = Array.from(this.agents).filter(row => row !== this.ego);
-    this.color = row => row === this.ego ? PALETTE[0] : PALETTE[(1 + others.indexOf(row)) % PALETTE.length];
+    // The first is the ego's alone.
+    this.color = row => row === this.ego ? PALETTE[0] : PALETTE[1 + others.indexOf(row) % (PALETTE.length - 1)];
   }
 
   // What a driven agent is: one that is evaluated, or background that drives by a rule.

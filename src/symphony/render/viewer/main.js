@@ -77,6 +77,7 @@ function remember() {
   if (!scene) return;
   const place = new URLSearchParams({ segment: scene.replay.id, rollout: view.rollout, t: (view.t * scene.replay.dt).toFixed(2) });
   if (view.agent !== null) place.set("agent", scene.replay.ids[view.agent]);
+  if (view.follow !== null) place.set("follow", scene.replay.ids[view.follow]);
   history.replaceState(null, "", "#" + place);
 }
 function fit() {
@@ -96,9 +97,18 @@ function resize() {
 }
 function legend(r) {
   const rows = Array.from(new Set([r.ego, ...r.agents])).filter(row => r.rank.has(row));
-  const entries = rows.slice(0, 8).map(row => `<div><b style="background:${r.color(row)}"></b>${r.kind(row)} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
+  const entries = rows.slice(0, 8).map(row => `<div><b style="background:${r.color(row)}"${row === r.ego ? " class=ego" : ""}></b>${r.kind(row)} ${TYPE_NAMES[r.type[row]]} ${escapeText(r.ids[row])}</div>`);
   if (rows.length > 8) entries.push(`<div>and ${rows.length - 8} more driven</div>`);
-  $("legend").innerHTML = entries.join("") + `<div><b style="background:${PLAYBACK}"></b>playback</div><div><b class="dash"></b>log</div>`;
+  entries.push(`<div><b style="background:${PLAYBACK}"></b>playback</div>`, `<div><b class="dash"></b>log</div>`);
+  const sign = (text, color, what) => `<div><i style="color:${color}">${text}</i>${what}</div>`, kinds = Array.from(r["marks.type"]);
+  if (r["lights.x"].length) for (const [name, text] of [["stop", "■"], ["caution", "◆"], ["go", "●"]]) entries.push(sign(text, LIGHT_COLORS[name], `light: ${name}`));
+  if (kinds.includes(MARKS.sign)) entries.push(sign("○", STOP, "stop sign"));
+  if (kinds.includes(MARKS.crosswalk)) entries.push(sign("▭", "#9a958c", "crosswalk"));
+  if (r.lines("routes")) entries.push(sign("◎", INK, "end of a route, the goal"));
+  if (r.events.some(e => e.kind === "collision")) entries.push(sign("×", STOP, "collision"));
+  if (r.events.some(e => e.kind === "offroad")) entries.push(sign("△", "#e69f00", "off the road"));
+  if (r.events.some(e => e.kind === "redlight")) entries.push(sign("△", STOP, "red light run"));
+  $("legend").innerHTML = entries.join("");
 }
 
 function whoPanel() {
@@ -178,7 +188,12 @@ $("back").onclick = () => stepBy(-1); $("forth").onclick = () => stepBy(1);
 $("time").oninput = event => { play(false); seek(+event.target.value); };
 $("time").onchange = remember;
 $("speed").onchange = event => { view.speed = +event.target.value; };
-$("follow").onchange = event => { view.follow = event.target.value === "" ? null : +event.target.value; if (view.follow !== null) { camera.scale = Math.max(camera.scale, 6); select(view.follow); } dirty = true; };
+function follow(row) {
+  view.follow = row < 0 ? null : row;
+  if (view.follow !== null) { camera.scale = Math.max(camera.scale, 6); if (view.agent === null) select(row); }
+  dirty = true; remember();
+}
+$("follow").onchange = event => { const row = event.target.value === "" ? -1 : +event.target.value; follow(row); if (row >= 0) select(row); };
 $("segment").onchange = event => open(+event.target.value).catch(complain);
 const neighbour = d => open((view.segment + d + about.segments.length) % about.segments.length).catch(complain);
 $("previous").onclick = () => neighbour(-1); $("following").onclick = () => neighbour(1);
@@ -221,8 +236,9 @@ function fromPlace() {
   const segment = Math.max(found, 0);
   return open(segment, { rollout: +wanted.get("rollout") || 0 }).then(() => {
     seek((+wanted.get("t") || 0) / scene.replay.dt);
-    const row = scene.replay.ids.indexOf(wanted.get("agent"));
+    const ids = scene.replay.ids, who = wanted.get("follow"), row = ids.indexOf(wanted.get("agent"));
     if (row >= 0) select(row);
+    follow(who === "ego" ? scene.replay.ego : ids.indexOf(who));
   });
 }
 document.title = `${about.agent}: rollouts`;

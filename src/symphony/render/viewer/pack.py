@@ -43,7 +43,7 @@ class Event:
         rollout: its number.
         step: the state at which it happens, from 0.
         agent: row of the log.
-        kind: ``collision``, ``offroad`` or ``redlight``.
+        kind: ``collision``, ``offroad``, ``redlight`` or ``blocking``.
         text: what happened, behind the agent's id (of a collision: its kind).
         other: row of the other agent of a collision, else -1.
         fault: of a collision, whether the agent is at fault; None where that is not known.

@@ -56,7 +56,8 @@ class Scene {
     const r = this.replay, at = this.outline(context, row, state);
     context.globalAlpha = alpha;
     context.fillStyle = color; context.fill();
-    context.strokeStyle = "white"; context.lineWidth = 0.8 * this.px; context.stroke();
+    const ego = row === r.ego;
+    context.strokeStyle = ego ? INK : "white"; context.lineWidth = (ego ? 2 : 0.8) * this.px; context.stroke();
     const l = r.size[2 * row], w = r.size[2 * row + 1];
     context.beginPath();
     for (const [a, b] of [[0.46, 0], [0.12, 0.36], [0.12, -0.36]]) context.lineTo(...at(a * l, b * w));

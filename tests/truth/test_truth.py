@@ -1,0 +1,124 @@
+"""What a report says of scenes whose right values are known, whatever the phase of the time step and its length."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from made import Case, segment_of
+from scenes import cases
+
+from helpers_saved import played
+from symphony.data.segment import AgentType
+from symphony.envs.flags import offroad_flags
+from symphony.envs.scene import scene
+from symphony.evaluation.contacts import contacts
+from symphony.evaluation.report import KIND_NAMES, Report, add_segment
+from symphony.metrics import CollisionKind, collision_kinds
+from symphony.simulation.rollouts import between_states
+from symphony.simulation.saved import SavedRollouts
+from symphony.simulation.world import world_of
+
+PHASES = 8
+KINDS = {name: kind for kind, name in KIND_NAMES.items()}
+BY_TYPE = {int(AgentType.PEDESTRIAN): CollisionKind.PEDESTRIAN, int(AgentType.CYCLIST): CollisionKind.CYCLIST}
+"""What the evaluator calls a collision with them, whichever way they went."""
+STEPS = (0.2, 0.1)
+ALL = cases()
+
+
+def rollouts(case: Case, dt: float, phase: float) -> SavedRollouts:
+    """One of the case, with the flags that the simulation would have set."""
+    segment, state = segment_of(case, dt, phase)
+    saved = played(segment)
+    saved.state[0, :, 0] = state
+    scenes = scene(segment, [0])
+    position = torch.from_numpy(saved.state[0, 1:, :, :2])
+    off = offroad_flags(scenes, torch.zeros(len(position), dtype=torch.int64), position)
+    there = torch.from_numpy(saved.there[:, :, :])[None]
+    hit = between_states(scenes, torch.from_numpy(saved.state)[None], there)
+    saved.offroad[0], saved.collision[0] = off.numpy(), hit[0, 0].numpy()
+    return saved
+
+
+def kind_of(saved: SavedRollouts) -> int:
+    """Of the first collision, as the evaluator finds it."""
+    segment, steps = saved.segment, saved.steps + 1
+    pose = np.concatenate([segment.position[..., :2], segment.heading[..., None], segment.velocity], -1)
+    found = collision_kinds(
+        torch.from_numpy(saved.collision[0].T),
+        torch.from_numpy(saved.state[0].swapaxes(0, 1)),
+        torch.from_numpy(saved.there[0].T),
+        torch.tensor([0]),
+        torch.from_numpy(pose[:, :steps]),
+        torch.from_numpy(segment.valid[:, :steps]),
+        torch.from_numpy(segment.size[:, :2]),
+        torch.from_numpy(segment.agent_type.astype(np.int64)),
+    )
+    return int(found.kind[0])
+
+
+def check(case: Case, row: dict[str, Any], events: list[Any], saved: SavedRollouts, start: float) -> None:
+    """Compare every number that the case names, and those that follow from it."""
+    right, dt = case.right, saved.segment.dt
+    hits = [event for event in events if event.kind == "collision"]
+    assert row["collision"] == ("kind" in right), "collision"
+    assert row["collision"] == saved.collision.any() == bool(hits), "the evaluator's reading"
+    assert row["collisions"] == right.get("collisions", len(hits[:1]))
+    if hits:
+        assert {event.text for event in hits} == {right["kind"]}
+        assert row["at_fault_collision"] == right["fault"], "at fault"
+        if start == 0:
+            first = int(saved.segment.agent_type[hits[0].other])
+            assert kind_of(saved) == BY_TYPE.get(first, int(KINDS[right["kind"]])), "the evaluator's kind"
+        if right["at"] is not None:
+            (found,) = contacts([world_of(saved, 0)], np.array([0]))
+            times = start + (found.step - 1 + found.share) * dt
+            assert times[0] == pytest.approx(right["at"], abs=2e-3), "time of contact"
+    assert row["red_lights"] == (right.get("red", 0) if case.light else None)
+    for name, number in (("wrong", "wrong_way_time"), ("blocking", "blocking_time")):
+        if name in right:
+            expected = right[name]
+            assert (row[number] is None) == (expected is None), name
+            assert expected is None or (row[number] > 0) == expected, name
+        elif name == "wrong" and case.lanes:
+            assert row[number] == 0, name
+    step = 150 * dt / 8
+    if "offroad" in right:
+        assert row["offroad_time"] == (
+            None if right["offroad"] is None else pytest.approx(right["offroad"], abs=step)
+        )
+    for name, number, tolerance in (
+        ("ratio", "progress_ratio", 0.03),
+        ("progress", "progress", 1e-3),
+        ("distance", "log_distance", 1.5),
+        ("braking", "max_braking", 1e-3),
+        ("acceleration", "max_acceleration", 1e-3),
+        ("jerk", "max_jerk", 1e-2),
+        ("lateral", "max_lateral_acceleration", 1e-3),
+        ("ttc", "min_ttc", dt),
+    ):
+        if name in right:
+            expected = right[name]
+            assert row[number] == (None if expected is None else pytest.approx(expected, abs=tolerance)), name
+    if "low_ttc" in right:
+        assert (row["low_ttc_time"] > 0) == right["low_ttc"]
+
+
+@pytest.mark.parametrize("dt", STEPS)
+@pytest.mark.parametrize("case", ALL, ids=[case.name for case in ALL])
+def test_a_report_says_what_is_right(case: Case, dt: float) -> None:
+    for phase in range(PHASES):
+        saved = rollouts(case, dt, phase / PHASES)
+        found = Report("made", "ego")
+        add_segment(found, saved)
+        check(case, found.rows[0], found.events[case.name], saved, phase / PHASES * dt)
+
+
+def test_there_are_enough_of_them() -> None:
+    names = [case.name for case in ALL]
+    assert len(names) == len(set(names)) >= 60
+    assert math.isclose(STEPS[0], 2 * STEPS[1])
