@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from symphony.imports import lazily
-from symphony.modules.discriminator import FORESIGHT, Discriminator, discriminator
+from symphony.modules.discriminator import Discriminator, discriminator
 
 if TYPE_CHECKING:
     from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram
     from symphony.modules.displacement import displacement_policy
-    from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
+    from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder, SceneNetwork, scene_module
     from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
     from symphony.modules.noise import SeededNoise
     from symphony.modules.policy import NoiseSampler, discrete_policy

@@ -6,11 +6,12 @@ import hashlib
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -30,10 +31,11 @@ from symphony.simulation.experts import Experts, fit_experts
 from symphony.simulation.kept import KeptExperts, KeptLists
 from symphony.simulation.logged import expert_batch, logged, logged_routes
 from symphony.simulation.memory import ItemCache
-from symphony.simulation.personas import PersonaScale, styles
-from symphony.simulation.perturbation import perturbed
 from symphony.simulation.weights import segment_weights, some_of, state_weights
 from symphony.streams import stream_of, uniform
+
+if TYPE_CHECKING:
+    from symphony.simulation.personas import PersonaScale
 
 GRAPHS = 64
 """Lane graphs held in memory."""
@@ -182,13 +184,20 @@ class SceneDataset:
     def _scene(self, i: int) -> SceneBatch:
         """Item ``i`` as a batch of one scene."""
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
-        persona = self.personas.personas(styles(segment, self.graph(i))) if self.persona else None
+        persona = self.personas.personas(self._styles(i)) if self.persona else None
         return scene(segment, self._interactive(segment), graph, number=i, persona=persona)
 
     @cached_property
     def personas(self) -> PersonaScale:
         """The driving styles of all items, measured when first asked for."""
-        return PersonaScale.of(styles(self.segment(i), self.graph(i)) for i in range(len(self)))
+        from symphony.simulation.personas import PersonaScale  # noqa: PLC0415 - few learn with them
+
+        return PersonaScale.of(map(self._styles, range(len(self))))
+
+    def _styles(self, i: int) -> NDArray[np.float64]:
+        from symphony.simulation.personas import styles  # noqa: PLC0415
+
+        return styles(self.segment(i), self.graph(i))
 
     def _interactive(self, segment: RunSegment) -> int | list[int]:
         """How many agents of a segment act, or which."""
@@ -261,6 +270,8 @@ class SceneDataset:
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
         if perturb is not None:
+            from symphony.simulation.perturbation import perturbed  # noqa: PLC0415 - likewise
+
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
             size = scenes.box_size[item, agent]
             state, action = perturbed(state, action, now, later, size, self.dynamics, self.dt, perturb, rng)
