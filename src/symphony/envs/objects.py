@@ -83,6 +83,34 @@ def objects_at(
     return Objects(logged, valid, size, kind, height)
 
 
+def everyone_at(
+    scenes: SceneBatch,
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    state: Float[Tensor, "M N 4"],
+    valid: Bool[Tensor, "M N"],
+    *,
+    open_traffic: bool = False,
+) -> Objects:
+    """Everyone at a step: interactive agents in their states, and all others as logged.
+
+    Args:
+        scenes: the static part.
+        scene: rows of ``scenes``.
+        step: logged step.
+        state: x, y, heading, speed of the interactive agents.
+        valid: which of them are there.
+        open_traffic: whether agents enter and leave: one that has left, or not entered yet, is not played back.
+    """
+    index = scenes.interactive.index_select(0, scene)
+    found = objects_at(scenes, scene, step, state, index, valid)
+    if not open_traffic:
+        return found
+    agents = found.valid.shape[1]
+    column = torch.where(scenes.interactive_valid[scene] & ~valid, index, agents)
+    return found._replace(valid=pad(found.valid, (0, 1)).scatter(1, column, False)[:, :agents])
+
+
 def _height(
     scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M N 2"], index: Int[Tensor, "M N"]
 ) -> Float[Tensor, "M N 2"]:

@@ -20,13 +20,6 @@ FORESEEN = (0.5, 1.0)
 """Seconds ahead at which its box would meet no other, were everyone to keep speed and course."""
 
 
-def without(objects: Objects, index: Int[Tensor, "M N"], absent: Bool[Tensor, "M N"]) -> Objects:
-    """The same agents without those of ``index`` that are absent."""
-    agents = objects.valid.shape[1]
-    column = torch.where(absent, index, agents)
-    return objects._replace(valid=pad(objects.valid, (0, 1)).scatter(1, column, False)[:, :agents])
-
-
 @torch.no_grad()
 def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
     """Which agents that are ready can enter, far enough from all others.

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
@@ -17,7 +16,6 @@ from symphony.agents import Agent
 from symphony.collectors import BeamSearchResult, KeepAll
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
-from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import Bicycle
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
@@ -127,15 +125,15 @@ def simulation(
         logged_goals=config.logged_goals,
         goals_per=config.pruning(agent.search).goals,
         personas=given_personas(agent.personas, config.persona),
+        fix=_fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None),
     )
-    start = _with_fixed_goals(env, start, given, along_log=config.others == "idm")
     settings, planned = config.pruning(agent.search), None
     if egos is not None:
         kind = search_kind(agent, config)
         # Nothing else simulates a period again.
         keep_every = settings.prune_every if config.retries and kind in ("tree", "oracle") else 0
         forked = kind not in ("none", "log")
-        start, planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
+        planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
     drawn = goal
@@ -235,17 +233,31 @@ def _check_given(
         raise ConfigError(f"{agent.name} follows no goals, so a given one means nothing to it")
 
 
-def _with_fixed_goals(
-    env: DrivingEnv, start: TensorDictBase, given: Tensor | None, *, along_log: bool
-) -> TensorDictBase:
-    """A start state in which goals are as given, and with ``along_log`` those of background agents the log's."""
-    scene, goal = start.get(keys.SCENE).squeeze(-1), start.get(keys.GOAL)
-    if along_log:
-        goal = torch.where(env.scenes.background[scene], env.scenes.route_logged[scene], goal)
-    if given is not None:
-        chosen = given.to(goal.device)[scene]
-        goal = torch.where(chosen >= 0, chosen, goal)
-    return start if goal is start.get(keys.GOAL) else env.with_goals(start, goal)
+def _fixed_goals(
+    scenes: SceneBatch, given: Int[Tensor, "B N"] | None, *, along_log: bool, ego: bool
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """From rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
+
+    Args:
+        scenes: B scenes.
+        given: routes of agents, -1 where that is left open.
+        along_log: whether background agents follow the log's routes.
+        ego: whether the first agent of each scene does.
+    """
+
+    def fixed(scene: Tensor, goal: Tensor) -> Tensor:
+        logged = scenes.route_logged[scene]
+        if along_log:
+            goal = torch.where(scenes.background[scene], logged, goal)
+        if given is not None:
+            chosen = given.to(goal.device)[scene]
+            goal = torch.where(chosen >= 0, chosen, goal)
+        # Scenes without routes have no number of one either.
+        if ego and scenes.route_point.shape[1]:
+            goal = torch.cat([logged[..., :1], goal[..., 1:]], -1)
+        return goal
+
+    return fixed
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:

@@ -84,7 +84,7 @@ def simulate(
 @torch.no_grad()
 def draw_goals(
     env: DrivingEnv,
-    goals: TensorDictModuleBase | None,
+    goals: TensorDictModuleBase,
     start: TensorDictBase,
     seed: int,
     tree: Int[Tensor, "*b"],
@@ -95,13 +95,11 @@ def draw_goals(
 
     Args:
         env: the environment.
-        goals: the goal policy; None takes the routes nearest to the log.
+        goals: the goal policy.
         start: [...], one entry per draw.
         seed: of the draw.
         tree: [...] number of the draw within its scene, so that it is the same whatever the batch.
     """
-    if goals is None:
-        return env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)]
     stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _GOALS), tree[..., None])
     noise = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
 
@@ -121,7 +119,7 @@ def draw_goals(
 def draw_personas(
     env: DrivingEnv,
     personas: Float[Tensor, "M 2"],
-    start: TensorDictBase,
+    scene: Int[Tensor, "*b"],
     seed: int,
     number: Int[Tensor, "*b"],
 ) -> Float[Tensor, "*b N 2"]:
@@ -130,12 +128,12 @@ def draw_personas(
     Args:
         env: the environment.
         personas: to draw from, equally likely.
-        start: [...], one entry per draw.
+        scene: rows of the scene batch, one per draw.
         seed: of the draw.
         number: [...] of the draw within its scene.
     """
-    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _PERSONAS), number[..., None])
-    share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
+    stream = fold_in(fold_in(env.scenes.stream[scene], _PERSONAS), number)[..., None]
+    share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=scene.device)), 0)
     return personas[(share * len(personas)).long()]
 
 
@@ -149,8 +147,9 @@ def start_states(
     logged_goals: bool = False,
     goals_per: Literal["tree", "branch"] = "tree",
     personas: Float[Tensor, "M 2"] | None = None,
+    fix: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> TensorDictBase:
-    """First states [B, trees, branches] of all scenes.
+    """First states [B, trees, branches] of all scenes, observed once they have their goals and personas.
 
     Args:
         env: the environment.
@@ -162,24 +161,28 @@ def start_states(
         goals_per: who draws goals, and personas, together: all branches of a tree (paper, section IV-B), or each
             branch alone.
         personas: that agents drive in, to draw from; None for agents without.
+        fix: from rows of the scenes [*b] and goals [*b, N] to the goals that agents follow.
     """
-    device, scenes = env.scenes.device, len(env.scenes)
-    number = torch.arange(trees * branches, device=device).reshape(trees, branches)
-    scene = torch.arange(scenes, device=device)[:, None, None]
-    start = env.start(scene.expand(-1, trees, branches), number.expand(scenes, -1, -1))
+    device, shape = env.scenes.device, (len(env.scenes), trees, branches)
+    scene = torch.arange(len(env.scenes), device=device)[:, None, None].expand(shape)
+    number = torch.arange(trees * branches, device=device).reshape(trees, branches).expand(shape)
+    goal, persona = torch.full((*shape, env.num_agents), -1, device=device), None
     if personas is not None:
-        first = number if goals_per == "branch" else number[:, :1]
-        start.set(
-            keys.PERSONA, draw_personas(env, personas, start, seed, first.expand(scenes, trees, branches))
-        )
-    if goals is None:
-        return start
-    chosen = None if logged_goals else goals
-    if goals_per == "branch":
-        return env.with_goals(start, draw_goals(env, chosen, start, seed, number.expand(scenes, -1, -1)))
-    tree = torch.arange(trees, device=device).expand(scenes, trees)
-    goal = draw_goals(env, chosen, start[..., 0], seed, tree)
-    return env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
+        first = number if goals_per == "branch" else number[..., :1].expand(shape)
+        persona = draw_personas(env, personas, scene, seed, first)
+    if goals is not None and logged_goals:
+        goal = env.scenes.route_logged[scene]
+    elif goals is not None and goals_per == "branch":
+        goal = draw_goals(env, goals, env.start(scene, number, persona=persona), seed, number)
+    elif goals is not None:
+        # Chosen once, by what the first branch of each tree observes.
+        styles = None if persona is None else persona[:, :, 0]
+        tree = torch.arange(trees, device=device).expand(shape[:2])
+        drawn = draw_goals(env, goals, env.start(scene[..., 0], number[..., 0], persona=styles), seed, tree)
+        goal = drawn[:, :, None].expand(*shape, -1)
+    if fix is not None:
+        goal = fix(scene, goal)
+    return env.start(scene, number, goal, persona)
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
