@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -28,7 +29,9 @@ from symphony.envs import (
     points,
     scene,
 )
+from symphony.envs.observation import observe_states
 from symphony.envs.tables import POINT_FEATURES
+from symphony.roadgraph import LaneGraph
 
 NOTHING = ObservationConfig.nothing()
 EVERYTHING = ObservationConfig(num_objects=4, num_points=60, clearance=True, foresight=(0.5, 1.0))
@@ -80,6 +83,22 @@ def test_what_is_observed_changes_no_state_and_no_flag(dynamics: Any) -> None:
                 assert torch.equal(now[0][key], other[key])
         flags = flags + now[0][keys.REWARD].sum()
     assert flags < 0
+
+
+def test_states_can_be_observed_without_an_environment() -> None:
+    logs = [crossing(4, seed=1, steps=9), straight_road(4, steps=9)]
+    scenes = collate([scene(log, [0, 1], LaneGraph(log.road)) for log in logs])
+    config = replace(EVERYTHING, num_objects=3, num_points=12, route=True)
+    env = DrivingEnv(scenes, None, config)
+    now = env.start(torch.tensor([0, 1, 1]), goal=torch.tensor([[0, -1], [0, 0], [1, 0]]))
+    for _ in range(3):
+        now = env.step(now.set(keys.ACTION, torch.full((3, 2), 90)))["next"]
+    row, step = now[keys.SCENE].squeeze(-1), now[keys.STEP].squeeze(-1)
+    state, valid, goal, come = (now[key] for key in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS))
+    seen, _ = observe_states(scenes, row, step, state, valid, config, goal=goal, progress=come)
+    assert now[keys.ROUTE].any()
+    for name, value in now["agents", "observation"].items():
+        assert torch.equal(getattr(seen, name), value), name
 
 
 def test_constant_velocity_needs_no_observation() -> None:

@@ -458,12 +458,10 @@ def test_drawing_goals_builds_no_graph(env: DrivingEnv, agent: Agent) -> None:
     assert modes == [False, False]
 
 
-def test_logged_goals_are_the_logged_routes(
-    dataset: SceneDataset, agent: Agent, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_logged_goals_are_the_logged_routes(dataset: SceneDataset, agent: Agent) -> None:
     scenes = dataset.scenes(range(4))
     config = EvaluateConfig(search="none", rollouts=3, logged_goals=True)
-    goals, _ = goals_of(monkeypatch, agent, scenes, config)
+    goals = simulation(agent, scenes, config).goal
     assert torch.equal(goals, scenes.route_logged[:, None].expand(-1, 3, -1))
 
 

@@ -394,6 +394,7 @@ class DrivingEnv(EnvBase):
         row, at = scene.flatten(), step.flatten()
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
         index = self.scenes.interactive.index_select(0, row)
+        follows = self.observation.route or self.observation.along
         seen, objects = observe_states(
             self.scenes,
             row,
@@ -401,8 +402,8 @@ class DrivingEnv(EnvBase):
             moved,
             real,
             self.observation,
-            goal=goal.reshape(real.shape),
-            progress=progress.reshape(real.shape),
+            goal=goal.reshape(real.shape) if follows else None,
+            progress=progress.reshape(real.shape) if follows else None,
             tables=self._kept(),
             open_traffic=self.open_traffic,
         )

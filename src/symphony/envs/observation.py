@@ -260,14 +260,14 @@ def observe_states(
         state: x, y, heading, speed of the interactive agents.
         valid: which of them are there.
         config: what they see.
-        goal: routes that they follow, -1 for none; without, nothing of routes is observed.
+        goal: routes that they follow, -1 for none; without them nothing of routes is observed.
         progress: metres that they have come along them.
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
         open_traffic: whether agents enter and leave.
     """
     objects = everyone_at(scenes, scene, step, state, valid, open_traffic=open_traffic)
     routes = None
-    if goal is not None and progress is not None and (config.route or config.along):
+    if goal is not None and progress is not None:
         routes = scenes.routes.of(scene, goal).window(progress)
     index = scenes.interactive.index_select(0, scene)
     return observe(scenes, scene, step, objects, index, config, tables, routes), objects
