@@ -6,6 +6,7 @@ import torch
 
 from symphony import BCLoss, GoalLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, goal_network, observation_of, policy_network
+from symphony.config.training import GOALS
 from symphony.simulation import SceneDataset
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
@@ -33,7 +34,7 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
         items, observation = data.draw(config.segments, rng), observation_of(spec)
         experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
         yield "policy", policy_loss(experts)
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
 
     phases = [Phase(config.steps, update, cosine(rates, config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)

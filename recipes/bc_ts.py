@@ -29,18 +29,18 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: the discriminator prunes branches of every segment.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.search.segments, len(data))]),
+        with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=branched_streams,
-        **collector_settings(config.search, env, seed, data),
+        **collector_settings(config.search, env, seed, data, config.segments),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
-    policy_loss = processes.share(DistillationLoss(policy, rollout_weight=config.search.weight))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
+    policy_loss = processes.share(DistillationLoss(policy))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
 
@@ -50,7 +50,7 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
         experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
-        rollouts = replay.survivors(config.search.states, rng, observation, config.search.survivors)
+        rollouts = replay.survivors(config.search.states, rng, observation)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
 
     phases = [Phase(config.steps, update, cosine(rates, config.steps))]

@@ -15,6 +15,7 @@ from symphony.agents import (
     policy_network,
 )
 from symphony.collectors import BeamSearchCollector, with_rows
+from symphony.config.training import GOALS
 from symphony.modules import SeededNoise
 from symphony.simulation import SceneDataset, SearchReplay, with_survivors
 from symphony.simulation.search import branched_streams, collector_settings, pruning_rule, realism_score
@@ -36,19 +37,19 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: the discriminator prunes branches that follow the routes of the log.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.search.segments, len(data))]),
+        with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=lambda start: env.with_goals(branched_streams(start)),
-        **collector_settings(config.search, env, seed, data),
+        **collector_settings(config.search, env, seed, data, config.segments),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
-    policy_loss = processes.share(DistillationLoss(policy, rollout_weight=config.search.weight))
+    policy_loss = processes.share(DistillationLoss(policy))
     goal_loss = processes.share(GoalLoss(goals))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
 
@@ -58,9 +59,9 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
         experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
-        rollouts = replay.survivors(config.search.states, rng, observation, config.search.survivors)
+        rollouts = replay.survivors(config.search.states, rng, observation)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, observation, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
 
     phases = [Phase(config.steps, update, cosine(rates, config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)

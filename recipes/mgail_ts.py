@@ -29,19 +29,19 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: the discriminator prunes branches of every segment.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.search.segments, len(data))]),
+        with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=branched_streams,
-        **collector_settings(config.search, env, seed, data),
+        **collector_settings(config.search, env, seed, data, config.segments),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
     regression_loss = processes.share(BCLoss(policy))
     mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
     seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device

@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictSequential
 from symphony import BCLoss, DiscriminatorLoss, GoalLoss, MGAILLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, discriminator_network, goal_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, with_rows
+from symphony.config.training import GOALS
 from symphony.envs import Displacement, DrivingEnv
 from symphony.modules import SeededNoise
 from symphony.simulation import SceneDataset, SearchReplay
@@ -29,19 +30,19 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: the discriminator prunes branches that follow the routes of the log.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.search.segments, len(data))]),
+        with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=lambda start: env.with_goals(branched_streams(start)),
-        **collector_settings(config.search, env, seed, data),
+        **collector_settings(config.search, env, seed, data, config.segments),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.discriminator.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
     regression_loss, goal_loss = processes.share(BCLoss(policy)), processes.share(GoalLoss(goals))
     mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator, **config.discriminator.regularisation))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
     seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device
@@ -51,14 +52,14 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         items = data.draw(config.segments, rng)
         experts = data.sample_states(items, config.states, seen, rng, device, config.perturb.at(step))
         yield "policy", regression_loss(experts)
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, seen, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, seen, rng, device))
 
     def head_start(step: int) -> Updates:
         yield "search", replay.refresh(step)
         for _ in range(config.mgail.discriminator_updates):
             yield "discriminator", realism_loss(replay.both_kinds(rng))
         items = data.draw(config.segments, rng)
-        yield "goals", goal_loss(data.sample_goals(items, config.goals, seen, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, seen, rng, device))
 
     def adversarial(step: int) -> Updates:
         yield from head_start(step)

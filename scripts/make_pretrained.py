@@ -191,9 +191,6 @@ def without_paths(config: TrainConfig) -> TrainConfig:
         validation=evaluated,
         resume=False,
         wandb="disabled",
-        wandb_project="symphony",
-        wandb_group="",
-        wandb_tags=(),
         device="cpu",
     )
 
@@ -369,9 +366,7 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
     rows += [(f"`agent.{key}`", value) for key, value in asdict(config.agent).items()]
     rows += [("`learning_rate`", config.learning_rate)]
     if spec.discriminator is not None:
-        rows += [
-            (f"`discriminator.{key}`", getattr(config.discriminator, key)) for key in ("features", "radius")
-        ]
+        rows += [("`discriminator.features`", config.discriminator.features)]
     if spec.action_space == "displacement":
         rows += [
             (f"`mgail.{key}`", getattr(config.mgail, key))
@@ -380,7 +375,7 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
     if spec.searches:
         rows += [
             (f"`search.{key}`", getattr(config.search, key))
-            for key in ("test_branches", "prune_every", "rule", "goals", "survivors")
+            for key in ("test_branches", "prune_every", "rule", "goals")
         ]
     return {key: str(value) for key, value in rows}
 

@@ -18,8 +18,8 @@ def make_agent(space: Any = "bicycle", cells: int = 0) -> Agent:
         action_space=space,
         dt=0.2,
         goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8, cells=cells),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        agent=AgentConfig(num_points=12, hidden=8, cells=cells),
+        discriminator=DiscriminatorConfig(hidden=8),
         searches=True,
         search=SearchConfig(test_branches=2, prune_every=3),
     )

@@ -40,7 +40,7 @@ def config(method: Any, store: Path, out: Path) -> TrainConfig:
         out,
         steps=4,
         validation=ValidationConfig(data=store, segments=1, rollouts=1),
-        discriminator=DiscriminatorConfig(hidden=8, head=8, states=8, instance_noise=0.1),
+        discriminator=DiscriminatorConfig(hidden=8),
         mgail=MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5),
     )
 

@@ -24,7 +24,7 @@ from symphony.envs import DrivingEnv, collate, scene
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.rollouts import start_states
-from symphony.simulation.search import mean_then_sum, search
+from symphony.simulation.search import search
 
 LOGGED = 3  # a search of them prunes once
 SCENES = collate(
@@ -44,10 +44,8 @@ def spec(space: Any) -> AgentSpec:
         action_space="displacement" if cells else space,
         dt=0.2,
         goals=True,
-        agent=AgentConfig(
-            num_objects=3, num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8, head=8
-        ),
-        discriminator=DiscriminatorConfig(features="foresight", hidden=8, head=8),
+        agent=AgentConfig(num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8),
+        discriminator=DiscriminatorConfig(features="foresight", hidden=8),
         searches=True,
     )
 
@@ -55,7 +53,7 @@ def spec(space: Any) -> AgentSpec:
 def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
     return {
         "bc": BCLoss(agent.policy),
-        "distillation": DistillationLoss(agent.policy, survivors="best"),
+        "distillation": DistillationLoss(agent.policy),
         "goal": GoalLoss(agent.goals),
         "discriminator": DiscriminatorLoss(agent.discriminator, gradient_penalty=1.0),
         "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=2),
@@ -72,7 +70,6 @@ def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
     )
     batch.set(keys.ROLLOUT, torch.zeros_like(valid))
     batch.set(keys.SIMULATED, torch.zeros_like(valid))
-    batch.set(keys.RANK, torch.zeros_like(action))
     batch.set(keys.GOAL_SET, batch.get(keys.ROUTES_MASK))
     return batch
 
@@ -81,7 +78,7 @@ def searched(agent: Any, env: DrivingEnv, rule: Any, start: TensorDict | None = 
     """A search of both scenes."""
     if start is None:
         start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
-    how: Any = {"rule": rule, "prune_every": 1, "leaves": 3, "aggregate": mean_then_sum}
+    how: Any = {"rule": rule, "prune_every": 1, "leaves": 3}
     with torch.no_grad():
         return search(env, agent.policy, agent.discriminator, start, seed=0, **how)
 

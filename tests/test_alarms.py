@@ -189,7 +189,7 @@ def test_training_gives_up_with_one_line(
     store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
 ) -> None:
     altered(lambda step: {"gradient_norm_policy": NAN, "loss_policy": INF} if step >= 4 else {})
-    small = "--agent.hidden 8 --agent.head 8 --agent.num-points 12 --states 8 --checkpoint-every 2"
+    small = "--agent.hidden 8 --agent.num-points 12 --states 8 --checkpoint-every 2"
     command = f"train bc --data {store} --out {tmp_path}/run --wandb disabled {small}"
     assert main(command.split()) == 1
     *_, last = capsys.readouterr().err.strip().splitlines()

@@ -17,7 +17,6 @@ from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.map_lists import MapLists
 from symphony.envs.objects import objects_at
 from symphony.envs.points import nearest_points, observed_points
 from symphony.envs.road import road_distance
@@ -36,16 +35,14 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(points, "REPAID", 1)
 
 
-@pytest.fixture(scope="module", params=["lists are made", "some are kept"])
-def scenes(request: pytest.FixtureRequest) -> SceneBatch:
+@pytest.fixture(scope="module")
+def scenes() -> SceneBatch:
     """Maps of several sizes, made and recorded, one without lights and one without a boundary."""
     store = SegmentStore(builtin_store("train"))
     bare = scene(straight_road(4))
     bare = bare.replace(**{name: getattr(bare, name)[:, :0] for name in _EDGES})
     given = [scene(s) for s in (straight_road(), crossing(6), *(store[k] for k in (0, 9, 21)))]
     given.append(bare)
-    if request.param == "some are kept":
-        given[1:] = [MapLists.of(one, FEW.num_points).beside(one) for one in given[1:]]
     return collate(given)
 
 
@@ -193,7 +190,7 @@ def test_padding_batch_and_order_change_nothing(scenes: SceneBatch) -> None:
         fields = {n: getattr(scenes, n)[b : b + 1] for n in SceneBatch.__annotations__}
         for name in fields:
             limit = {"point": valid, "edge_": edges}.get(name[:5])
-            if limit is not None and not name.endswith("lists"):
+            if limit is not None:
                 fields[name] = fields[name][:, :limit]
         lone = SceneBatch(**fields, batch_size=[1])
         mine = row == b

@@ -76,13 +76,11 @@ def test_constant_score_prunes_blindly(branches):
         assert_close(here.get(ACTION), -0.2 * here.get(X) + noise(here, 2))
 
 
-@pytest.mark.parametrize("retries", [0, 2])
-def test_leaves_are_true_histories(retries):
+def test_leaves_are_true_histories():
     """Replaying a leaf's actions from its start gives its states, log-probabilities and scores."""
     env, policy = Walk(), Policy()
     start = starts(env, 3, branches=8)
-    kwargs = {"retries": retries, "retry_above": 1.0, "reseed": reseed} if retries else {}
-    found = search(start, env=env, policy=policy, steps=14, **kwargs)
+    found = search(start, env=env, policy=policy, steps=14)
     leaves, now = found.trajectories, start
     for step in range(14):
         here = leaves[..., step]
@@ -142,7 +140,7 @@ def test_rows_never_meet():
 def test_start_is_left_alone():
     start = starts(Walk(), 2, branches=4)
     before, versions = start.clone(), {k: v._version for k, v in start.items(True, True)}
-    search(start, retries=1, retry_above=0.5, reseed=reseed)
+    search(start)
     assert_same(start, before)
     assert versions == {k: v._version for k, v in start.items(True, True)}
 
@@ -375,59 +373,6 @@ def test_a_rule_may_mix_groups():
     assert torch.equal(groups, goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)))
 
 
-def reseed(state, attempt):
-    return state.set(STREAM, state.get(STREAM) + 7919 * attempt)
-
-
-def test_retries_take_the_better_run_of_bad_branches_only():
-    start = starts(Walk(), 4, branches=4)
-    plain = search(start, steps=4, rule=KeepAll())
-    again = search(reseed(start.clone(), 1), steps=4, rule=KeepAll())
-    above = float(plain.totals.median())
-    both = search(start, steps=4, rule=KeepAll(), retries=1, retry_above=above, reseed=reseed)
-    bad = plain.totals > above
-    expected = torch.where(bad, torch.minimum(plain.totals, again.totals), plain.totals)
-    assert_close(both.totals, expected, rtol=0, atol=0)
-    took = (bad & (again.totals < plain.totals))[:, 0]
-    assert took.any()
-    assert not took.all()
-    assert_close(both.scores[took], again.scores[took], rtol=0, atol=0)
-    assert_close(both.scores[~took], plain.scores[~took], rtol=0, atol=0)
-    assert plain.simulated_steps == 4 * 4 * 4
-    assert both.simulated_steps == plain.simulated_steps + 4 * int(bad.sum())
-    more = search(start, steps=4, rule=KeepAll(), retries=3, retry_above=above, reseed=reseed)
-    assert (more.totals <= both.totals).all()
-    # nothing is bad enough: nothing is repeated
-    idle = search(start, steps=4, rule=KeepAll(), retries=3, retry_above=1e9, reseed=reseed)
-    assert idle.simulated_steps == plain.simulated_steps
-
-
-@pytest.mark.parametrize("spoiled", ["again", "first"])
-def test_of_two_runs_one_that_is_no_number_is_never_taken(spoiled):
-    start = starts(Walk(), 4, branches=4)
-    own = start.get(STREAM)
-
-    def score(state):
-        again = ~torch.isin(state.get(STREAM), own)
-        return torch.where(again == (spoiled == "again"), math.nan, distance(state))
-
-    found = search(start, score=score, steps=4, rule=KeepAll(), retries=1, retry_above=-1.0, reseed=reseed)
-    expected = search(
-        start if spoiled == "again" else reseed(start.clone(), 1), steps=4, rule=KeepAll()
-    ).totals
-    assert_close(found.totals, expected, rtol=0, atol=0)
-
-
-def test_retried_branches_go_on_with_the_numbers_of_their_slot():
-    start = starts(Walk(), 4, branches=4)
-    found = search(start, rule=KeepAll(), retries=1, retry_above=0.0, reseed=reseed)
-    streams, own = found.trajectories.get(STREAM), start.get(STREAM)[:, :, None]
-    assert torch.isin(streams - own, torch.tensor([0, 7919])).all()
-    changed = (streams != own).squeeze(-1).unflatten(2, (3, 4))
-    assert changed.any()
-    assert not changed.any(-1).all()
-
-
 def test_only_what_is_kept_comes_back():
     start = starts(Walk(), 2, branches=4)
     found = search(start, keep=[("next", *X), ACTION], keep_tree=True)
@@ -491,8 +436,6 @@ def test_aggregates_by_hand():
         ({"steps": 0}, "positive"),
         ({"prune_every": 0}, "positive"),
         ({"leaves": 5}, "leaves"),
-        ({"retries": 1}, "retry_above"),
-        ({"retry_above": 1.0}, "retry_above"),
         ({"group_key": "goal"}, "goal"),
         ({"group_key": X}, "integers, one or some per branch"),
         ({"group_key": STREAM}, None),

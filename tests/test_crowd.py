@@ -71,8 +71,8 @@ def tiny(**changes: Any) -> Agent:
         action_space="bicycle",
         dt=DT,
         goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        agent=AgentConfig(num_points=12, hidden=8),
+        discriminator=DiscriminatorConfig(hidden=8),
         searches=True,
         search=SearchConfig(branches=4, test_branches=4, prune_every=3),
     )
@@ -477,7 +477,7 @@ def test_a_cold_draw_is_the_likeliest_action() -> None:
 
     plain = simulation(tiny(), scenes, EvaluateConfig(rollouts=3, search="none", logged_goals=True))
     assert torch.equal(rollouts(1.0 + 1e-9), plain.rollouts.state)
-    cold, warm = rollouts(1e-4), rollouts(3.0)
+    cold, warm = rollouts(1e-7), rollouts(3.0)
     assert (cold == cold[:, :1]).all()
     assert not (warm == warm[:, :1]).all()
     with pytest.raises(ConfigError, match="no discrete actions"):

@@ -81,8 +81,8 @@ def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     path = Path(__file__).resolve().parents[1] / "scripts" / "make_table.py"
     script = runpy.run_path(str(path))
     monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)
-    sizes = "--steps 2 --states 8 --agent.hidden 8 --agent.head 8 --agent.num-points 8 --search.updates 2 "
-    sizes += "--checkpoint-every 2 --search.segments 1 --search.branches=2 --rollouts 2"
+    sizes = "--steps 2 --states 8 --agent.hidden 8 --agent.num-points 8 --search.updates 2 "
+    sizes += "--checkpoint-every 2 --batch 1 --search.branches=2 --rollouts 2"
     out = tmp_path / "out"
     status = script["main"](["--out", str(out), *sizes.split()])
     shown = capsys.readouterr()

@@ -23,7 +23,6 @@ EVERYTHING: dict[str, Any] = {
     "route": True,
     "along": True,
     "gaps": True,
-    "road": True,
     "clearance": True,
     "foresight": (0.5, 1.0),
 }

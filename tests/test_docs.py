@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import io
+import json
 import os
 import re
 import runpy
@@ -116,7 +117,18 @@ def test_tables_are_those_of_the_records(tables: dict[str, Any], capsys: pytest.
     blocks = [
         found[2] for name in tables["PAGES"] for found in tables["BLOCK"].finditer((ROOT / name).read_text())
     ]
-    assert set(blocks) == set(tables["TABLES"])
+    assert set(blocks) == {record.stem for record in tables["RECORDS"].glob("*.json")}
+
+
+def test_records_say_what_they_are_of_and_how_they_were_made(tables: dict[str, Any]) -> None:
+    records = [json.loads(path.read_text()) for path in tables["RECORDS"].glob("*.json")]
+    assert sum(path.stat().st_size for path in tables["RECORDS"].iterdir()) < 1_000_000
+    for record in records:
+        assert record["of"]
+        assert set(record["made"]) == {"commit", "command"}
+        assert len(record["rows"]) <= 12
+    assert tables["cell"]([3, 0.25], 1) == "3.0 ± 0.2"
+    assert tables["cell"]("–") == "–"
 
 
 def test_a_changed_figure_is_found(tables: dict[str, Any]) -> None:

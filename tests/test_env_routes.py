@@ -17,7 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from helpers_segments import CAR, crossing, straight_road
 from symphony import keys
-from symphony.data.segment import RunSegment
+from symphony.data.segment import Polylines, RunSegment
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.routes import (
     AHEAD,
@@ -548,3 +548,28 @@ def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch: pytest.Monk
             batch = scene(segment, [0], LaneGraph(segment.road))
     assert batch.route_logged.tolist() == [[-1]]
     assert scene(segment, [0], LaneGraph(segment.road)).route_logged[0, 0] >= 0
+
+
+def test_who_drives_under_a_bridge_has_no_route_over_it() -> None:
+    segment = straight_road(2, num_lanes=1, steps=21)
+    lane = segment.road.lanes[0]
+    above = lane + np.array([0.0, 0.5, 6.0], np.float32)
+    road = replace(
+        segment.road,
+        **{
+            name: np.repeat(getattr(segment.road, name)[:1], 2, 0)
+            for name in ("lane_type", "speed_limit", "lane_width")
+        },
+        lanes=Polylines.of([lane, above]),
+        lane_id=np.arange(2),
+        successors=np.zeros((0, 2), np.int32),
+        left_neighbors=np.zeros((0, 2), np.int32),
+        right_neighbors=np.zeros((0, 2), np.int32),
+    )
+    for height, aside in ((0.0, 0.0), (6.0, 0.5)):
+        position = segment.position.copy()
+        position[..., 1] += lane[0, 1] - position[0, 0, 1]
+        position[..., 2] = height + 0.5 * segment.size[:, None, 2]
+        table = route_table(segment.replace(position=position, road=road), LaneGraph(road), 0)
+        assert len(table.count) == 1
+        np.testing.assert_allclose(table.line(0)[:, 1], lane[0, 1] + aside, atol=1e-4)

@@ -15,8 +15,6 @@ from symphony.evaluation.records import evaluation_name
 
 CHANGES: dict[str, Any] = {
     "persona": "speed=.8",
-    "tilt": 1.0,
-    "tilt_on": "cut_in",
     "rollouts": 8,
     "search": "oracle",
     "trees": 2,
@@ -30,8 +28,6 @@ CHANGES: dict[str, Any] = {
     "temperature": 0.6,
     "threshold": 2.0,
     "goals": "branch",
-    "retries": 1,
-    "retry_above": 2.0,
     "metric": ["my.metrics:jerk"],
     "action_temperature": 0.5,
     "radius": 50.0,

@@ -32,7 +32,7 @@ def learned(segments: Sequence[RunSegment], method: Any, out: Path) -> Agent:
         out / "run",
         steps=3,
         segments=2 * len(segments),
-        agent=AgentConfig(interactive=1, num_objects=4, num_points=12, hidden=8, head=8),
+        agent=AgentConfig(interactive=1, num_points=12, hidden=8),
         mgail=MGAILConfig(regression=1, head_start=1, rollouts=len(segments), expert_weight=0.5),
     )
     trainer = build(config)

@@ -25,7 +25,6 @@ EVERYTHING = ObservationConfig(
     route=True,
     along=True,
     gaps=True,
-    road=True,
     clearance=True,
     foresight=(0.5, 1.0),
 )

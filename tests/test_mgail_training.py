@@ -91,13 +91,9 @@ def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> se
     return {name for name, share in shares.items() if share}
 
 
-@pytest.mark.parametrize(("method", "checkpoint"), list(zip(METHODS, (3, 0, 0, 3), strict=True)))
-def test_each_phase_changes_the_networks_it_is_for(
-    store: Path, tmp_path: Path, method: str, checkpoint: int
-) -> None:
-    trainer = build(
-        config(method, store, tmp_path, mgail=replace(SHORT, checkpoint=checkpoint, expert_weight=0.0))
-    )
+@pytest.mark.parametrize("method", METHODS)
+def test_each_phase_changes_the_networks_it_is_for(store: Path, tmp_path: Path, method: str) -> None:
+    trainer = build(config(method, store, tmp_path, mgail=replace(SHORT, expert_weight=0.0)))
     goals = {"goals"} if method.endswith("_h") else set()
     phases = ({"policy"}, {"policy"}, {"discriminator"}, {"discriminator"}) + (
         {"policy", "discriminator"},
@@ -161,9 +157,9 @@ def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, meth
 
 
 def test_settings_of_the_configuration_reach_the_loss(store: Path, tmp_path: Path) -> None:
-    settings = MGAILConfig(cost="logit", truncate=4, checkpoint=2, react=True)
+    settings = MGAILConfig(cost="logit", truncate=4, react=True)
     loss = pieces(build(config("mgail", store, tmp_path, mgail=settings)))["mgail_loss"]
-    assert (loss.cost, loss.truncate, loss.checkpoint, loss.detach_keys) == ("logit", 4, 2, [])
+    assert (loss.cost, loss.truncate, loss.detach_keys) == ("logit", 4, [])
     loss = pieces(build(config("mgail_h", store, tmp_path)))["mgail_loss"]
     assert set(loss.detach_keys) == {keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE}
 

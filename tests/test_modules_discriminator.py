@@ -27,8 +27,6 @@ from symphony.modules.encoder import gap_features, road_features
 from symphony.objectives import DiscriminatorLoss
 
 KINDS = ("paper", "clearance", "foresight")
-SPLIT = (*KINDS, "split")
-"""The last is a network that separates map and neighbours, with all features."""
 
 
 def observation(*batch, agents=3, objects=5, points=12, seed=0):
@@ -54,12 +52,10 @@ def observation(*batch, agents=3, objects=5, points=12, seed=0):
 
 def realism(features="clearance", seed=0, **changes):
     torch.manual_seed(seed)
-    if features == "split":
-        features, changes = "foresight", changes | {"split": True}
     return discriminator(4, 5, 4, hidden=16, head=(16,), features=features, **changes)
 
 
-@pytest.mark.parametrize("features", SPLIT)
+@pytest.mark.parametrize("features", KINDS)
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
 def test_one_score_per_agent_and_none_for_padding(batch, features):
     td = observation(*batch)
@@ -69,7 +65,7 @@ def test_one_score_per_agent_and_none_for_padding(batch, features):
     assert (score[td[VALID]] != 0).all()
 
 
-@pytest.mark.parametrize("features", SPLIT)
+@pytest.mark.parametrize("features", KINDS)
 @torch.no_grad()
 def test_a_padded_agent_may_hold_anything(features):
     td, network = observation(20), realism(features)
@@ -83,7 +79,9 @@ def test_a_padded_agent_may_hold_anything(features):
 
 @torch.no_grad()
 @settings(max_examples=10)
-@given(st.floats(0, 6.28), st.floats(1.001, 50), st.floats(0, 0.999), st.sampled_from(["clearance", "split"]))
+@given(
+    st.floats(0, 6.28), st.floats(1.001, 50), st.floats(0, 0.999), st.sampled_from(["clearance", "foresight"])
+)
 def test_nothing_beyond_the_radius_matters(angle, far, near, features):
     network, td = realism(features, radius=0.8), observation()
     td[OBJECTS_MASK][0, 1] = td[POINTS_MASK][0, 4] = True
@@ -104,7 +102,7 @@ def test_nothing_beyond_the_radius_matters(angle, far, near, features):
     assert not torch.equal(with_elements_at(near, 30.0)[0], with_elements_at(near, -70.0)[0])
 
 
-@pytest.mark.parametrize("features", ["foresight", "split"])
+@pytest.mark.parametrize("features", ["foresight"])
 @torch.no_grad()
 def test_the_order_of_elements_and_their_padding_change_nothing(features):
     td, network = observation(6), realism(features)
@@ -124,36 +122,13 @@ def test_the_order_of_elements_and_their_padding_change_nothing(features):
     assert torch.equal(network(masked)[SCORE], plain)
 
 
-@pytest.mark.parametrize("features", ["foresight", "split"])
+@pytest.mark.parametrize("features", ["foresight"])
 @torch.no_grad()
 def test_a_score_does_not_depend_on_the_batch(features):
     td, network = observation(70), realism(features)
     whole = network(td.clone())[SCORE]
     for rows in (slice(0, 1), slice(5, 38), slice(66, 70)):
         assert torch.equal(network(td[rows].clone())[SCORE], whole[rows])
-
-
-@torch.no_grad()
-def test_a_split_score_is_of_the_map_and_of_the_worst_neighbour():
-    td, network = observation(40), realism("split", radius=100.0)
-    whole = network(td.clone())[SCORE]
-
-    def without(*masks):
-        return network(td.clone().update({mask: torch.zeros_like(td[mask]) for mask in masks}))[SCORE]
-
-    alone = without(OBJECTS_MASK)
-    each = []
-    for k in range(5):
-        only = td[OBJECTS_MASK] & (torch.arange(5) == k)
-        pair = network(td.clone().set(OBJECTS_MASK, only))[SCORE] - alone
-        each.append(pair.masked_fill(~only.any(-1), -torch.inf))
-    worst = torch.stack(each).amax(0)
-    torch.testing.assert_close(whole - alone, torch.where(worst.isinf(), 0.0, worst))
-    assert (worst > 0).any()
-    assert (worst < 0).any()
-    # The map adds the same whoever else is there.
-    torch.testing.assert_close(whole - without(POINTS_MASK), alone - without(OBJECTS_MASK, POINTS_MASK))
-    assert not torch.allclose(whole, without(POINTS_MASK))
 
 
 def test_each_kind_reads_what_it_needs_and_no_more():

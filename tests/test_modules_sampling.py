@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from symphony.modules import inverse_cdf
-from symphony.streams import fold_in, stream_of, uniform
+from symphony.streams import Stream, fold_in, stream_of, uniform
 
 MASK = 2**64 - 1
 int64 = st.integers(-(2**63), 2**63 - 1)
@@ -68,6 +68,16 @@ def chi_square(counts: torch.Tensor) -> float:
     freedom = counts.numel() - 1
     statistic = ((counts.double() - expected) ** 2).sum().item() / expected
     return (statistic - freedom) / math.sqrt(2 * freedom)
+
+
+def test_streams_keep_the_numbers_that_rollouts_were_made_with():
+    first = 1 << 40
+    assert {stream.name: stream - first for stream in Stream} == {
+        "GOALS": 0,
+        "PRUNING": 1,
+        "PLANNERS": 3,
+        "PERSONAS": 4,
+    }
 
 
 @pytest.mark.parametrize("axis", ["stream", "step", "seed", "folded"])

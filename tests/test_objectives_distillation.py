@@ -20,7 +20,7 @@ from symphony.objectives import BCLoss, DistillationLoss
 
 OBSERVATION, LOGITS = ("agents", "observation"), ("agents", "logits")
 ACTION, VALID = ("agents", "action"), ("agents", "valid")
-ROLLOUT, RANK = ("agents", "rollout"), ("agents", "rank")
+ROLLOUT = ("agents", "rollout")
 
 
 def categorical_actor(classes=5):
@@ -62,7 +62,6 @@ def batch(*shape, agents=3, continuous=False):
     td[VALID] = torch.rand(*shape, agents) < 0.7
     # Whole entries come from one source, and there are many more rollouts than experts.
     td[ROLLOUT] = (torch.rand(*shape, 1) < 0.8).expand(*shape, agents).clone()
-    td[RANK] = torch.randint(3, (*shape, 1)).expand(*shape, agents).clone()
     return td
 
 
@@ -74,18 +73,15 @@ def bc(actor, td, mask, key="loss_bc", **arguments):
 
 @pytest.mark.parametrize("continuous", [False, True])
 @pytest.mark.parametrize("reduction", [None, "sum"])
-@pytest.mark.parametrize("survivors", ["all", "best"])
-def test_it_is_one_bc_loss_per_kind(continuous, reduction, survivors):
+def test_it_is_one_bc_loss_per_kind(continuous, reduction):
     td = batch(30, continuous=continuous)
     actor = gaussian_actor() if continuous else categorical_actor()
-    loss = DistillationLoss(actor, rollout_weight=2.0, survivors=survivors, reduction=reduction)
+    loss = DistillationLoss(actor, reduction=reduction)
     out = loss(td)
     expert, rollout = td[VALID] & ~td[ROLLOUT], td[VALID] & td[ROLLOUT]
-    if survivors == "best":
-        rollout = rollout & (td[RANK] == 0)
     assert 0 < expert.sum() < rollout.sum()
     parts = [bc(actor, td, mask, reduction=reduction) for mask in (expert, rollout)]
-    torch.testing.assert_close(out["loss_distillation"], parts[0] + 2.0 * parts[1])
+    torch.testing.assert_close(out["loss_distillation"], parts[0] + parts[1])
     torch.testing.assert_close(out["nll_expert"], bc(actor, td, expert).detach())
     torch.testing.assert_close(out["nll_rollout"], bc(actor, td, rollout).detach())
     if not continuous:
@@ -103,36 +99,23 @@ def test_by_hand():
         actor[0].module.bias.copy_(torch.tensor([0.5, 0.25, 0.125, 0.125]).log())
     td = TensorDict(x=torch.zeros(6, 1), a=torch.tensor([0, 1, 1, 3, 0, 0]), batch_size=[6])
     td["rollout"] = torch.tensor([False, False, True, True, True, True])
-    td["rank"] = torch.tensor([7, 7, 0, 0, 1, 0])
     td["valid"] = torch.tensor([True, True, True, True, True, False])
-    keys = {"action": "a", "valid": "valid", "rollout": "rollout", "rank": "rank"}
-    for survivors, bits in (("all", (2 + 3 + 1) / 3), ("best", (2 + 3) / 2)):
-        loss = DistillationLoss(actor, rollout_weight=0.5, survivors=survivors)
-        loss.set_keys(**keys)
-        out = loss(td)
-        expected = torch.tensor([1.5 + 0.5 * bits, 1.5, bits]) * torch.tensor(2.0).log()
-        got = torch.stack([out["loss_distillation"], out["nll_expert"], out["nll_rollout"]])
-        torch.testing.assert_close(got, expected)
-        assert out["accuracy"] == 0.5
-
-
-def test_the_best_survivors_are_those_filtered_by_hand():
-    td = batch(40)
-    kept = td[~td[ROLLOUT][:, 0] | (td[RANK][:, 0] == 0)]
-    actor = categorical_actor()
-    best = DistillationLoss(actor, survivors="best")(td)
-    by_hand = DistillationLoss(actor, survivors="all")(kept.exclude(RANK))
-    for key in best.keys():  # noqa: SIM118 - a TensorDict
-        torch.testing.assert_close(best[key], by_hand[key])
+    loss = DistillationLoss(actor)
+    loss.set_keys(action="a", valid="valid", rollout="rollout")
+    out, bits = loss(td), (2 + 3 + 1) / 3
+    expected = torch.tensor([1.5 + bits, 1.5, bits]) * torch.tensor(2.0).log()
+    got = torch.stack([out["loss_distillation"], out["nll_expert"], out["nll_rollout"]])
+    torch.testing.assert_close(got, expected)
+    assert out["accuracy"] == 0.5
 
 
 def test_without_reduction_it_keeps_the_shape():
     td = batch(6, 5)
-    loss = DistillationLoss(categorical_actor(), rollout_weight=3.0, reduction="none", label_smoothing=0.2)
+    loss = DistillationLoss(categorical_actor(), reduction="none", label_smoothing=0.2)
     out = loss(td)
     plain = bc(categorical_actor(), td, td[VALID], reduction="none", label_smoothing=0.2)
     assert {value.shape for value in out.values()} == {td[VALID].shape}
-    torch.testing.assert_close(out["loss_distillation"], torch.where(td[ROLLOUT], 3.0, 1.0) * plain)
+    torch.testing.assert_close(out["loss_distillation"], plain)
     nll = bc(categorical_actor(), td, td[VALID], reduction="none").detach()
     torch.testing.assert_close(out["nll_expert"] + out["nll_rollout"], nll)
     assert (out["nll_expert"][td[ROLLOUT]] == 0).all()
@@ -151,8 +134,8 @@ def test_a_kind_that_is_absent_adds_nothing(absent):
     td = batch(10)
     td[ROLLOUT] = torch.full_like(td[ROLLOUT], not absent)
     actor = categorical_actor()
-    out = DistillationLoss(actor, rollout_weight=2.0)(td)
-    torch.testing.assert_close(out["loss_distillation"], (1.0 if absent else 2.0) * bc(actor, td, td[VALID]))
+    out = DistillationLoss(actor)(td)
+    torch.testing.assert_close(out["loss_distillation"], bc(actor, td, td[VALID]))
     td[VALID] = torch.zeros_like(td[VALID])
     loss = DistillationLoss(actor)(td)["loss_distillation"]
     assert loss == 0
@@ -165,12 +148,11 @@ def test_what_padded_agents_hold_has_no_influence():
     dirty = td.clone()
     dirty[ACTION] = torch.where(td[VALID], td[ACTION], -1)
     dirty[ROLLOUT] = td[ROLLOUT] ^ ~td[VALID]
-    dirty[RANK] = torch.where(td[VALID], td[RANK], 0)
     dirty[OBSERVATION] = torch.where(td[VALID][..., None], td[OBSERVATION], 1e4)
     results = []
     for data in (td, dirty):
         actor = categorical_actor()
-        out = DistillationLoss(actor, survivors="best")(data)
+        out = DistillationLoss(actor)(data)
         out["loss_distillation"].backward()
         results.append([*(v.detach() for v in out.values()), *(p.grad for p in actor.parameters())])
     for a, b in zip(*results, strict=True):
@@ -178,14 +160,11 @@ def test_what_padded_agents_hold_has_no_influence():
 
 
 @pytest.mark.parametrize("continuous", [False, True])
-@pytest.mark.parametrize("survivors", ["all", "best"])
-def test_it_keeps_the_contract_of_torchrl(continuous, survivors):
+def test_it_keeps_the_contract_of_torchrl(continuous):
     actor = gaussian_actor if continuous else categorical_actor
     td = batch(20, continuous=continuous)
-    if survivors == "all":
-        td = td.exclude(RANK)
     check_contract(
-        lambda: DistillationLoss(actor(), survivors=survivors, use_mask=True),
+        lambda: DistillationLoss(actor(), use_mask=True),
         td,
         "loss_distillation",
         parameters=2 if continuous else 4,
@@ -195,9 +174,6 @@ def test_it_keeps_the_contract_of_torchrl(continuous, survivors):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"rollout_weight": -1.0}, "rollout_weight must be"),
-        ({"rollout_weight": float("nan")}, "rollout_weight must be"),
-        ({"survivors": "some"}, "unknown survivors"),
         ({"reduction": "median"}, "unknown reduction"),
         ({"label_smoothing": 1.0}, "label_smoothing must be in"),
     ],
@@ -207,17 +183,8 @@ def test_bad_arguments_are_refused(arguments, message):
         DistillationLoss(categorical_actor(), **arguments)
 
 
-def test_rollouts_of_no_weight_leave_the_loss_of_the_experts():
-    td = batch(5)
-    found = DistillationLoss(categorical_actor(), rollout_weight=0.0)(td)
-    torch.testing.assert_close(found["loss_distillation"], found["nll_expert"])
-
-
 def test_bad_inputs_are_refused():
-    loss, td = DistillationLoss(categorical_actor(), survivors="best"), batch(5)
-    td[RANK] = td[RANK][:, :1]
-    with pytest.raises(ValueError, match=r"rank .* has shape \(5, 1\).*\(5, 3\)"):
-        loss(td)
+    loss, td = DistillationLoss(categorical_actor()), batch(5)
     td[ROLLOUT] = td[ROLLOUT].long()
     with pytest.raises(ValueError, match=r"rollout flag .* is torch.int64"):
         loss(td)

@@ -25,7 +25,7 @@ from symphony.envs import DrivingEnv, collate, scene
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
 from symphony.simulation.demonstrations import SceneDataset
 
-BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.RANK, keys.NOISE_PLAN}
+BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.NOISE_PLAN}
 """What depends on how batches are put together; the first three must be there, the last is optional."""
 
 
@@ -43,8 +43,8 @@ def spec_of(method: str, dataset: SceneDataset) -> AgentSpec:
         action_space="displacement" if method == "mgail_ts_h" else "bicycle",
         dt=dataset.dt,
         goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        agent=AgentConfig(num_points=12, hidden=8),
+        discriminator=DiscriminatorConfig(hidden=8),
         searches=True,
     )
 
@@ -82,7 +82,7 @@ def batch(env: DrivingEnv) -> TensorDict:
     td = env.rand_action(td)
     td[keys.ROLLOUT] = torch.rand(valid.shape) < 0.5
     td[keys.SIMULATED] = torch.rand(valid.shape) < 0.5
-    return td.set(keys.RANK, torch.zeros_like(valid, dtype=torch.int64))
+    return td
 
 
 METHODS = ("bc_ts_h", "mgail_ts_h")

@@ -112,7 +112,7 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
     torch.testing.assert_close(make(env, cost=cost, reduction="sum")(td)["loss_mgail"], costs[counted].sum())
 
 
-@pytest.mark.parametrize("arguments", [{}, {"cost": "logit", "checkpoint": 2}])
+@pytest.mark.parametrize("arguments", [{}, {"cost": "logit"}])
 def test_gradients_by_differences(env, arguments):
     td, loss, eps = planned(env, steps=5), make(env, **arguments), 1e-6
     pairs = list(zip(loss.parameters(), value_and_gradient(loss, td)[1], strict=True))
@@ -142,13 +142,12 @@ def test_gradients_of_final_states_by_differences():
     assert torch.autograd.gradcheck(final, actions.requires_grad_(), fast_mode=True)
 
 
-@pytest.mark.parametrize("checkpoint", [0, 2])
-def test_only_the_actor_receives_a_gradient(env, checkpoint):
+def test_only_the_actor_receives_a_gradient(env):
     policy, network = actor(), realism()
     before = list(network.parameters())
     td = planned(env)
     kept = td.clone()
-    loss = MGAILLoss(policy, network, env, checkpoint=checkpoint)
+    loss = MGAILLoss(policy, network, env)
     assert {id(p) for p in loss.parameters()} == {id(p) for p in policy.parameters()}
     loss(td)["loss_mgail"].backward()
     assert all(p.grad is not None and p.grad.norm() > 0 for p in policy.parameters())
@@ -161,33 +160,7 @@ def test_only_the_actor_receives_a_gradient(env, checkpoint):
     assert any(p.grad is not None for p in network.parameters())
 
 
-@pytest.mark.parametrize("more", [{}, {"truncate": 2, "detach_keys": SEEN}, {"truncate": 3}])
-def test_checkpoints_change_nothing(env, more):
-    for td, checkpoints in ((planned(env), (0, 1, 4)), (env.start(torch.tensor([0, 1])), (0, 2))):
-        found = []
-        for checkpoint in checkpoints:
-            torch.manual_seed(3)  # draws where there is no plan
-            found.append(value_and_gradient(make(env, horizon=STEPS, checkpoint=checkpoint, **more), td))
-            assert_same(found[0], found[-1], rtol=1e-9, atol=1e-12)
-
-
-def test_checkpoints_keep_less_for_the_backward_pass(env):
-    kept = []
-    for checkpoint in (0, 2):
-        loss, seen = make(env, checkpoint=checkpoint), {}
-
-        def keep(tensor, seen=seen):
-            seen[tensor.untyped_storage().data_ptr()] = (tensor.untyped_storage().nbytes(), tensor)
-            return tensor
-
-        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            loss(planned(env))
-        kept.append(sum(size for size, _ in seen.values()))
-    assert kept[1] < 0.2 * kept[0]
-
-
-@pytest.mark.parametrize("checkpoint", [0, 2])
-def test_cut_at_every_step_it_is_the_sum_of_single_steps(env, checkpoint):
+def test_cut_at_every_step_it_is_the_sum_of_single_steps(env):
     td = planned(env)
     with torch.no_grad():
         states, _ = by_hand(env, actor(), realism(), td)
@@ -195,7 +168,7 @@ def test_cut_at_every_step_it_is_the_sum_of_single_steps(env, checkpoint):
     ones = (states[t].copy().set(PLAN, td[PLAN][:, t : t + 1]) for t in range(STEPS))
     parts = [value_and_gradient(single, one) for one in ones]
     total = sum(part[0] for part in parts), [sum(g) for g in zip(*(p[1] for p in parts), strict=True)]
-    cut = make(env, reduction="sum", truncate=1, checkpoint=checkpoint)
+    cut = make(env, reduction="sum", truncate=1)
     assert_same(value_and_gradient(cut, td), total)
     # Cut less often, the steps between are connected.
     whole = value_and_gradient(make(env, reduction="sum"), td)
@@ -266,9 +239,8 @@ def test_without_given_numbers_it_draws_anew(env):
     assert first == loss(used)["loss_mgail"] != second
 
 
-@pytest.mark.parametrize("checkpoint", [0, 2])
-def test_the_environment_may_change_between_calls(env, checkpoint):
-    other, loss = world(3, 3), make(env, checkpoint=checkpoint)
+def test_the_environment_may_change_between_calls(env):
+    other, loss = world(3, 3), make(env)
     expected = value_and_gradient(make(env), planned(env))
     value = loss(planned(env))["loss_mgail"]
     loss.env = other
@@ -298,7 +270,7 @@ def walkers(agents, **arguments):
 
 
 @pytest.mark.parametrize("agents", [1, 2])
-@pytest.mark.parametrize("arguments", [{}, {"checkpoint": 1, "truncate": 2, "reduction": "none"}])
+@pytest.mark.parametrize("arguments", [{}, {"truncate": 2, "reduction": "none"}])
 def test_it_keeps_the_contract_of_torchrl(agents, arguments):
     td = starts(Walk(agents), 5, branches=1)[:, 0]
     td[VALID] = torch.ones(5, agents, dtype=torch.bool)
@@ -320,7 +292,7 @@ def test_copies_have_a_discriminator_of_their_own(env):
         torch.equal(*pair)
         for pair in zip(loss.discriminator.parameters(), realism().parameters(), strict=True)
     )
-    assert set(loss.state_dict()) == set(make(env, checkpoint=3).state_dict())
+    assert set(loss.state_dict()) == set(make(env).state_dict())
     assert len(list(loss.parameters())) == len(list(actor().parameters()))
 
 
@@ -348,7 +320,7 @@ def test_bad_calls_are_refused(env):
         make(env)(td.exclude(PLAN))
     with pytest.raises(ValueError, match="no environment"):
         MGAILLoss(actor(), realism())(td)
-    for bad in ({"cost": "d"}, {"horizon": -1}, {"truncate": -1}, {"checkpoint": -1}, {"reduction": "max"}):
+    for bad in ({"cost": "d"}, {"horizon": -1}, {"truncate": -1}, {"reduction": "max"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             make(env, **bad)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,10 +17,9 @@ from symphony.envs import Bicycle, Displacement
 from symphony.envs.dynamics import bicycle_step
 from symphony.envs.observation import ObservationConfig
 from symphony.geometry.frames import rotate, wrap
-from symphony.simulation import SceneDataset
+from symphony.simulation import SceneDataset, demonstrations, perturbation
 from symphony.simulation.perturbation import displaced, perturbed, way_back
 
-NOWHERE = PerturbConfig(share=1.0, along=0, across=0, heading=0, speed=0)
 DT, LENGTH = 0.2, torch.tensor([4.5], dtype=torch.float64)
 
 
@@ -86,7 +86,7 @@ def test_a_label_brakes_and_turns_as_the_way_back_does(
 def test_turning_the_world_turns_the_way_back(seed: int, angle: float) -> None:
     rng = torch.Generator().manual_seed(seed)
     log = drive(8.0, 0.3, 0.02, 1)
-    start = displaced(log[:1], PerturbConfig(share=1.0), rng)
+    start = displaced(log[:1], rng)
     turned = torch.tensor(angle, dtype=torch.float64)
 
     def turn(state: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ def test_turning_the_world_turns_the_way_back(seed: int, angle: float) -> None:
 def test_slow_vehicles_are_not_put_sideways_and_none_goes_backwards() -> None:
     rng = torch.Generator().manual_seed(0)
     standing = torch.zeros(500, 4)
-    found = displaced(standing, PerturbConfig(share=1.0), rng)
+    found = displaced(standing, rng)
     assert (found[:, 1:3] == 0).all()
     assert (found[:, 3] >= 0).all()
     assert (found[:, 3] > 0).any()
@@ -114,14 +114,14 @@ def test_a_share_is_displaced_and_the_rest_left_as_it_was() -> None:
         action = torch.zeros(4000, dtype=torch.int64) if dynamics.discrete else torch.zeros(4000, 2)
         given_ = (log[:1].expand(4000, 4), log[1:].expand(4000, 4), torch.tensor([4.5, 2.0]).expand(4000, 2))
         rng = torch.Generator().manual_seed(1)
-        start, label = perturbed(state, action, *given_, dynamics, DT, PerturbConfig(share=0.25), rng)
+        start, label = perturbed(state, action, *given_, dynamics, DT, 0.25, rng)
         same = (start == state).all(-1)
         assert 0.7 < same.float().mean() < 0.8
         assert (label[same] == action[same]).all()
         assert label.dtype == action.dtype
 
 
-def test_training_batches_are_the_log_unless_displaced() -> None:
+def test_training_batches_are_the_log_unless_displaced(monkeypatch: pytest.MonkeyPatch) -> None:
     store = SegmentStore(builtin_store("train"))
     data = SceneDataset(store, 2, Bicycle(num_acceleration=21), routes=True)
     sees = ObservationConfig(num_points=16)
@@ -132,7 +132,11 @@ def test_training_batches_are_the_log_unless_displaced() -> None:
         return drawn["agents", "state"], drawn["agents", "action"]
 
     plain, action = batch(None)
-    still, label = batch(NOWHERE)
+    with monkeypatch.context() as nowhere:
+        nowhere.setattr(demonstrations, "AHEAD", 0.0)
+        for name in ("ASIDE", "TURNED", "FASTER"):
+            nowhere.setattr(perturbation, name, 0.0)
+        still, label = batch(PerturbConfig(share=1.0))
     # Not displaced, an expert is where the log is, not where the fit is: centimetres apart.
     assert (plain[..., :2] - still[..., :2]).norm(dim=-1).median() < 0.1
     levels, _ = Bicycle(num_acceleration=21).grid(torch.zeros(1))

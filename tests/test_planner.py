@@ -116,14 +116,6 @@ SEARCHES: list[dict[str, Any]] = [
     {"search": "none"},
     {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5},
     {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2},
-    {
-        "search": "tree",
-        "branches": 6,
-        "rule": "best",
-        "prune_every": 4,
-        "retries": 2,
-        "retry_above": -100.0,
-    },
     {"search": "oracle", "branches": 4},
     {"search": "best", "branches": 2},
 ]
@@ -142,28 +134,9 @@ def test_planners_are_forked_with_their_branches(settings: dict[str, Any]) -> No
         assert (parents != torch.arange(6)).any(), "nobody was forked"
 
 
-@pytest.mark.parametrize("make", [Wanderer, odd([0.0] * 3)], ids=["copied", "failed"])
-def test_planners_of_branches_that_come_again_are_not_all_there_are(make: Any) -> None:
-    settings: dict[str, Any] = {"search": "tree", "branches": 6, "rule": "replace", "prune_every": 4}
-    once = simulated(make, **settings).search
-    found = simulated(make, retries=2, retry_above=float(once.totals.median()), **settings)
-    assert 1 < found.search.simulated_steps / once.simulated_steps < 3
-    assert [set(each) for each in found.failed] == [set() if make is Wanderer else set(range(4))] * 2
-
-
 def test_planners_that_share_their_memory_are_taken_for_another() -> None:
     found = simulated(Shared, search="tree", branches=6, rule="best", prune_every=5)
     assert any("taken for another" in why for each in found.failed for why in each.values())
-
-
-def test_without_a_search_there_is_nothing_to_repeat() -> None:
-    once, repeated = (
-        simulated(odd([0.0] * 3), count=1, rollouts=2, retries=retries, retry_above=0.0) for retries in (0, 2)
-    )
-    assert torch.equal(once.rollouts.state, repeated.rollouts.state)
-    assert set(repeated.failed[0]) == {0, 1}
-    assert repeated.failed == once.failed
-    assert simulated(Locked, count=1, rollouts=2, retries=2).failed == ({},)
 
 
 def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
@@ -377,23 +350,20 @@ def loaded() -> Agent:
 @given(
     runs=st.integers(1, 300),
     segments=st.integers(1, 600),
-    search=st.sampled_from(["none", "tree", "best", "tilted"]),
+    search=st.sampled_from(["none", "tree", "best"]),
     trees=st.sampled_from([1, 2, 16]),
 )
 def test_runs_are_spread_over_as_many_segments_as_there_are(
     runs: int, segments: int, search: str, trees: int
 ) -> None:
-    agent, tilt = loaded(), search == "tilted"
-    config = EvaluateConfig(
-        search="tree" if tilt else search, trees=trees, tilt=float(tilt), rule="systematic"
-    )  # type: ignore[arg-type]
-    config = dataclasses.replace(config, branches=16 // trees if tilt else 0)
+    agent = loaded()
+    config = EvaluateConfig(search=search, trees=trees, rule="systematic")  # type: ignore[arg-type]
     count, how = spread_runs(agent, config, runs, segments)
     trees_of, _, taken = planned_trees(agent, how)  # refuses what can't be simulated
     assert 1 <= count <= segments
     assert trees_of * taken == how.rollouts
     assert runs <= count * how.rollouts
-    if not tilt and (search == "none" or trees == 1):
+    if search == "none" or trees == 1:
         # No fewer rollouts of each would do, but for runs that come out exactly: less than twice as many.
         least = -(-runs // segments)
         assert least <= how.rollouts

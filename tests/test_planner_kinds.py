@@ -18,6 +18,7 @@ from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
+from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.planners import planner_record, read_planner_record, run_score, winners
@@ -336,8 +337,22 @@ def test_a_first_place_is_clear_only_beyond_two_standard_errors() -> None:
 
 def test_damaged_records_of_planners_are_named(tmp_path: Path) -> None:
     file = tmp_path / "record.json"
-    whole = json.loads((Path(__file__).parents[1] / "results/planners/0-log-idm.json").read_text())
-    file.write_text(json.dumps(whole))
+    data = str(builtin_store("test"))
+    words = [
+        "--data",
+        data,
+        "--segments",
+        "0",
+        "1",
+        "--rollouts",
+        "1",
+        "--duration",
+        "2",
+        "--json",
+        str(file),
+    ]
+    assert main(["evaluate", "playback", "--planner", "idm", *words]) == 0
+    whole = json.loads(file.read_text())
     assert read_planner_record(file) == whole
     runs = whole["per_run"]
     for field, value in (

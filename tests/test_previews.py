@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,14 @@ from symphony.training.previews import QUANTILES, ROLLOUTS, Preview, samples_of
 MOTIONS = ("speed", "acceleration", "turn")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few() -> Iterator[None]:
+    """Two run segments are shown."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("symphony.training.previews.SEGMENTS", 2)
+        yield
+
+
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "train"
@@ -53,7 +62,7 @@ def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(store: Path, out: Path, every: int, method: Any = "bc", **changes: Any) -> TrainConfig:
-    return tiny(method, store, out, preview=PreviewConfig(every=every, segments=2), **changes)
+    return tiny(method, store, out, preview=PreviewConfig(every=every), **changes)
 
 
 def media(run: Path) -> list[str]:
@@ -104,8 +113,7 @@ def test_runs_shorter_than_that_and_others_show_nothing(store: Path, tmp_path: P
 def test_being_watched_changes_nothing(
     store: Path, held_out: Path, tmp_path: Path, method: str, validated: bool
 ) -> None:
-    noisy = replace(tiny(method, store, tmp_path).discriminator, instance_noise=0.1)
-    changes = {"discriminator": noisy, "validation": ValidationConfig(data=held_out if validated else None)}
+    changes = {"validation": ValidationConfig(data=held_out if validated else None)}
     changes["validation"] = replace(changes["validation"], rollouts=2)
     blind, watched = (
         train(config(store, tmp_path / str(every), every, method, **changes)) for every in (0, 2)
@@ -287,12 +295,11 @@ def test_weights_and_biases_gets_video_and_histograms(
 
 
 def test_settings_are_checked_and_read_back(store: Path, tmp_path: Path) -> None:
-    for bad in ({"every": -1}, {"segments": 0}):
-        with pytest.raises(ConfigError):
-            PreviewConfig(**bad)
+    with pytest.raises(ConfigError):
+        PreviewConfig(every=-1)
     file = tmp_path / "config.json"
     file.write_text(to_json(config(store, tmp_path, 7)))
-    assert read_json(TrainConfig, file).preview == PreviewConfig(every=7, segments=2)
+    assert read_json(TrainConfig, file).preview == PreviewConfig(every=7)
     saved = json.loads(file.read_text())
     del saved["preview"]
     file.write_text(json.dumps(saved))

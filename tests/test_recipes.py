@@ -22,8 +22,6 @@ TINY = [
     "16",
     "--agent.hidden",
     "8",
-    "--agent.head",
-    "8",
     "--agent.num-points",
     "10",
 ]
@@ -40,8 +38,6 @@ SEARCH = [
     "--checkpoint-every",
     "2",
     "--search.states",
-    "8",
-    "--discriminator.states",
     "8",
 ]
 ADVERSARIAL = [

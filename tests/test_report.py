@@ -351,17 +351,6 @@ def test_a_recording_without_a_number_is_no_sample_of_it() -> None:
     assert (total_numbers(rows)["progress"], total_numbers(rows)["progress_se"]) == (4.0, pytest.approx(1.0))
 
 
-@pytest.mark.parametrize("shift", [0.0, 900.0, -900.0])
-def test_only_the_ratios_of_weights_matter(shift: float) -> None:
-    rows = [
-        made_row(name, collision=hit, log_weight=shift + math.log(weight))
-        for name, hit, weight in (("a", True, 1.0), ("b", False, 3.0))
-    ]
-    totals = total_numbers(rows)
-    assert totals["untilted_collision_rate"] == pytest.approx(25.0)
-    assert totals["effective_runs"] == pytest.approx(1.6)
-
-
 def test_contacts_are_those_that_the_simulation_flagged() -> None:
     """Of the included agent, and of the log: no collision of the flags is missing or made up."""
     _, found = searched()

@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
 from symphony.agents import Agent, build_agent
-from symphony.collectors import Aggregate, BeamSearchResult, KeepAll, KeepBest, beam_search
+from symphony.collectors import BeamSearchResult, KeepAll, KeepBest, beam_search, max_then_sum
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
@@ -33,12 +33,11 @@ from symphony.simulation import simulate
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import simulated, simulation
 from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of
-from symphony.simulation.search import AGGREGATES, ENDED, flag_score, search
+from symphony.simulation.search import ENDED, flag_score, search
 
 EVERY = 2
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=EVERY)
 KINDS = ("none", "tree", "oracle", "best")
-at_the_end = Aggregate("last")
 
 
 def make_agent(seed: int = 0, discriminator: int = 0, **changes: Any) -> Agent:
@@ -47,8 +46,8 @@ def make_agent(seed: int = 0, discriminator: int = 0, **changes: Any) -> Agent:
         action_space="bicycle",
         dt=0.2,
         goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        agent=AgentConfig(num_points=12, hidden=8),
+        discriminator=DiscriminatorConfig(hidden=8),
         searches=True,
         search=SEARCH,
     )
@@ -258,22 +257,18 @@ def test_no_rollout_depends_on_the_order_of_segments(dataset: SceneDataset, agen
         assert torch.equal(a[real], b[real])
 
 
-@pytest.mark.parametrize("name", AGGREGATES)
-def test_totals_are_the_same_bits_beside_any_padding(name: str) -> None:
+def test_totals_are_the_same_bits_beside_any_padding() -> None:
     scores = torch.randn(3, 4, 5, 31, generator=torch.Generator().manual_seed(0))
-    total = AGGREGATES[name](scores)
+    total = max_then_sum(scores)
     for more in range(1, 34):
-        assert torch.equal(AGGREGATES[name](torch.nn.functional.pad(scores, (0, more))), total)
+        assert torch.equal(max_then_sum(torch.nn.functional.pad(scores, (0, more))), total)
 
 
-@pytest.mark.parametrize(
-    ("rule", "trees", "aggregate"),
-    [("replace", 1, "max_then_sum"), ("replace", 2, "mean_then_sum"), ("best", 2, "mean_then_sum")],
-)
+@pytest.mark.parametrize(("rule", "trees"), [("replace", 1), ("replace", 2), ("best", 2)])
 def test_longer_segments_beside_it_choose_no_leaves(
-    dataset: SceneDataset, agent: Agent, rule: Any, trees: int, aggregate: str
+    dataset: SceneDataset, agent: Agent, rule: Any, trees: int
 ) -> None:
-    agent = searching(agent, rule=rule, aggregate=aggregate, threshold=0.1)
+    agent = searching(agent, rule=rule, threshold=0.1)
     config = EvaluateConfig(rollouts=4, trees=trees)
     scenes = dataset.scenes(range(4))
     together = simulation(agent, scenes, config)
@@ -310,7 +305,6 @@ def test_leaves_are_chosen_in_the_period_in_which_a_scene_ends(
 
 
 def test_the_best_is_the_best_up_to_the_end(dataset: SceneDataset, agent: Agent) -> None:
-    agent = searching(agent, aggregate=f"{__name__}:at_the_end")
     config = EvaluateConfig(search="best", rollouts=2)
     together = simulated(agent, dataset.scenes(range(4)), config)
     for item in range(4):
@@ -365,30 +359,6 @@ def test_the_evaluation_decides_the_pruning(
     found = simulated(agent, scenes, replace(config, **changes))
     assert same(found, simulated(trained, scenes, config))
     assert not same(found, simulated(agent, scenes, config))
-
-
-def test_what_nobody_needs_is_not_repeated(dataset: SceneDataset, agent: Agent) -> None:
-    scenes, config = (
-        dataset.scenes(range(4)),
-        EvaluateConfig(search="tree", rollouts=4, retries=1, retry_above=1e9),
-    )
-    assert same(simulated(agent, scenes, config), simulated(agent, scenes, replace(config, retries=0)))
-
-
-def test_repeated_periods_lower_the_score(env: DrivingEnv, agent: Agent) -> None:
-    start = start_of(env, 4)
-    once = look(env, agent, start)
-    above = float(once.totals[:, 0].median())
-    twice = look(env, agent, start, retries=1, retry_above=above)
-    first_once, first_twice = once.totals[:, 0], twice.totals[:, 0]
-    assert (first_twice <= first_once).all()
-    assert (first_twice < first_once).any()
-    assert torch.equal(first_twice[first_once <= above], first_once[first_once <= above])
-    # Whatever was taken is a history of its own: the scores are those of the states.
-    found = rollouts_of(env, start, twice.trajectories)
-    counted = found.counted.any(-1)
-    expected = scored(env, agent, start, found.state)
-    torch.testing.assert_close(twice.scores[counted], expected[counted], atol=1e-6, rtol=1e-5)
 
 
 def test_trees_differ_from_each_other(dataset: SceneDataset, agent: Agent) -> None:

@@ -37,8 +37,8 @@ def agent() -> Agent:
         action_space="bicycle",
         dt=0.2,
         goals=True,
-        agent=AgentConfig(num_objects=4, num_points=12, hidden=8, head=8),
-        discriminator=DiscriminatorConfig(hidden=8, head=8),
+        agent=AgentConfig(num_points=12, hidden=8),
+        discriminator=DiscriminatorConfig(hidden=8),
         searches=True,
         search=SearchConfig(test_branches=BRANCHES, prune_every=2),
     )

@@ -268,7 +268,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     with StoreWriter(folder / "test") as writer:
         writer.append(straight_road(4, seed=1, steps=8))
         writer.append(crossing(4, seed=1, steps=8))
-    small = AgentConfig(hidden=8, head=8, num_points=10)
+    small = AgentConfig(hidden=8, num_points=10)
     config = TrainConfig(
         method="bc",
         data=folder / "test",

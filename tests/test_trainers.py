@@ -42,7 +42,7 @@ from symphony.simulation.experts import experts
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 from symphony.training.logging import read_metrics
 
-TINY = AgentConfig(num_objects=4, num_points=20, hidden=8, head=16)
+TINY = AgentConfig(num_points=20, hidden=8)
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +251,7 @@ def test_command_line_trains_and_evaluates(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, file, picture = tmp_path / "run", tmp_path / "numbers.json", tmp_path / "rollouts.png"
-    small = ["--agent.hidden", "8", "--agent.head", "8", "--agent.num-points", "20", "--wandb", "disabled"]
+    small = ["--agent.hidden", "8", "--agent.num-points", "20", "--wandb", "disabled"]
     command = ["train", "bc", "--data", store, "--out", out, "--steps", "3", "--seed", "4", *small]
     assert main([str(c) for c in command]) == 0
     command = ["evaluate", out, "--data", store, "--json", file, "--figure", picture, "--rollouts", "2"]

@@ -209,7 +209,7 @@ def test_an_agent_that_searches_otherwise_is_another_simulation(store: Path, run
     assert told(*command)[0] == 0
     file = Path("own/agent.json")
     spec = json.loads(file.read_text())
-    spec["search"]["keep"] = 0.25
+    spec["search"]["threshold"] = 0.25
     file.write_text(json.dumps(spec))
     code, words = told(*command)
     assert (code, "differs in settings.specification" in words) == (1, True)
@@ -392,7 +392,7 @@ def test_of_two_planners_the_better_one_is_better_where_both_drove() -> None:
     assert "20.0 above quick, in the 1 segments that both drove" in sentence
 
 
-@pytest.mark.parametrize("changes", [{}, {"search": "oracle"}, {"retries": 1, "retry_above": -50.0}])
+@pytest.mark.parametrize("changes", [{}, {"search": "oracle"}])
 def test_the_tree_that_is_drawn_is_the_one_that_is_simulated(
     store: Path, run: Path, tmp_path: Path, changes: dict[str, Any]
 ) -> None:

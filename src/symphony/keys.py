@@ -58,8 +58,6 @@ SIMULATED: Key = ("agents", "simulated")
 """[..., N] bool: the state comes from a simulation, not from the log."""
 ROLLOUT: Key = ("agents", "rollout")
 """[..., N] bool: the action comes from a rollout that survived the search, not from the log."""
-RANK: Key = ("agents", "rank")
-"""[..., N] int64: place of the rollout among those of its tree, 0 for the best."""
 
 OWN: Key = ("agents", "observation", "own")
 """[..., N, Fs] float."""
@@ -82,9 +80,7 @@ LIGHTS: Key = ("agents", "observation", "lights")
 LIGHTS_MASK: Key = ("agents", "observation", "lights_mask")
 ROAD: Key = ("agents", "observation", "road")
 """[..., N, 5] float: signed distance of box centre and corners to the edge of the road, metres, positive off it."""
-ROAD_AHEAD: Key = ("agents", "observation", "road_ahead")
-"""[..., N, H] float: that of the centre at some times ahead, were it to keep speed and course."""
-SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE, GAP, GAP_AHEAD, ALONG, LIGHTS, ROAD, ROAD_AHEAD)
+SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE, GAP, GAP_AHEAD, ALONG, LIGHTS, ROAD)
 """What an agent observes and could react to."""
 
 ROUTES: Key = ("agents", "routes")

@@ -8,10 +8,30 @@ layout, process or device.
 from __future__ import annotations
 
 import hashlib
+from enum import IntEnum, unique
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+
+@unique
+class Stream(IntEnum):
+    """What draws from a stream of its own, derived from that of a scene or a rollout.
+
+    The numbers lie far above those of rollouts, branches and agents, which are counted from 0 and fold into the same
+    streams. A number stays with its use, or a seed would give other rollouts: 2 belonged to a use that is gone.
+    """
+
+    GOALS = 1 << 40
+    """Routes of the agents of a scene."""
+    PRUNING = (1 << 40) + 1
+    """Which branches go on."""
+    PLANNERS = (1 << 40) + 3
+    """Seeds of the planners of egos."""
+    PERSONAS = (1 << 40) + 4
+    """Styles of driving."""
+
 
 # SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.
 _GAMMA = 0x9E3779B97F4A7C15

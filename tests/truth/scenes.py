@@ -249,7 +249,7 @@ def manoeuvres() -> list[Case]:
         Case(
             "the ego evades an oncoming one to the right",
             "it leaves its lane, but on the other side",
-            ego(10.0, aside=(1.0, 2.0, -0.6), turned=False),
+            ego(10.0, aside=(1.0, 2.0, -1.6), turned=False),
             (car(120, OWN, 10.0, math.pi),),
             hit("oncoming", False, (80 - 4.5) / 20),
         ),

@@ -15,6 +15,8 @@ from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES
 from symphony.imports import build_object, load_object
 from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder
 
+RADIUS = 20.0
+"""Metres around an agent that its discriminator observes."""
 PERSONAS = 1024
 """Personas kept with an agent, to be drawn from."""
 
@@ -37,9 +39,8 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         discriminator: whether the discriminator looks too; clearances are costly, and only it reads them.
     """
     features = spec.discriminator.features if discriminator and spec.discriminator is not None else "paper"
-    gaps, road = spec.agent.features != "paper", spec.agent.features == "road"
+    gaps = spec.agent.features != "paper"
     return ObservationConfig(
-        num_objects=spec.agent.num_objects,
         num_points=spec.agent.num_points,
         num_lights=spec.agent.num_lights,
         route=spec.goals,
@@ -47,7 +48,6 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         along=gaps and spec.goals,
         gaps=gaps,
         persona=spec.agent.persona,
-        road=road,
         clearance=features != "paper",
         foresight=FORESIGHT if gaps or features == "foresight" else (),
     )
@@ -84,14 +84,11 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
 def _policy(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     sizes: dict[str, Any] = {
         "hidden": spec.agent.hidden,
-        "head": (spec.agent.head, spec.agent.head),
+        "head": (2 * spec.agent.hidden, 2 * spec.agent.hidden),
         "own_keys": (*_own_keys(spec), keys.PERSONA) if spec.agent.persona else _own_keys(spec),
-        "road_keys": (keys.ROAD, keys.ROAD_AHEAD) if spec.agent.features == "road" else (),
         "encoder": _encoder(spec),
     }
-    # Two of each distance: of the centre, of four corners, and of the centre at each time ahead.
-    own = _own_features(spec) + 2 * (5 + len(FORESIGHT)) * (spec.agent.features == "road")
-    own += 2 * spec.agent.persona
+    own = _own_features(spec) + 2 * spec.agent.persona
     dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
         return modules.discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
@@ -117,18 +114,17 @@ def discriminator_network(spec: AgentSpec) -> TensorDictModule:
     config = spec.discriminator
     if config is None:
         raise ValueError("the specification has no discriminator")
-    if config.network not in ("paper", "split"):
+    if config.network != "paper":
         return build_object(config.network, spec)
     return modules.discriminator(
         _own_features(spec),
         OBJECT_FEATURES,
         POINT_FEATURES,
         own_keys=_own_keys(spec),
-        radius=config.radius / observation_of(spec).distance_scale,
+        radius=RADIUS / observation_of(spec).distance_scale,
         hidden=config.hidden,
-        head=(config.head,),
+        head=(2 * config.hidden,),
         features=config.features,
-        split=config.network == "split",
     )
 
 

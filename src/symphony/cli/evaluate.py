@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -50,11 +50,6 @@ class Evaluate:
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder to keep the very rollouts in that are evaluated (see `symphony view`, `report` and `export`)."""
-    calibrate: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Store of other run segments that sets the threshold of rule `replace`: a quantile of what the discriminator
-    says of their logs, over as many steps as lie between two prunings."""
-    quantile: float = 0.99
-    """That quantile: a branch that drives as the log does is replaced once in a hundred prunings."""
     details: bool = False
     """Print more than the table: kinds of collision, what the divergence owes to sampling, where agents stand at the
     end, what a search made of the goals, and what becomes of single agents. The file of `--json` has it all."""
@@ -73,14 +68,8 @@ class Evaluate:
             raise ConfigError(
                 "--figure goes without --planner: keep the rollouts and draw them, symphony view"
             )
-        if self.planner and self.calibrate is not None:
-            raise ConfigError("--calibrate goes without --planner: give the threshold, --threshold")
         if self.planner and (self.metrics or self.config.metric):
             raise ConfigError("--metrics and --metric go without --planner: they are of the agent")
-        if self.config.tilt:
-            raise ConfigError(
-                "--tilt goes with `symphony simulate`: the report makes up for it, these numbers don't"
-            )
         check_planner_seconds(self.planner_seconds)
 
     def run(self) -> None:
@@ -106,8 +95,7 @@ class Evaluate:
 
             check_picture(self.figure)
         agent = load_agent(self.agent, self.config.device, trust_code=self.trust_code)
-        store = SegmentStore(self.data)
-        config = self.config if self.calibrate is None else self._calibrated(agent, self.calibrate)
+        store, config = SegmentStore(self.data), self.config
         chosen = segment_indices(store, self.segments)
         if self.metrics:
             from symphony.evaluation.wosac import scorable
@@ -154,34 +142,6 @@ class Evaluate:
             from symphony.evaluation.pictures import draw_clips
 
             draw_clips(clips.clips, self.figure)
-
-    def _calibrated(self, agent: Agent, folder: Path) -> EvaluateConfig:
-        """With the threshold that the logs of a store give."""
-        from symphony.data.store import SegmentStore
-        from symphony.simulation.calibration import BATCH, calibrated_threshold
-        from symphony.simulation.demonstrations import SceneDataset
-
-        config, search = self.config, self.config.pruning(agent.search)
-        if search.rule != "replace":
-            raise ConfigError(
-                f"only rule 'replace' has a threshold to calibrate, the rule is '{search.rule}'"
-            )
-        if config.threshold is not None:
-            raise ConfigError("the threshold is either given or calibrated")
-        if config.interactive == "all" or config.open_traffic or config.others != "log":
-            raise ConfigError(
-                "a threshold is calibrated for a fixed number of agents: give it as --threshold"
-            )
-        data = SceneDataset(
-            SegmentStore(folder),
-            config.interactive or agent.interactive,
-            agent.dynamics,
-            routes=agent.goals is not None,
-            duration=config.duration or agent.duration,
-        )
-        threshold = round(calibrated_threshold(agent, data, search, self.quantile, config.batch or BATCH), 3)
-        sys.stderr.write(f"threshold {threshold:g}: quantile {self.quantile:g} of the logs in {folder}\n")
-        return replace(config, threshold=threshold)
 
     def _wosac(
         self,

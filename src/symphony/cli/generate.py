@@ -46,10 +46,6 @@ class Generate:
     """Seconds of a segment."""
     interactive: int = 2
     """Vehicles that must be there and move at the first step."""
-    parked: float = 0.0
-    """Share of the places along straight kerbs with a parked car."""
-    pedestrians: int = 0
-    """People who walk or stand beside the road in each segment, at most; nobody steps onto it."""
     workers: int = 1
     """Processes that make networks."""
     engine: Literal["local", "ray"] = "local"
@@ -84,8 +80,6 @@ class Generate:
             kinds=kinds,
             duration=self.duration,
             interactive=self.interactive,
-            parked=self.parked,
-            pedestrians=self.pedestrians,
         )
         return {self.split: (plan, self.out)}
 

@@ -59,7 +59,7 @@ class Simulate:
             raise ConfigError("one agent is simulated: RUN or --agents RUN")
         if self.runs < 0 or (self.runs and self.segments):
             raise ConfigError("--runs is a number of runs, and goes without --segments")
-        if self.runs and not self.config.tilt and self.config.rollouts != EvaluateConfig.rollouts:
+        if self.runs and self.config.rollouts != EvaluateConfig.rollouts:
             raise ConfigError("--runs says how many rollouts a segment gives: it goes without --rollouts")
         check_planner_seconds(self.planner_seconds)
 

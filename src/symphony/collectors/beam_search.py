@@ -24,7 +24,6 @@ from symphony.collectors.rules import (
     GroupRule,
     KeepBest,
     PruningRule,
-    Systematic,
     group_members,
     prune,
     takes_groups,
@@ -55,10 +54,6 @@ def beam_search(
     keep_tree: bool = False,
     leaves: int | None = None,
     last_period: Int[Tensor, "*b"] | None = None,
-    retries: int = 0,
-    retry_above: float | None = None,
-    reseed: Callable[[TensorDictBase, int], TensorDictBase] | None = None,
-    tilt: Callable[[Sequence[TensorDictBase]], Tensor] | None = None,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
     """Search an environment whose whole state is in the TensorDict (no GymEnv, VmasEnv, SerialEnv or ParallelEnv).
@@ -91,30 +86,16 @@ def beam_search(
         keep_tree: also return the branches that were pruned.
         leaves: return only so many, the best of the last period first; default all, in the order of their slots.
         last_period: [*b] number of the period that is the last for `leaves`, where rows end sooner than others.
-        retries: how often a period may be simulated again, from its start, for branches that ended it with a
-            total above `retry_above`; the lowest total of a branch counts. Only these are run again, R of them as
-            a batch [R, 1], which policy, environment and `score` must take like any other.
-        retry_above: threshold of `retries`.
-        reseed: ``reseed(state, attempt) -> state`` for attempt 1, 2, ...: gives the start of a repeated period
-            fresh random numbers. Not needed if policy and environment draw from a global generator.
-        tilt: importance of rare events: from the kept entries of the steps of a period, [*b, S] each, the logarithm
-            [*b, S] of how much heavier each branch weighs when it is resampled (rule :class:`Systematic`, all leaves,
-            no groups, no retries). The leaves' `log_weights` make up for it.
         exploration_type: under which the policy runs.
 
     Raises:
         ConfigError: for an environment that can't be branched, arguments that contradict each other or shapes that
             do not fit.
     """
-    _check(start, steps, prune_every, leaves, retries, retry_above)
+    _check(start, steps, prune_every, leaves)
     if last_period is not None and last_period.shape != start.shape[:-1]:
         raise ConfigError(f"last_period is {list(last_period.shape)}, rows are {list(start.shape[:-1])}")
-    if tilt is not None and not _tiltable(rule, start, leaves, retries, group_key):
-        raise ConfigError(
-            "a tilt goes with rule Systematic and all leaves, without groups and without retries"
-        )
     check_branching(env, start)
-    threshold = torch.inf if retry_above is None else retry_above
     groups = None if group_key is None else _groups(start, group_key)
     members = None if groups is None or takes_groups(rule) else group_members(groups)
     periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
@@ -122,33 +103,20 @@ def beam_search(
 
     now = start
     records: list[TensorDictBase] = []
-    scores, totals, parents, weights = [], [], [], []
+    scores, totals, parents = [], [], []
     simulated = 0
     with set_exploration_type(exploration_type):
         for period, length in enumerate(periods):
             run = _simulate(env, policy, score, now, length, aggregate, keep)
             simulated += length * start.numel()
-            for attempt in range(1, retries + 1):
-                # Places in the flattened [*b, S].
-                redo = (~(run.totals <= threshold)).flatten().nonzero()
-                if len(redo) == 0:
-                    break
-                again = now if reseed is None else reseed(now.copy(), attempt)
-                other = _simulate(env, policy, score, _take(again, redo), length, aggregate, keep)
-                simulated += length * len(redo)
-                run = _better(run, other, redo.squeeze(-1), slot_keys)
             records += run.records
             scores.append(run.scores)
             totals.append(run.totals)
             last = period == len(periods) - 1
-            compared = run.totals.detach()
             if last and not prune_last:
                 parents.append(torch.arange(start.shape[-1], device=run.totals.device).expand(start.shape))
                 break
-            if tilt is not None and isinstance(rule, Systematic):
-                compared, weight = _tilted(rule, compared, tilt(run.records))
-                weights.append(weight)
-            parents.append(prune(rule, compared, noises[period], members, groups))
+            parents.append(prune(rule, run.totals.detach(), noises[period], members, groups))
             groups = None if groups is None else groups.gather(-1, parents[-1])
             if not last:
                 now = _fork(run.after, parents[-1], slot_keys)
@@ -170,9 +138,6 @@ def beam_search(
         last_totals, last_slots = (_period(part, ended) for part in (all_totals.detach(), slots))
         best = ranking(last_totals, last_slots)[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
-    log_weights = None
-    if weights:
-        log_weights = torch.stack(weights, -2).gather(-1, slots[..., : len(weights), :]).sum(-2)
     steps_at = _step_rows(slots, start.shape[-1], periods)
     trajectories = _take(tree, steps_at)
     trajectories.refine_names(..., "time")
@@ -187,7 +152,6 @@ def beam_search(
         tree=tree if keep_tree else None,
         prune_every=prune_every,
         simulated_steps=simulated,
-        log_weights=log_weights,
     )
 
 
@@ -195,30 +159,6 @@ def _period(values: Shaped[Tensor, "*b P S"], number: Int[Tensor, "*b"]) -> Shap
     """Of each row the values of a period of its own."""
     place = number[..., None, None].expand(*number.shape, 1, values.shape[-1])
     return values.gather(-2, place).squeeze(-2)
-
-
-def _tiltable(
-    rule: object, start: TensorDictBase, leaves: int | None, retries: int, group_key: NestedKey | None
-) -> bool:
-    return (
-        isinstance(rule, Systematic)
-        and leaves in (None, start.shape[-1])
-        and retries == 0
-        and group_key is None
-    )
-
-
-def _tilted(
-    rule: Systematic, totals: Float[Tensor, "*b S"], lift: Float[Tensor, "*b S"]
-) -> tuple[Float[Tensor, "*b S"], Float[Tensor, "*b S"]]:
-    """Totals whose weights are exp(lift) times as large, and the logarithm of what a copy of each branch then weighs,
-    so that the mean over copies stays what it was.
-    """
-    usual = rule.log_weights(totals)
-    # Nothing makes up for what is infinitely bad or good.
-    lift = torch.where(totals.isfinite(), lift, 0.0)
-    weight = (usual + lift).logsumexp(-1, keepdim=True) - usual.logsumexp(-1, keepdim=True) - lift
-    return totals - rule.temperature * lift, weight
 
 
 def score_state(
@@ -270,40 +210,6 @@ def _simulate(
     if totals.shape != now.shape:
         raise ConfigError(f"the aggregate must be {tuple(now.shape)}, is {tuple(totals.shape)}")
     return _Run(records, joined, totals, now)
-
-
-def _better(first: _Run, second: _Run, rows: Int[Tensor, " R"], slot_keys: Sequence[NestedKey]) -> _Run:
-    """The first run, but of some branches the second, [R, 1], where that has a lower total; NaN is worse than any.
-
-    Args:
-        first: of all branches.
-        second: of some.
-        rows: places of these in the flattened [*b, S].
-        slot_keys: entries that stay as in the first.
-    """
-    before, total = first.totals.flatten().index_select(0, rows), second.totals.flatten()
-    lower = ((total < before) | (before.isnan() & ~total.isnan())).nonzero().squeeze(-1)
-    dims, where = first.totals.ndim, rows.index_select(0, lower)
-
-    def put(old: Shaped[Tensor, "*e"], new: Shaped[Tensor, "*e"]) -> Shaped[Tensor, "*e"]:
-        taken = new.flatten(0, 1).index_select(0, lower)
-        return old.flatten(0, dims - 1).index_copy(0, where, taken).reshape(old.shape)
-
-    def put_all(old: TensorDictBase, new: TensorDictBase) -> TensorDictBase:
-        both = {
-            key: put_all(value, new.get(key))
-            if isinstance(value, TensorDictBase)
-            else put(value, new.get(key))
-            for key, value in old.items()
-        }
-        return TensorDict(both, old.batch_size, device=old.device)
-
-    return _Run(
-        [put_all(old, new) for old, new in zip(first.records, second.records, strict=True)],
-        put(first.scores, second.scores),
-        put(first.totals, second.totals),
-        _set_slots(put_all(first.after, second.after), first.after, slot_keys),
-    )
 
 
 def _fork(
@@ -375,8 +281,6 @@ def _check(
     steps: int,
     prune_every: int,
     leaves: int | None,
-    retries: int,
-    retry_above: float | None,
 ) -> None:
     if not start.batch_dims or not start.numel():
         raise ConfigError(f"the start state must have rows and branches, its batch is {list(start.shape)}")
@@ -384,5 +288,3 @@ def _check(
         raise ConfigError(f"steps and prune_every must be positive, are {steps} and {prune_every}")
     if leaves is not None and not 1 <= leaves <= start.shape[-1]:
         raise ConfigError(f"leaves must be 1 ... {start.shape[-1]} branches, is {leaves}")
-    if retries < 0 or (retries > 0) != (retry_above is not None):
-        raise ConfigError("retries and retry_above go together, and retries is not negative")

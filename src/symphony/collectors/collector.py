@@ -59,8 +59,8 @@ class BeamSearchCollector(Collector):
         keep_tree: also return what was pruned; with ``leaves=branches`` only.
         rule_noise: ``rule_noise(start, periods) -> [*env.batch_size, periods]``, numbers in [0, 1) for rules that
             draw, from the branched start state; by default from a generator that :meth:`set_seed` sets.
-        prune_every, rule, aggregate, prune_last, slot_keys, group_key, keep, retries, retry_above, reseed: as
-            for :func:`beam_search`.
+        prune_every, rule, aggregate, prune_last, slot_keys, group_key, keep: as for
+            :func:`beam_search`.
         kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T. Batches are never cut short by an
             interruptor, and trajectories all have one length, so `split_trajs` is not available.
 
@@ -86,9 +86,6 @@ class BeamSearchCollector(Collector):
         keep: Sequence[NestedKey] | None = None,
         keep_tree: bool = False,
         rule_noise: Callable[[TensorDictBase, int], Tensor] | None = None,
-        retries: int = 0,
-        retry_above: float | None = None,
-        reseed: Callable[[TensorDictBase, int], TensorDictBase] | None = None,
         **kwargs: Any,
     ) -> None:
         if keep_tree and leaves != branches:
@@ -121,9 +118,6 @@ class BeamSearchCollector(Collector):
             prune_last=prune_last,
             slot_keys=slot_keys,
             group_key=group_key,
-            retries=retries,
-            retry_above=retry_above,
-            reseed=reseed,
             # The leaves of a whole tree stay in the order of their slots.
             leaves=None if keep_tree else leaves or 1,
             keep_tree=keep_tree,

@@ -27,9 +27,7 @@ class BeamSearchResult:
         simulated_scores: [*b, S, T, N] by the slot that simulated the step, the pruned ones included.
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
-        simulated_steps: branch-steps that were simulated, retries included.
-        log_weights: [*b, L] float64 logarithm of what each leaf weighs after a tilt: means over leaves with these
-            weights estimate what they would be without it. None without a tilt.
+        simulated_steps: branch-steps that were simulated.
     """
 
     trajectories: TensorDictBase
@@ -41,7 +39,6 @@ class BeamSearchResult:
     tree: TensorDictBase | None
     prune_every: int
     simulated_steps: int
-    log_weights: Float[Tensor, "*b L"] | None = None
 
     @property
     def leaf_totals(self) -> Float[Tensor, "*b P L"]:

@@ -132,7 +132,10 @@ class Systematic:
             )
         branches = totals.shape[-1]
         ranked = totals.argsort(dim=-1, stable=True)
-        logits = self.log_weights(totals.gather(-1, ranked))
+        # float64: in float32 the last of many cumulated weights may stay visibly below one.
+        worst = torch.finfo(torch.float64).min / 4
+        logits = -totals.gather(-1, ranked).double() / self.temperature
+        logits = logits.nan_to_num(nan=worst, neginf=worst, posinf=-worst)
         cumulative = torch.softmax(logits, -1).cumsum(-1)
         slots = torch.arange(branches, device=totals.device)
         points = (slots + noise.double()[..., None]) / branches
@@ -140,13 +143,6 @@ class Systematic:
         # Rounding may carry the last point up to the total, past the last branch that has any weight.
         drawn = torch.minimum(drawn, (cumulative < cumulative[..., -1:]).sum(-1, keepdim=True))
         return ranked.gather(-1, drawn)
-
-    def log_weights(self, totals: Float[Tensor, "*b S"]) -> Float[Tensor, "*b S"]:
-        """Logarithms of the weights, float64, but for a constant; NaN counts as infinitely bad."""
-        worst = torch.finfo(torch.float64).min / 4
-        # float64: in float32 the last of many cumulated weights may stay visibly below one.
-        logits = -totals.double() / self.temperature
-        return logits.nan_to_num(nan=worst, neginf=worst, posinf=-worst)
 
 
 @dataclass(frozen=True)

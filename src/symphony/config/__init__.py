@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         PerturbConfig,
         PreviewConfig,
         RunConfig,
-        SamplingConfig,
         TrainConfig,
         ValidationConfig,
     )
@@ -50,7 +49,6 @@ __all__ = [
     "PreviewConfig",
     "Profile",
     "RunConfig",
-    "SamplingConfig",
     "Search",
     "SearchConfig",
     "Setting",

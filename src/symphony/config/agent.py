@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from tyro.conf import arg
+from tyro.conf import Fixed, Suppress, arg
 
 from symphony.config.checks import at_most, not_negative, one_of, positive
 from symphony.errors import ConfigError
-from symphony.keys import OBJECTS, OWN
 
 ActionSpace = Literal["bicycle", "displacement"]
 Features = Literal["clearance", "paper", "foresight"]
-Survivors = Literal["all", "best"]
 RULES = ("best", "systematic", "replace")
-AGGREGATES = ("max_then_sum", "mean_then_sum")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,19 +21,18 @@ class AgentConfig:
 
     interactive: Annotated[int, arg(aliases=("--interactive",))] = 2
     """Interactive agents per run segment (the paper uses 2 and 8)."""
-    num_objects: int = 16
-    """Nearest other agents it observes."""
     num_points: int = 200
     """Nearest map and light points it observes (the paper: 1 000)."""
     num_lights: int = 0
     """Nearest lights it sees beside the points, as a group of their own, however far they are (the paper: none)."""
-    features: Literal["paper", "gaps", "road"] = "paper"
+    features: Literal["paper", "gaps"] = "paper"
     """`paper`: objects and points around; `gaps`: also how far it is from the boxes of objects, now and within the
-    next 2 s, were everyone to keep speed and course, and with goals where they are along its route; `road`: also how
-    far its box is from the edge of the road, and its centre within the next 2 s."""
-    goal_features: Literal["points", "turns"] = field(default="turns", metadata={"before": "points"})
-    """What the goal policy observes of each route. `points`: where it is every 12 m; `turns`: also where it begins
-    and how much it turns every 3 m, which tells where it changes lanes (methods *_h)."""
+    next 2 s, were everyone to keep speed and course, and with goals where they are along its route."""
+    goal_features: Annotated[Literal["points", "turns"], Fixed, Suppress] = field(
+        default="turns", metadata={"before": "points"}
+    )
+    """What the goal policy observes of each route. `points`, of agents from before it could see more: where it is
+    every 12 m; `turns`: also where it begins and how much it turns every 3 m, which tells where it changes lanes."""
     accelerations: int = 7
     """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
     cells: int = 0
@@ -46,21 +42,20 @@ class AgentConfig:
     """Drive in a style of one's own: the policy is told how closely the vehicle follows and how fast it drives among
     those of the log; in simulations that is drawn for each rollout, or given."""
     hidden: int = 64
-    """Width of the element encoders."""
-    head: int = 128
-    """Width of the action head."""
+    """Width of the element encoders; the action head is twice as wide."""
     encoder: str = "paper"
     """`paper`: element MLPs and max-pool; or the import path of your own, with the signature of
     `symphony.modules.SceneEncoder`, for policy and goal policy."""
     policy: str = "paper"
     """`paper`; or the import path of a function from an `AgentSpec` to a policy module."""
+    GONE: ClassVar[dict[str, Any]] = {"num_objects": 16, "head": lambda values: 2 * values.get("hidden", 64)}
 
     def __post_init__(self) -> None:
-        positive(self, "interactive", "num_objects", "num_points", "hidden", "head")
+        positive(self, "interactive", "num_points", "hidden")
         not_negative(self, "num_lights", "cells")
-        at_most(self, 10_000, "num_objects", "num_points", "num_lights")
+        at_most(self, 10_000, "num_points", "num_lights")
         at_most(self, 1001, "accelerations", "cells")
-        one_of(self, "features", ["paper", "gaps", "road"])
+        one_of(self, "features", ["paper", "gaps"])
         one_of(self, "goal_features", ["points", "turns"])
         if self.accelerations < 3 or self.accelerations % 2 == 0:
             raise ConfigError(f"accelerations must be odd and at least 3, is {self.accelerations}")
@@ -77,39 +72,22 @@ class DiscriminatorConfig:
     features: Features = "clearance"
     """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge;
     `foresight`: also the gaps within the next 2 s, were everyone to keep speed and course."""
-    radius: float = 20.0
-    """Metres around an agent that it observes."""
-    hidden: int = 32
-    """Width of its encoders."""
-    head: int = 64
-    """Width of its head."""
+    hidden: Annotated[int, Suppress] = 32
+    """Width of its encoders; its head is twice as wide."""
     network: str = "paper"
-    """`paper`; `split`: a logit of the agent on the map plus the highest of it with each other; or the import path
-    of a function from an `AgentSpec` to a module that writes one logit per agent."""
-    states: int = 256
-    """States of either kind (simulated, logged) per update, each with all its interactive agents."""
-    learning_rate: float = 1e-3
-    """Of its Adam."""
-    gradient_penalty: float = 0.0
-    """Weight of the squared gradient at logged states (0: none)."""
-    instance_noise: float = 0.0
-    """Standard deviation of noise on what it observes in training (0: none)."""
+    """`paper`; or the import path of a function from an `AgentSpec` to a module that writes one logit per agent."""
+    GONE: ClassVar[dict[str, Any]] = {"radius": 20.0, "head": lambda values: 2 * values.get("hidden", 32)}
+    GONE_IN_TRAINING: ClassVar[dict[str, Any]] = {
+        "states": 256,
+        "learning_rate": 1e-3,
+        "gradient_penalty": 0.0,
+        "instance_noise": 0.0,
+    }
 
     def __post_init__(self) -> None:
         one_of(self, "features", get_args(Features))
-        one_of(self, "network", ["paper", "split"], path=True)
-        positive(self, "radius", "hidden", "head", "states", "learning_rate")
-        not_negative(self, "gradient_penalty", "instance_noise")
-
-    @property
-    def regularisation(self) -> dict[str, Any]:
-        """As :class:`symphony.objectives.DiscriminatorLoss` takes it."""
-        return {
-            "gradient_penalty": self.gradient_penalty,
-            "instance_noise": self.instance_noise,
-            # Of a network of the user's own, it is unknown what it reads.
-            "noise_keys": (OWN, OBJECTS) if self.instance_noise else (),
-        }
+        one_of(self, "network", ["paper"], path=True)
+        positive(self, "hidden")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,44 +101,30 @@ class SearchConfig:
     prune_every: int = 2
     """Steps between prunings (T_p; 10 in the paper)."""
     rule: str = "systematic"
-    """`best`: the better share of the branches survives (the paper); `systematic`: every branch gets copies in
+    """`best`: the better half of the branches survives (the paper); `systematic`: every branch gets copies in
     proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings; `replace`:
     only branches above `threshold` make room, for copies of others, of the same goals where there are any; or the
     import path of a pruning rule of your own."""
-    keep: float = 0.5
-    """Share of the branches that survives a pruning with rule `best`."""
     temperature: float = 0.6
     """Of rule `systematic`: the lower, the stricter."""
     threshold: float = 1.0
     """Of rule `replace`: the highest total, in logits of the discriminator, that a branch goes on with."""
-    aggregate: str = "max_then_sum"
-    """From scores of steps and agents to one per branch: `max_then_sum` (the paper), `mean_then_sum`, or the import
-    path of a function of your own."""
     goals: Literal["tree", "branch"] = "tree"
     """Who draws goals together in evaluation: all branches of a `tree` (the paper), or each `branch` alone. In
     training all follow the routes of the log."""
-    segments: int = 16
-    """Run segments searched at a time."""
     updates: int = 10
     """Updates made from the results of one search before the next."""
     states: int = 256
-    """States of surviving rollouts per update, each with all its interactive agents."""
-    weight: float = 1.0
-    """Of the surviving rollouts beside the expert data in the policy's loss."""
-    survivors: Survivors = "all"
-    """Learn from every surviving branch or only from the best of each tree."""
+    """States per update of the surviving rollouts for the policy, and of the simulated and the logged ones each for
+    the discriminator; every state is of all its interactive agents."""
+    GONE: ClassVar[dict[str, Any]] = {"keep": 0.5, "aggregate": "max_then_sum"}
+    GONE_IN_TRAINING: ClassVar[dict[str, Any]] = {"segments": 16, "weight": 1.0, "survivors": "all"}
 
     def __post_init__(self) -> None:
-        positive(self, "branches", "test_branches", "prune_every", "keep", "temperature")
-        positive(self, "segments", "updates", "states")
+        positive(self, "branches", "test_branches", "prune_every", "temperature", "updates", "states")
         at_most(self, 10_000, "branches", "test_branches")
-        one_of(self, "survivors", get_args(Survivors))
         one_of(self, "goals", ["tree", "branch"])
         one_of(self, "rule", RULES, path=True)
-        one_of(self, "aggregate", AGGREGATES, path=True)
-        if self.keep > 1:
-            raise ConfigError(f"keep must not exceed 1, is {self.keep}")
-        not_negative(self, "weight")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,6 +150,7 @@ class AgentSpec:
     discriminator: DiscriminatorConfig | None = None
     searches: bool = False
     search: SearchConfig = field(default_factory=SearchConfig)
+    TRAINS: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         one_of(self, "action_space", get_args(ActionSpace))
@@ -207,6 +172,5 @@ class AgentSpec:
             "agent.policy": self.agent.policy,
             "discriminator.network": network,
             "search.rule": self.search.rule,
-            "search.aggregate": self.search.aggregate,
         }
         return {name: path for name, path in paths.items() if ":" in path}

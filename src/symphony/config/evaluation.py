@@ -31,8 +31,6 @@ for sampling, what the search made of the goals.
 
 MOST_SECONDS = 1e6
 """That a planner can be given for an answer."""
-MANOEUVRES = ("hard_braking", "cut_in")
-"""That a search can make more frequent."""
 PERSONA_PARTS = ("headway", "speed")
 """What a persona consists of, in the order of its numbers."""
 
@@ -94,23 +92,11 @@ class EvaluateConfig:
     goals: Goals = "agent"
     """Who draws goals together: all branches of a `tree` (the paper), or each `branch` alone; `agent`: as it is
     meant."""
-    retries: int = 0
-    """How often the steps between two prunings are simulated again for branches that end them with a score above
-    `retry-above`. Only these cost anything."""
-    retry_above: float = 0.0
-    """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     action_temperature: float = 1.0
     """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
     persona: str = ""
     """Style of all agents that the agent drives, such as `headway=.8,speed=.3`: quantiles among the vehicles it
     learned from; what is not given is drawn for each (agents trained with `agent.persona`)."""
-    tilt: float = 0.0
-    """Raises the chance of a rare manoeuvre: in resampling (rule `systematic`, all branches of a tree as rollouts),
-    branches in which it happened between two prunings weigh exp(tilt) times as much. Rollouts are kept with weights
-    that make up for it."""
-    tilt_on: str = "hard_braking"
-    """Which: `hard_braking` (4 m/s^2), `cut_in` (into the path of another driven agent, within 15 m), or the import
-    path of a function of your own, see `symphony.simulation.importance`."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones."""
     seed: int = 0
@@ -153,14 +139,8 @@ class EvaluateConfig:
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
         persona_quantiles(self.persona)
-        one_of(self, "tilt_on", MANOEUVRES, path=True)
-        not_negative(self, "tilt")
-        if self.tilt and (self.retries or self.search in ("none", "best")):
-            raise ConfigError(
-                "a tilt needs a search that resamples: no retries, and neither search none nor best"
-            )
         one_of(self, "others", get_args(Others))
-        not_negative(self, "radius", "batch", "branches", "duration", "prune_every", "temperature", "retries")
+        not_negative(self, "radius", "batch", "branches", "duration", "prune_every", "temperature")
         if self.interactive != "all" and not 0 <= self.interactive <= MOST:
             raise ConfigError(f"interactive is 'all' or a number up to {MOST}, is {self.interactive}")
         for path in self.metric:
@@ -168,11 +148,12 @@ class EvaluateConfig:
                 raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
-        """How branches are pruned: as in training, but for what is set here."""
+        """The search: as in training, but for what is set here."""
         # A threshold learned for a discriminator says nothing of flags: with one of them a branch is bad.
         threshold = 0.0 if self.search == "oracle" else trained.threshold
         return dataclasses.replace(
             trained,
+            test_branches=self.branches or trained.test_branches,
             rule=trained.rule if self.rule == "agent" else self.rule,
             prune_every=self.prune_every or trained.prune_every,
             temperature=self.temperature or trained.temperature,

@@ -47,18 +47,36 @@ def read_json(kind: type[Any], file: Path) -> Any:
         raise ConfigError(f"{file}: not a JSON object")
     if values.pop("format", None) != FORMAT:
         raise ConfigError(f"{file}: configuration of another version, expected format {FORMAT}")
-    _fill(kind, values)
+    _adapt(kind, values, f"{file}: ", trains=getattr(kind, "TRAINS", True))
     return from_dict(kind, values, where=f"{file}: ")
 
 
-def _fill(kind: Any, values: dict[str, Any]) -> None:
-    """Add settings that a file is too old to have and that meant something else then than by default now."""
+def _adapt(kind: Any, values: dict[str, Any], where: str, *, trains: bool) -> None:
+    """Make of an older file's settings today's.
+
+    Settings that the file is too old to have, and that meant something else then than by default now, are added.
+    Settings that are gone are left out where they said what always holds now: ``GONE`` of a class has these values
+    by name, ``...`` for a setting that changed no result, and a function where the value follows from the others.
+    ``GONE_IN_TRAINING`` has those that matter to a training only, so that an agent can be read whatever they were.
+
+    Raises:
+        ConfigError: a setting that is gone said something else.
+    """
+    gone, of_training = (getattr(kind, name, {}) for name in ("GONE", "GONE_IN_TRAINING"))
+    for name, held in (gone | of_training).items():
+        meant = held(values) if callable(held) else held
+        found = values.pop(name, meant)
+        # Of settings that went together, a file may be too old to have all.
+        same = found.items() <= meant.items() if isinstance(found, dict) else meant is ... or found == meant
+        if not same and (trains or name in gone):
+            raise ConfigError(f"{where}setting '{name}' is gone: this version reads only {meant!r}")
     for field in dataclasses.fields(kind):
-        nested, value = _hints(kind)[field.name], values.get(field.name)
+        hint, value = _hints(kind)[field.name], values.get(field.name)
         if "before" in field.metadata:
             values.setdefault(field.name, field.metadata["before"])
-        elif isinstance(nested, type) and dataclasses.is_dataclass(nested) and isinstance(value, dict):
-            _fill(nested, value)
+        for nested in (hint, *get_args(hint)):
+            if isinstance(nested, type) and dataclasses.is_dataclass(nested) and isinstance(value, dict):
+                _adapt(nested, value, f"{where}{field.name}.", trains=trains)
 
 
 def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> Any:

@@ -18,7 +18,7 @@ def paper(config: TrainConfig) -> TrainConfig:
         steps=70_000,
         segments=16,
         checkpoint_every=2000,
-        agent=replace(config.agent, num_objects=16, num_points=1000),
+        agent=replace(config.agent, num_points=1000),
         discriminator=replace(config.discriminator, features="paper"),
         search=replace(
             config.search,
@@ -26,8 +26,6 @@ def paper(config: TrainConfig) -> TrainConfig:
             test_branches=16,
             prune_every=10,
             rule="best",
-            keep=0.5,
-            segments=16,
             updates=1,
         ),
         mgail=replace(
@@ -66,13 +64,12 @@ def laptop(config: TrainConfig) -> TrainConfig:
     return replace(
         config,
         steps=3000,
-        checkpoint_every=500,
+        checkpoint_every=1000,
         agent=replace(config.agent, num_points=128),
         discriminator=replace(config.discriminator, features="foresight"),
-        search=replace(config.search, survivors="best"),
         # Of all that goes beyond the paper's inputs, what lowers collisions most.
         perturb=replace(config.perturb, share=0.5, begin=1500),
-        validation=replace(config.validation, every=1000, segments=48, rollouts=4),
+        validation=replace(config.validation, segments=48, rollouts=4),
     )
 
 
@@ -84,9 +81,8 @@ def tiny(config: TrainConfig) -> TrainConfig:
         segments=8,
         states=256,
         checkpoint_every=60,
-        agent=replace(config.agent, num_points=64, hidden=32, head=32),
-        search=replace(config.search, segments=4, branches=4, test_branches=4, updates=10, states=64),
-        discriminator=replace(config.discriminator, hidden=8, head=8, states=64),
+        agent=replace(config.agent, num_points=64, hidden=32),
+        search=replace(config.search, branches=4, test_branches=4, updates=10, states=64),
         mgail=replace(config.mgail, regression=80, head_start=10, rollouts=4),
     )
 
@@ -98,11 +94,9 @@ def smoke(config: TrainConfig) -> TrainConfig:
         steps=4,
         segments=2,
         states=16,
-        goals=8,
         checkpoint_every=2,
-        agent=replace(config.agent, num_points=16, hidden=8, head=8),
-        search=replace(config.search, segments=2, branches=2, test_branches=2, updates=2, states=8),
-        discriminator=replace(config.discriminator, hidden=8, head=8, states=8),
+        agent=replace(config.agent, num_points=16, hidden=8),
+        search=replace(config.search, branches=2, test_branches=2, updates=2, states=8),
         mgail=replace(config.mgail, regression=2, head_start=0, rollouts=2),
         validation=replace(config.validation, segments=2, rollouts=2),
         wandb="disabled",

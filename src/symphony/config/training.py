@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from symphony.config.agent import ActionSpace, AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
 from symphony.config.checks import not_negative, one_of, positive
-from symphony.config.evaluation import MOST
 from symphony.errors import ConfigError
 from symphony.keys import SEEN
 
@@ -21,6 +20,10 @@ the model (MGAIL), with goals (H: hierarchy), with tree search (TS), with both.
 """
 METHODS: tuple[str, ...] = get_args(Method)
 Cost = Literal["log_d", "non_saturating", "logit"]
+GOALS = 128
+"""Expert routes per update of the goal policy."""
+DISCRIMINATOR_RATE = 1e-3
+"""Learning rate of the discriminator's Adam, falling to a tenth along a cosine."""
 MAX_SEED = (1 << 40) - 1
 """Of a training, which derives a number from it for every update."""
 
@@ -51,13 +54,12 @@ class MGAILConfig:
     """Let the gradient also pass through the policy's reactions to what earlier actions changed."""
     truncate: int = 0
     """Steps after which the gradient is cut (0: never)."""
-    checkpoint: int = 0
-    """Steps simulated twice instead of being kept in memory for the gradient (0: all are kept)."""
+    GONE: ClassVar[dict[str, Any]] = {"checkpoint": ...}
 
     def __post_init__(self) -> None:
         one_of(self, "cost", get_args(Cost))
         positive(self, "rollouts", "learning_rate", "discriminator_updates")
-        not_negative(self, "regression", "head_start", "expert_weight", "truncate", "checkpoint")
+        not_negative(self, "regression", "head_start", "expert_weight", "truncate")
 
     @property
     def gradient(self) -> dict[str, Any]:
@@ -66,7 +68,6 @@ class MGAILConfig:
             "cost": self.cost,
             "detach_keys": () if self.react else SEEN,
             "truncate": self.truncate,
-            "checkpoint": self.checkpoint,
         }
 
 
@@ -76,16 +77,14 @@ class ValidationConfig:
 
     data: Path | None = None
     """Store of run segments to evaluate them on; without one the last checkpoint is the agent."""
-    every: int = 0
-    """Updates between evaluations, a multiple of `checkpoint-every` (0: at every checkpoint)."""
     segments: int = 200
     """Run segments of it, evenly spaced (all, if there are fewer)."""
     rollouts: int = 4
     """Simulations of each."""
+    GONE: ClassVar[dict[str, Any]] = {"every": ...}
 
     def __post_init__(self) -> None:
         positive(self, "segments", "rollouts")
-        not_negative(self, "every")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,17 +95,10 @@ class PerturbConfig:
     """Of the expert states of an update (0: none, as in the paper)."""
     begin: int = 0
     """Updates before the first: a policy learns more from displaced states when it drives already."""
-    along: float = 1.5
-    """Standard deviation along the road, in metres, times a number between 0 and 1 drawn for each state."""
-    across: float = 0.5
-    """Likewise to the side, in metres; less below 4 m/s."""
-    heading: float = 0.1
-    """Likewise in radians; less below 4 m/s and above 8 m/s."""
-    speed: float = 1.5
-    """Likewise in m/s."""
+    GONE: ClassVar[dict[str, Any]] = {"along": 1.5, "across": 0.5, "heading": 0.1, "speed": 1.5}
 
     def __post_init__(self) -> None:
-        not_negative(self, "share", "begin", "along", "across", "heading", "speed")
+        not_negative(self, "share", "begin")
         if self.share > 1:
             raise ConfigError(f"share must not exceed 1, is {self.share}")
 
@@ -116,47 +108,15 @@ class PerturbConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SamplingConfig:
-    """What is learned from more often than the rest; all is drawn alike by default."""
-
-    interactive: float = 1.0
-    """How much more often states of interactive agents are drawn than those of other vehicles."""
-    standing: float = 1.0
-    """How often states below 0.5 m/s are drawn, relative to others."""
-    hard: Path | None = None
-    """Record of an evaluation on the store that is learned from (`symphony evaluate RUN --data STORE --json FILE`):
-    run segments are drawn in proportion to the collision rate plus off-road time there."""
-    even_sources: bool = False
-    """Run segments of every source of logs (`sumo`, `womd`, ...; `symphony data info` counts them) are drawn as
-    often as those of any other, however few there are."""
-    share: float = 0.5
-    """Of an update's run segments that are drawn so, with a record or even sources; the others are drawn evenly."""
-
-    def __post_init__(self) -> None:
-        positive(self, "interactive")
-        not_negative(self, "standing", "share")
-        if self.share > 1:
-            raise ConfigError(f"share must not exceed 1, is {self.share}")
-
-    @property
-    def even(self) -> bool:
-        """Whether all states count alike."""
-        return self.interactive == self.standing == 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
 class PreviewConfig:
     """What a run lets see of its agent while it trains: animated rollouts, and distributions of what it does."""
 
     every: int = 2000
     """Updates between previews, and one at the end of a run that has so many (0: never); by default this takes about
     a hundredth of the time on a CPU, or less."""
-    segments: int = 8
-    """Run segments simulated for it, evenly spaced over those that are validated on, or else learned from; the
-    animation has the first two."""
+    GONE: ClassVar[dict[str, Any]] = {"segments": ...}
 
     def __post_init__(self) -> None:
-        positive(self, "segments")
         not_negative(self, "every")
 
 
@@ -172,8 +132,6 @@ class RunConfig:
     """Updates (the paper: 70 000)."""
     seed: int = 0
     """Of the weights and of the order of the data."""
-    clip: float = 1.0
-    """Largest norm of the gradient."""
     warm_start: Path | None = None
     """Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its last
     (`RUN@last` or `RUN@3000` names another), or `pretrained:NAME`; new ones where that run has none."""
@@ -183,30 +141,26 @@ class RunConfig:
     """Rollouts to look at, in `media` of the run's folder."""
     checkpoint_every: int = 1000
     """Updates between checkpoints."""
-    log_every: int = 20
+    log_every: Annotated[int, Suppress] = 20
     """Updates between records of the metrics."""
     resume: bool = False
     """Go on from the last checkpoint in `out`; without it a folder that holds a run is refused."""
     wandb: Literal["offline", "online", "disabled"] = "offline"
-    """Where Weights & Biases keeps the curves; a plain file has them in any case."""
-    wandb_project: str = "symphony"
-    """Its project."""
-    wandb_group: str = ""
-    """Its group of runs, such as the seeds of one experiment; empty for none."""
-    wandb_tags: tuple[str, ...] = ()
-    """Its tags."""
+    """Where Weights & Biases keeps the curves; a plain file has them in any case. Its own variables (WANDB_PROJECT,
+    WANDB_RUN_GROUP, WANDB_TAGS) name project, group and tags."""
     device: str = "cpu"
     """`cpu`, `cuda` or `cuda:N`."""
+    GONE: ClassVar[dict[str, Any]] = {
+        "clip": 1.0,
+        "wandb_project": ...,
+        "wandb_group": ...,
+        "wandb_tags": ...,
+    }
 
     def __post_init__(self) -> None:
-        positive(self, "steps", "clip", "checkpoint_every", "log_every")
+        positive(self, "steps", "checkpoint_every", "log_every")
         if abs(self.seed) > MAX_SEED:
             raise ConfigError(f"seed must be within ±{MAX_SEED}, is {self.seed}")
-        if self.validation.every % self.checkpoint_every:
-            raise ConfigError(
-                f"validation.every ({self.validation.every}) must be a multiple of checkpoint-every "
-                f"({self.checkpoint_every}): only checkpoints are evaluated"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,19 +173,12 @@ class TrainConfig(RunConfig):
     """Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are)."""
     agent: AgentConfig = field(default_factory=AgentConfig)
     """The agent."""
-    most_interactive: int = 0
-    """Simulate more agents in some run segments: their number is drawn for each between `agent.interactive` and this
-    one (methods that simulate; 0: always `agent.interactive`, as in the paper)."""
     segments: Annotated[int, arg(name="batch")] = 16
-    """Run segments per update."""
+    """Run segments per update, and per search."""
     states: int = 1024
     """Expert states per update, drawn from those segments."""
     perturb: PerturbConfig = field(default_factory=PerturbConfig)
     """Displaced expert states."""
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    """Run segments and expert states drawn more often than others."""
-    goals: int = 128
-    """Expert routes per update of the goal policy (methods with H)."""
     learning_rate: float = 1e-2
     """Of Adam, falling to a tenth along a cosine."""
     search: SearchConfig = field(default_factory=SearchConfig)
@@ -240,19 +187,19 @@ class TrainConfig(RunConfig):
     """The discriminator (methods with TS, and MGAIL)."""
     mgail: MGAILConfig = field(default_factory=MGAILConfig)
     """Adversarial learning (methods mgail*)."""
+    GONE: ClassVar[dict[str, Any]] = RunConfig.GONE | {
+        "most_interactive": 0,
+        "goals": GOALS,
+        "sampling": {"interactive": 1.0, "standing": 1.0, "hard": None, "even_sources": False, "share": 0.5},
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of(self, "method", METHODS)
         if self.segments < 1:  # by its name on the command line
             raise ConfigError(f"batch must be positive, is {self.segments}")
-        positive(self, "states", "goals", "learning_rate")
+        positive(self, "states", "learning_rate")
         not_negative(self, "duration")
-        if self.most_interactive and not self.agent.interactive <= self.most_interactive <= MOST:
-            raise ConfigError(
-                f"most-interactive is 0 or from agent.interactive ({self.agent.interactive}) to {MOST}, "
-                f"is {self.most_interactive}"
-            )
 
     def spec(
         self,
@@ -289,14 +236,11 @@ class TrainConfig(RunConfig):
         return {
             "interactive": self.agent.interactive,
             "duration": self.duration,
-            "sampling": self.sampling,
-            "most": self.most_interactive,
             "persona": self.agent.persona,
-            # Lists of near points are for the CPU; a device compares all points and would only be sent them.
-            "num_points": self.agent.num_points if self.device == "cpu" else 0,
         }
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
         """Learning rates by network, before they fall."""
-        own = {"discriminator": self.discriminator.learning_rate}
-        return {name: own.get(name, self.learning_rate) for name in optimizers}
+        return {
+            name: DISCRIMINATOR_RATE if name == "discriminator" else self.learning_rate for name in optimizers
+        }

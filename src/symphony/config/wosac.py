@@ -38,11 +38,6 @@ class WosacSettings:
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the
     future."""
-    retries: int = 0
-    """How often the steps between two prunings are simulated again for branches that end them with a score above
-    `retry-above`."""
-    retry_above: float = 0.0
-    """Of a branch: the highest logit of the discriminator within those steps, summed over its agents."""
     action_temperature: float = 1.0
     """Of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
     horizon: float = 8.0

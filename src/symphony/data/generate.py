@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -22,7 +21,6 @@ import numpy as np
 from symphony.data import store_format
 from symphony.data.engine import Engine, ordered_map
 from symphony.data.plans import Plan, Task
-from symphony.data.roadside import add_roadside
 from symphony.data.segment import RunSegment
 from symphony.data.selection import usable
 from symphony.data.sources.sumo import crop_rule, generate_run
@@ -31,7 +29,7 @@ from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 
 _BEFORE = {"parked": 0.0, "pedestrians": 0}
-"""Settings of stores that were made before there were these."""
+"""What settings that are gone must have been in a store that is continued."""
 PER_NETWORK = 8
 """Segments taken from one network."""
 RECORDED = 90.0
@@ -78,9 +76,8 @@ def harvest(task: Task) -> Harvest:
     good = []
     for segment in run.segments:
         try:
-            whole = add_roadside(segment, task.roadside, zlib.crc32(segment.segment_id.encode()))
-            usable(whole, task.interactive)
-            good.append(whole)
+            usable(segment, task.interactive)
+            good.append(segment)
         except DataError as error:
             run.reasons[f"{error.field}: excluded by the paper's limits"] += 1
     taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
@@ -217,7 +214,7 @@ def _begin(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
         raise DataError(
             "is a segment store that was not generated: refusing to write into it", file=store.path
         )
-    for name, value in settings.items():
+    for name, value in {**_BEFORE, **settings}.items():
         made = there.get(name, _BEFORE.get(name))
         if made != value:
             raise ConfigError(

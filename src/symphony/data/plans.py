@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
-from symphony.data.roadside import Roadside
 from symphony.data.sources.sumo import KINDS, sumo_version
 from symphony.errors import ConfigError
 
@@ -35,8 +34,6 @@ class Plan:
         kinds: of networks, which take turns; one named twice comes twice as often.
         duration: seconds of a segment, one of :data:`DURATIONS`.
         interactive: moving vehicles a segment must have at its first step (N_I).
-        parked: share of the places to park along straight kerbs that are taken (see :mod:`symphony.data.roadside`).
-        pedestrians: people beside the road in each segment, at most.
 
     Raises:
         ConfigError: a value out of range; names the field.
@@ -48,8 +45,6 @@ class Plan:
     kinds: tuple[str, ...] = ("town",)
     duration: int = 10
     interactive: int = 2
-    parked: float = 0.0
-    pedestrians: int = 0
 
     def __post_init__(self) -> None:
         if self.segments < 1:
@@ -68,7 +63,6 @@ class Plan:
             raise ConfigError(f"duration must be one of {DURATIONS}, is {self.duration}")
         if self.interactive < 2:
             raise ConfigError(f"interactive must be at least 2, is {self.interactive}")
-        Roadside(self.parked, self.pedestrians)  # or complain now
 
     def network(self, number: int) -> Task:
         """The plan's network of that number, counted from 0.
@@ -84,7 +78,6 @@ class Plan:
             first + number,
             float(self.duration),
             self.interactive,
-            Roadside(self.parked, self.pedestrians),
         )
 
     def networks(self, start: int = 0) -> Iterator[Task]:
@@ -147,13 +140,12 @@ PRESETS: dict[str, Preset] = {
 
 @dataclass(frozen=True)
 class Task:
-    """One network: its kind and seed, the seconds of a segment, N_I, and what is beside the road."""
+    """One network: its kind and seed, the seconds of a segment, and N_I."""
 
     kind: str
     seed: int
     duration: float
     interactive: int
-    roadside: Roadside = field(default_factory=Roadside)
 
     @property
     def name(self) -> str:

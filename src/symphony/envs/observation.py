@@ -20,7 +20,6 @@ from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, RouteWindow, ro
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners
-from symphony.geometry.constants import constant
 
 __all__ = [
     "OBJECT_FEATURES",
@@ -54,10 +53,9 @@ class ObservationConfig:
         along: whether it observes where the objects are along that route.
         gaps: whether it observes how far its box is from others.
         persona: whether it knows the style in which it drives, a part of its state.
-        road: whether it observes how far its box is from the edge of the road, and how far its centre would be ahead.
         clearance: whether it observes how far its box is from others and from the edge of the road.
         foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
-            speed and course; with ``gaps`` or ``clearance`` only, and with ``road`` likewise from the edge.
+            speed and course; with ``gaps`` or ``clearance`` only.
         own: whether it observes its own speed and size.
     """
 
@@ -72,7 +70,6 @@ class ObservationConfig:
     along: bool = False
     gaps: bool = False
     persona: bool = False
-    road: bool = False
     clearance: bool = False
     foresight: tuple[float, ...] = ()
     own: bool = True
@@ -81,7 +78,7 @@ class ObservationConfig:
     def blind(self) -> bool:
         """Whether nothing is asked for, a route aside."""
         counts = self.num_objects, self.num_points, self.num_lights
-        return not (any(counts) or self.own or self.road or self.clearance)
+        return not (any(counts) or self.own or self.clearance)
 
     @classmethod
     def nothing(cls) -> ObservationConfig:
@@ -103,7 +100,6 @@ class Observation(NamedTuple):
         gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked.
         gap_ahead: [M, N, O, H] likewise at H times ahead.
         road: [M, N, 5] metres of centre and corners off the road, negative on it.
-        road_ahead: [M, N, H] likewise of the centre at H times ahead.
         route: [M, N, Fr], see :func:`symphony.envs.routes.route_ahead`.
         along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
     """
@@ -118,7 +114,6 @@ class Observation(NamedTuple):
     gap: Tensor | None = None
     gap_ahead: Tensor | None = None
     road: Tensor | None = None
-    road_ahead: Tensor | None = None
     route: Tensor | None = None
     along: Tensor | None = None
 
@@ -137,10 +132,8 @@ def observation_spec(config: ObservationConfig, agents: int, device: torch.devic
     masks = {f"{name}_mask": width[:1] for name, width in widths.items() if len(width) > 1}
     if config.route:
         widths["route"] = (ROUTE_FEATURES,)
-    if config.clearance or config.road:
+    if config.clearance:
         widths["road"] = (5,)
-    if config.road and config.foresight:
-        widths["road_ahead"] = (len(config.foresight),)
     if config.num_objects and (config.clearance or config.gaps):
         widths["gap"] = (config.num_objects,)
         if config.foresight:
@@ -189,7 +182,7 @@ def observe(
     speed = turn.cos() * own[..., 3] - turn.sin() * own[..., 4]
     height = None if objects.height is None else _take(objects.height, index)
     features, points, points_mask, road, route = None, None, None, None, None
-    lights, lights_mask, road_ahead = None, None, None
+    lights, lights_mask = None, None
     if config.own:
         ends = (step >= scenes.last_step[scene]).to(own.dtype)
         features = torch.cat(
@@ -210,17 +203,11 @@ def observe(
     if config.route and routes is not None:
         pose = torch.cat([own[..., :3], speed[..., None]], -1)
         route = route_ahead(pose, routes, config.distance_scale)
-    if config.clearance or config.road:
-        places = [origin[..., None, :], box_corners(origin, heading, own_size)]
-        if config.road and config.foresight:
-            times = constant(config.foresight, own.dtype, own.device)[:, None]
-            places.append(origin[..., None, :] + times * own[..., None, 3:])
-        queried = torch.cat(places, -2)
+    if config.clearance:
+        queried = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
         of_each = None if height is None else height.repeat_interleave(queried.shape[2], 1)
-        away = road_distance(scenes, scene, queried.flatten(1, 2), tables, of_each)
-        away = away.unflatten(1, queried.shape[1:3])
-        road, ahead = away[..., :5], away[..., 5:]
-        road_ahead = ahead if config.road and config.foresight else None
+        road = road_distance(scenes, scene, queried.flatten(1, 2), tables, of_each)
+        road = road.unflatten(1, queried.shape[1:3])
     return Observation(
         own=features,
         objects=seen.features,
@@ -232,7 +219,6 @@ def observe(
         gap=seen.gap,
         gap_ahead=seen.gap_ahead,
         road=road,
-        road_ahead=road_ahead,
         route=route,
         along=seen.along,
     )

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from symphony.data.levels import LEVEL
 from symphony.data.segment import RunSegment
 from symphony.errors import DataError, DataWarning
 from symphony.geometry.constants import constant
@@ -127,7 +128,7 @@ def agent_routes(
     steps = begin + np.flatnonzero(segment.valid[agent, begin:])
     for first in steps if begin else steps[:1]:
         position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
-        starts = starting_lanes(graph, position, heading)
+        starts = _on_level(segment, agent, first, graph, starting_lanes(graph, position, heading))
         if starts:
             break
     else:
@@ -144,6 +145,23 @@ def agent_routes(
         message = f"the routes of agent {int(segment.agent_id[agent])} can't be built: {error}"
         raise DataError(message, segment=segment.segment_id, field="road.lanes") from error
     return int(first), kept, lines
+
+
+def _on_level(
+    segment: RunSegment, agent: int, step: int, graph: LaneGraph, starts: list[tuple[int, float]]
+) -> list[tuple[int, float]]:
+    """Of the lanes that an agent may be on those of its height, where the map has any."""
+    lanes = segment.road.lanes
+    if len(starts) < 2 or np.ptp(lanes.points[:, 2]) < LEVEL:
+        return starts
+    ground = segment.position[agent, step, 2] - 0.5 * segment.size[agent, 2]
+    kept = []
+    for lane, along in starts:
+        points = lanes[lane]
+        arc = np.append(0.0, np.hypot(*np.diff(points[:, :2], axis=0).T).cumsum())
+        if abs(np.interp(along, arc, points[:, 2]) - ground) < LEVEL:
+            kept.append((lane, along))
+    return kept or starts
 
 
 def logged_progress(

@@ -108,8 +108,6 @@ class SceneBatch(TensorClass):
         edge_previous: [B, E] int32 segment that ends where this one starts, -1 if none.
         edge_following: [B, E] int32.
         edge_valid: [B, E].
-        point_lists: [B, W] int32 lists of near points, see :mod:`symphony.envs.map_lists`; W = 0 without.
-        edge_lists: [B, V] int32 likewise of near boundary segments.
         agent_height: [B, T, A, 2] height on the ground and level of logged agents, see :mod:`symphony.data.levels`;
             empty, as are the next two, where no map has roads above each other.
         point_height: [B, P, 2] those of points.
@@ -148,8 +146,6 @@ class SceneBatch(TensorClass):
     edge_previous: Tensor
     edge_following: Tensor
     edge_valid: Tensor
-    point_lists: Tensor
-    edge_lists: Tensor
     agent_height: Tensor
     point_height: Tensor
     edge_height: Tensor
@@ -238,8 +234,6 @@ def scene(
         "edge_previous": previous.astype(np.int32),
         "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
-        "point_lists": np.zeros(0, np.int32),
-        "edge_lists": np.zeros(0, np.int32),
         "agent_height": _heights(segment, levels),
         "edge_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(middle),
         "stream": np.array(stream_of(segment.segment_id)),

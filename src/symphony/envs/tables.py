@@ -14,7 +14,6 @@ from torch import Tensor
 
 from symphony.data.segment import AgentType, SignalState
 from symphony.envs.scene import PointType, SceneBatch
-from symphony.geometry.cell_lists import JoinedLists
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.edges import Edges
 from symphony.geometry.polylines import has_length
@@ -132,19 +131,10 @@ class Tables:
     def point_cells(self) -> PointCells:
         """Cells for the nearest points (CPU)."""
         x, y = self.position
-        count = self.config.num_points
-        kept = _joined(self.scenes.point_lists, self.scenes.point_valid, count)
-        return PointCells(x.numpy(), y.numpy(), count, kept)
+        return PointCells(x.numpy(), y.numpy(), self.config.num_points)
 
     @cached_property
     def edge_cells(self) -> EdgeCells:
         """Cells for the nearest edge of the road (CPU)."""
         exists = self.edges["valid"].view(self.scenes.edge_valid.shape).numpy()
-        return EdgeCells(self.segments, exists, _joined(self.scenes.edge_lists, self.scenes.edge_valid, 1))
-
-
-def _joined(lists: Int[Tensor, "B W"], exists: Bool[Tensor, "B K"], wanted: int) -> JoinedLists | None:
-    """Kept lists of a batch's maps; None where no map has any."""
-    if lists.shape[1] == 0:
-        return None
-    return JoinedLists(lists.numpy(), exists.sum(1).numpy(), total=exists.shape[1], wanted=wanted)
+        return EdgeCells(self.segments, exists)

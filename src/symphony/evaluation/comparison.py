@@ -37,9 +37,6 @@ _FREE = (
     "resume",
     "device",
     "wandb",
-    "wandb_project",
-    "wandb_group",
-    "wandb_tags",
     "checkpoint_every",
     "log_every",
 )

@@ -175,10 +175,6 @@ def evaluate_dataset(
         NotFiniteError: if a network of the agent puts out a number that is not finite.
     """
     agent.check_step(dataset.dt)
-    if config.tilt:
-        raise ConfigError(
-            "with a tilt, rare manoeuvres would count as usual ones: simulate, and see the report"
-        )
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.

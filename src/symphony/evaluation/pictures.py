@@ -180,7 +180,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         raise ConfigError(
             f"with search '{search_kind(agent, config)}' there is no tree to draw: ask for one, --search tree"
         )
-    most = config.trees * (config.branches or settings.test_branches)
+    most = config.trees * settings.test_branches
     config = dataclasses.replace(config, rollouts=min(config.rollouts, most))
     scene = dataset.scene(item).to(torch.device(config.device))
     found = driven_by(agent, scene, config, keep_tree=True)

@@ -37,7 +37,6 @@ _MEMORY = ("batch", "device", "workers", "engine")
 _USUAL = {
     "threshold": None,
     "goals": "tree",
-    "retries": 0,
     "logged_goals": False,
     "action_temperature": 1.0,
     "persona": "",
@@ -113,7 +112,7 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
-    config, settings = result.config, agent.search
+    config, used = result.config, result.config.pruning(agent.search)
     filled = dataclasses.asdict(config) | {
         "search": result.search,
         "interactive": result.interactive,
@@ -125,20 +124,15 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "prune_every": 0,
         "temperature": 0.0,
         "threshold": None,
-        "retries": 0,
-        "retry_above": 0.0,
     }
     if result.search not in ("none", "log"):
-        filled["branches"] = config.branches or settings.test_branches
+        filled["branches"] = used.test_branches
     if result.search in ("tree", "oracle"):
         filled["trees"] = config.trees
-        used = config.pruning(settings)
         filled["rule"], filled["prune_every"] = used.rule, used.prune_every
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
         filled["threshold"] = used.threshold if used.rule == "replace" else None
         filled["goals"] = used.goals
-        filled["retries"] = config.retries
-        filled["retry_above"] = config.retry_above if config.retries else 0.0
     return {name: value for name, value in filled.items() if name not in _MEMORY}
 
 

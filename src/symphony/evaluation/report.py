@@ -157,7 +157,6 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
     numbers, events = _numbers(saved, who, graph)
     group = segment.group or segment.segment_id
     for k, values in enumerate(numbers):
-        values["log_weight"] = None if saved.log_weight is None else float(saved.log_weight[k])
         found.rows.append(_row(segment.segment_id, k, group, saved.failed.get(k, ""), values))
     for hit in (event for event in events if event.kind == "collision" and event.rollout not in saved.failed):
         other = AgentType(segment.agent_type[hit.other]).name.lower()
@@ -187,7 +186,6 @@ _NUMBERS = (
     "first_event",
     "steps",
     "logged_steps",
-    "log_weight",
 )
 
 
@@ -336,8 +334,6 @@ def total_numbers(rows: Sequence[Row]) -> Row:
         are percent of runs (``collision_rate_at_states``: at states only), ``*_time`` percent of the evaluated
         agents' time, ``log_distance`` is a mean over steps. ``*_bound`` is of a percentage that is zero the exact
         bound over groups with 95 % confidence (:func:`symphony.metrics.intervals.zero_bound`), else None.
-        Where rare manoeuvres were made more frequent, also ``untilted_*`` with errors: what the means would be
-        without that, by the weights of the runs; and ``effective_runs``, how many of one weight would tell as much.
     """
     good = [row for row in rows if not row["failed"]]
     out: Row = {
@@ -348,12 +344,6 @@ def total_numbers(rows: Sequence[Row]) -> Row:
     }
     names = sorted({row["group"] for row in good})
     group = np.array([names.index(row["group"]) for row in good], np.int64)
-    tilted = any(row["log_weight"] is not None for row in good)
-    log_weight = np.array([_known(row["log_weight"]) for row in good], np.float64)
-    # Only their ratios matter: less the largest, none is too large for a number and not all are 0.
-    heavy = np.exp(log_weight - log_weight.max(initial=-math.inf))
-    if tilted:
-        out["effective_runs"] = float(heavy.sum() ** 2 / (heavy**2).sum())
     for name, (of, scale, by) in _MEANS.items():
         known = np.array([row[of] is not None for row in good], bool)
         value = np.array([_known(row[of]) for row in good], np.float64)
@@ -366,9 +356,6 @@ def total_numbers(rows: Sequence[Row]) -> Row:
         )
         if name in _SHARES:
             out[f"{name}_bound"] = zero_bound(len(np.unique(group[weight > 0]))) if out[name] == 0 else None
-        if tilted:
-            found = grouped_mean(scale * value, weight * heavy, group)
-            out[f"untilted_{name}"], out[f"untilted_{name}_se"] = found
     for name in _PEAKS:
         out[name] = max((row[name] for row in good if row[name] is not None), default=None)
     out["min_ttc"] = min((row["min_ttc"] for row in good if row["min_ttc"] is not None), default=None)

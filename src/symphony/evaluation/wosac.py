@@ -156,12 +156,11 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
     if settings.action_temperature != 1.0:
         found["action_temperature"] = settings.action_temperature
     if kind != "none":
-        found["branches"] = settings.branches or agent.search.test_branches
+        found["branches"] = pruning.test_branches
     if kind == "tree":
         found |= {"rule": pruning.rule, "prune_every": pruning.prune_every, "goals": pruning.goals}
         found |= {"temperature": pruning.temperature} if pruning.rule == "systematic" else {}
         found |= {"threshold": pruning.threshold} if pruning.rule == "replace" else {}
-        found |= {"retries": settings.retries} if settings.retries else {}
     return found
 
 

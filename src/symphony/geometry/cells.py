@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.geometry.cell_lists import Frame, JoinedLists, Whole, packed
 from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
 from symphony.geometry.nearest import kth_smallest, smallest
 from symphony.geometry.spans import spans
@@ -61,7 +60,7 @@ class Lists(NamedTuple):
 
 
 class Cells(ABC):
-    """The cells of B maps, and lists for those that somebody has been in, where they weren't kept.
+    """The cells of B maps, and lists for those that somebody has been in.
 
     Args:
         low: [B, 2] metres of the lower left corner of what is on each map.
@@ -70,7 +69,6 @@ class Cells(ABC):
         size: least side of a cell, metres.
         total: elements per map, padding included.
         wanted: how many are looked for.
-        kept: lists that were made before; their maps have the cells that they had then.
     """
 
     def __init__(
@@ -82,7 +80,6 @@ class Cells(ABC):
         *,
         total: int,
         wanted: int = 1,
-        kept: JoinedLists | None = None,
     ) -> None:
         self.total, self.wanted = total, wanted
         low, high = (np.where(some[:, None], value, 0.0).astype(np.float64) for value in (low, high))
@@ -91,9 +88,7 @@ class Cells(ABC):
         while (large := np.ceil(extent / side[:, None]).prod(1) > _CELLS).any():
             side[large] *= 2.0
         columns, rows = np.where(some, np.ceil(extent / side[:, None]).T, 0.0)
-        own = Frame(low[:, 0], low[:, 1], side, columns, rows)
-        if kept is not None:
-            own = Frame(*(np.where(kept.some, *two) for two in zip(kept.frame, own, strict=True)))
+        own = low[:, 0], low[:, 1], side, columns, rows
         self.x, self.y, self.side, self.columns, self.rows = map(np.ascontiguousarray, own)
         # Sides are powers of two, so to multiply is to divide.
         self.per_metre = 1.0 / self.side
@@ -103,10 +98,6 @@ class Cells(ABC):
         self.begin, self.count = np.full(cells, -1), np.zeros(cells, np.int64)
         self.sign, self._asked = np.zeros(cells, np.int8), np.zeros(cells, np.int64)
         self.items, self._used = np.zeros(1 << 12, np.int32), 0
-        # Place of a cell's list among the kept ones; -1 where it has none.
-        self._kept, self._place = kept, np.full(cells, -1)
-        if kept is not None:
-            self._place[self.first[kept.scene] + kept.cell] = np.arange(len(kept.cell))
 
     @abstractmethod
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
@@ -150,12 +141,7 @@ class Cells(ABC):
         with _FILLING:
             number, place, times = np.unique(cell[new], return_index=True, return_counts=True)
             self._asked[number] += times
-            kept, missing = self._place[number], self.begin[number] < 0
-            there = missing & (kept >= 0)
-            if self._kept is not None and there.any():
-                count, items = self._kept.lists(kept[there])
-                self._write(number[there], Lists(count, items, self._kept.sign[kept[there]]))
-            due = missing & ~there & (self._asked[number] >= repaid)
+            due = (self.begin[number] < 0) & (self._asked[number] >= repaid)
             if due.any():
                 self._write(number[due], self._made(scene[new[place[due]]], number[due]))
         return self.begin.take(cell) >= 0
@@ -177,22 +163,6 @@ class Cells(ABC):
         self.begin[number] = self._used + lists.length.cumsum() - lists.length
         self._used = end
 
-    def packed(self, x: Reals, y: Reals, number: int) -> Whole:
-        """Lists of the cells around positions [R] of the only map, which has so many elements, as whole numbers."""
-        here = np.stack([x - self.x[0], y - self.y[0]]) * self.per_metre[0]
-        # Those that a square of a cell's side around a position meets.
-        columns, rows = (np.floor(v + np.array([[-0.5], [0.5]])).astype(np.int64) for v in here)
-        wide, high = int(self.columns[0]), int(self.rows[0])
-        met = np.zeros((high + 2, wide + 2), np.bool_)  # with one around for what is beyond
-        met[rows[:, None].clip(-1, high) + 1, columns.clip(-1, wide) + 1] = True
-        cell = np.flatnonzero(met[1:-1, 1:-1])
-        frame = Frame(self.x, self.y, self.side, self.columns, self.rows)
-        none = np.zeros(0, np.int64)
-        lists = (
-            self._made(np.zeros_like(cell), cell) if len(cell) else Lists(none, none, none.astype(np.int8))
-        )
-        return packed(frame, cell, *lists, total=number, wanted=self.wanted)
-
 
 class PointCells(Cells):
     """Cells for the nearest points.
@@ -201,10 +171,9 @@ class PointCells(Cells):
         x: [B, P] of the points; infinity where there is none.
         y: [B, P].
         count: K, how many are looked for. A map with few more has no cells.
-        kept: lists that were made before.
     """
 
-    def __init__(self, x: Reals, y: Reals, count: int, kept: JoinedLists | None = None) -> None:
+    def __init__(self, x: Reals, y: Reals, count: int) -> None:
         exists = np.isfinite(x)
         low, high = (
             np.stack([bound(v, 1, where=exists, initial=start) for v in (x, y)], -1)
@@ -212,7 +181,7 @@ class PointCells(Cells):
         )
         some = exists.sum(1) >= max(_WORTH * count, 1)
         size = POINT_CELL if count <= _MANY else 2 * POINT_CELL
-        super().__init__(low, high, some, size, total=x.shape[1], wanted=count, kept=kept)
+        super().__init__(low, high, some, size, total=x.shape[1], wanted=count)
         self.points = x, y
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
@@ -248,10 +217,9 @@ class EdgeCells(Cells):
     Args:
         edges: of all maps.
         exists: [B, E] which of them there are.
-        kept: lists that were made before.
     """
 
-    def __init__(self, edges: Edges, exists: Bools, kept: JoinedLists | None = None) -> None:
+    def __init__(self, edges: Edges, exists: Bools) -> None:
         shape = exists.shape
         ends = [
             (v, v + 2 * edges.half * unit) for v, unit in ((edges.x, edges.unit_x), (edges.y, edges.unit_y))
@@ -263,7 +231,7 @@ class EdgeCells(Cells):
             )
             for bound, of_two, start in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
         )
-        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1], kept=kept)
+        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1])
         self.edges, self.exists = edges, exists
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:

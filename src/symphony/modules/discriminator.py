@@ -21,8 +21,7 @@ from symphony.modules.encoder import (
     road_features,
     scene_module,
 )
-from symphony.modules.pooling import PoolMode, pool_elements
-from symphony.modules.rows import mlp
+from symphony.modules.pooling import PoolMode
 
 Features = Literal["paper", "clearance", "foresight"]
 _GAP, _ROAD = 3, 2 * 5
@@ -43,9 +42,6 @@ class Discriminator(nn.Module):
         features: ``paper``; ``clearance``, which adds the signed gap to the box of each object and the signed
             distances of centre and corners to the edge of the road; or ``foresight``, which adds to these the gaps at
             :data:`FORESIGHT`, were everyone to keep speed and course.
-        split: whether the logit is the sum of one of the agent on the map, which observes no objects, and the highest
-            of the agent with each object alone, 0 where there is none. So nobody is blamed for what its neighbours
-            do to each other or to the map (the idea of DecompGAIL, Guo et al. 2025, arXiv 2510.06913).
     """
 
     def __init__(
@@ -58,7 +54,6 @@ class Discriminator(nn.Module):
         hidden: int = 32,
         head: Sequence[int] = (64,),
         features: Features = "clearance",
-        split: bool = False,
         pool: PoolMode = "auto",
     ) -> None:
         super().__init__()
@@ -67,10 +62,9 @@ class Discriminator(nn.Module):
         if self.clearance:
             gaps = 1 + len(FORESIGHT) if features == "foresight" else 1
             widths = (own_features + _ROAD, object_features + _GAP * gaps, point_features)
-        groups = widths[2:] if split else widths[1:]
-        self.network = SceneNetwork(SceneEncoder(widths[0], groups, hidden=hidden, pool=pool), 1, head=head)
-        self.pair = mlp((own_features + widths[1], 2 * hidden, hidden, 1)) if split else None
-        self.pool: PoolMode = pool
+        self.network = SceneNetwork(
+            SceneEncoder(widths[0], widths[1:], hidden=hidden, pool=pool), 1, head=head
+        )
 
     def forward(
         self,
@@ -88,17 +82,11 @@ class Discriminator(nn.Module):
         """
         objects_mask = objects_mask & self._near(objects)
         points_mask = points_mask & self._near(points)
-        alone = own
         if road is not None and self.clearance:
             own = torch.cat([own, road_features(road)], -1)
             known = [gap_features(gap).flatten(objects.ndim - 1) for gap in gaps]
             objects = torch.cat([objects, *known], -1)
-        if self.pair is None:
-            logits = self.network(own, valid, objects, objects_mask, points, points_mask)
-        else:
-            both = torch.cat([alone[..., None, :].expand(*objects.shape[:-1], -1), objects], -1)
-            logits = self.network(own, valid, points, points_mask)
-            logits = logits + pool_elements(self.pair, both, objects_mask & valid[..., None], mode=self.pool)
+        logits = self.network(own, valid, objects, objects_mask, points, points_mask)
         return torch.where(valid, logits.squeeze(-1), 0.0)
 
     def _near(self, elements: Float[Tensor, "*e F"]) -> Bool[Tensor, "*e"]:
@@ -119,7 +107,6 @@ def discriminator(
     hidden: int = 32,
     head: Sequence[int] = (64,),
     features: Features = "clearance",
-    split: bool = False,
     pool: PoolMode = "auto",
 ) -> TensorDictModule:
     """A :class:`Discriminator` that reads an observation and writes its logits `[..., N]`."""
@@ -131,7 +118,6 @@ def discriminator(
         hidden=hidden,
         head=head,
         features=features,
-        split=split,
         pool=pool,
     )
     groups = (

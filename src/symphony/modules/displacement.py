@@ -74,7 +74,6 @@ def displacement_policy(
     min_scale: float = 0.05,
     axle: float = 0.3,
     own_keys: Sequence[NestedKey] = (OWN,),
-    road_keys: Sequence[NestedKey] = (),
     valid_key: NestedKey = VALID,
     state_key: NestedKey = STATE,
     action_key: NestedKey = ACTION,
@@ -103,7 +102,6 @@ def displacement_policy(
         min_scale: smallest standard deviation of the Gaussian numbers.
         axle: distance from box centre to rear axle, as a share of the length.
         own_keys: features of the agent itself, concatenated.
-        road_keys: see :func:`symphony.modules.scene_module`; counted by ``own_features``, too.
         valid_key: mask of the agents.
         state_key: `[..., N, 4]`, of which the speed is read.
         action_key: written.
@@ -128,9 +126,7 @@ def displacement_policy(
     parameters: list[NestedKey] = [("agents", name) for name in names]
     kind: dict[str, Any] = {"forward": cells} if cells else {}
     return ProbabilisticTensorDictSequential(
-        scene_module(
-            network, groups, ("agents", "head"), own_keys=own_keys, road_keys=road_keys, valid_key=valid_key
-        ),
+        scene_module(network, groups, ("agents", "head"), own_keys=own_keys, valid_key=valid_key),
         TensorModule(
             _Parameters(cells, dt, size_scale, min_scale, max_slope, max_lateral, axle),
             in_keys=[("agents", "head"), state_key, own_keys[0], valid_key],

@@ -122,15 +122,14 @@ class SceneNetwork(nn.Module):
 class _Join(nn.Module):
     """Concatenates features that come under several keys: the agents' own, and those of each group's elements."""
 
-    def __init__(self, network: nn.Module, owns: int, roads: int, groups: Sequence[ElementGroup]) -> None:
+    def __init__(self, network: nn.Module, owns: int, groups: Sequence[ElementGroup]) -> None:
         super().__init__()
-        self.network, self.owns, self.roads = network, owns, roads
+        self.network, self.owns = network, owns
         self.parts = [(len(group.more_keys), len(group.gap_keys)) for group in groups]
 
     def forward(self, *inputs: Tensor) -> Tensor:
         waiting = iter(inputs)
         own = [next(waiting) for _ in range(self.owns)]
-        own += [road_features(next(waiting)) for _ in range(self.roads)]
         joined = [torch.cat(own, -1), next(waiting)]
         for more, gaps in self.parts:
             elements, mask = next(waiting), next(waiting)
@@ -148,7 +147,6 @@ def scene_module(
     out_key: NestedKey,
     *,
     own_keys: Sequence[NestedKey] = (OWN,),
-    road_keys: Sequence[NestedKey] = (),
     valid_key: NestedKey = VALID,
     more_keys: Sequence[NestedKey] = (),
 ) -> TensorModule:
@@ -159,13 +157,10 @@ def scene_module(
         groups: types of elements.
         out_key: where its result goes.
         own_keys: features of the agent itself, concatenated.
-        road_keys: signed distances `[..., N, K]` to the edge of the road in metres, of each of which
-            :func:`road_features` makes two more.
         valid_key: mask of the agents.
         more_keys: further inputs.
     """
     read = [key for group in groups for key in (group.key, group.mask_key, *group.more_keys, *group.gap_keys)]
-    apart = len(own_keys) + len(road_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
-    joined = _Join(network, len(own_keys), len(road_keys), groups) if apart else network
-    own = [*own_keys, *road_keys]
-    return TensorModule(joined, in_keys=[*own, valid_key, *read, *more_keys], out_keys=[out_key])
+    apart = len(own_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
+    joined = _Join(network, len(own_keys), groups) if apart else network
+    return TensorModule(joined, in_keys=[*own_keys, valid_key, *read, *more_keys], out_keys=[out_key])

@@ -89,7 +89,6 @@ def discrete_policy(
     hidden: int = 64,
     head: Sequence[int] = (128, 128),
     own_keys: Sequence[NestedKey] = (OWN,),
-    road_keys: Sequence[NestedKey] = (),
     valid_key: NestedKey = VALID,
     logits_key: NestedKey = LOGITS,
     action_key: NestedKey = ACTION,
@@ -101,7 +100,7 @@ def discrete_policy(
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).
 
-    Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys` and `road_keys`. Reads each
+    Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys`. Reads each
     group's keys, the own features and the agents' mask; writes logits `[..., N, actions]` and actions `[..., N]`
     int64, sampled according to TorchRL's exploration type (RANDOM unless set; see :class:`NoiseSampler`). It does not
     depend on the number of agents or elements. Another `encoder` takes the arguments of :class:`SceneEncoder`.
@@ -109,9 +108,7 @@ def discrete_policy(
     encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
     network = SceneNetwork(encoding, actions, head=head)
     return ProbabilisticTensorDictSequential(
-        scene_module(
-            network, groups, logits_key, own_keys=own_keys, road_keys=road_keys, valid_key=valid_key
-        ),
+        scene_module(network, groups, logits_key, own_keys=own_keys, valid_key=valid_key),
         NoiseSampler(
             logits_key,
             action_key,

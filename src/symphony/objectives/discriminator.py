@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
-from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional
@@ -29,15 +27,9 @@ class DiscriminatorLoss(MaskedLoss):
 
     Args:
         discriminator: module that writes one logit per entry, `[..., N]`, under the `score` key.
-        gradient_penalty: weight of the mean squared norm of the logit's gradient with respect to an entry's own
-            inputs, added to the loss (R1 of Mescheder et al. 2018 on data; their gamma is twice this weight). It
-            supposes that a logit depends on its own entry's inputs only.
-        penalty_keys: inputs `[..., N, *]` of the discriminator that count for the norm; None for all its
-            floating-point inputs.
-        penalty_on: entries whose gradient is penalised.
-        instance_noise: standard deviation of Gaussian noise added to `noise_keys` of both kinds in training mode.
-        noise_keys: floating-point inputs of the discriminator that receive the noise.
-        generator: source of the noise; None for the global one. Its state is not part of the state_dict.
+        gradient_penalty: weight of the mean squared norm, over data, of the logit's gradient with respect to an
+            entry's own floating-point inputs `[..., N, *]`, added to the loss (R1 of Mescheder et al. 2018; their
+            gamma is twice this weight). It supposes that a logit depends on its own entry's inputs only.
         label_smoothing: share of the target spread evenly over both kinds, in [0, 1).
         reduction: `"mean"` as above (0 for a kind that is absent); `"sum"` over all entries that count; `"none"`,
             which keeps the shape `[..., N]`, with zeros elsewhere. The penalty is reduced and added alike.
@@ -81,32 +73,17 @@ class DiscriminatorLoss(MaskedLoss):
         discriminator: TensorDictModuleBase,
         *,
         gradient_penalty: float = 0.0,
-        penalty_keys: Sequence[NestedKey] | None = None,
-        penalty_on: Literal["data", "simulated", "both"] = "data",
-        instance_noise: float = 0.0,
-        noise_keys: Sequence[NestedKey] = (),
-        generator: torch.Generator | None = None,
         label_smoothing: float = 0.0,
         reduction: Reduction | None = None,
         use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
-        for name, value in (("gradient_penalty", gradient_penalty), ("instance_noise", instance_noise)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} must be at least 0, is {value}")
+        if not (math.isfinite(gradient_penalty) and gradient_penalty >= 0.0):
+            raise ValueError(f"gradient_penalty must be at least 0, is {gradient_penalty}")
         if not 0.0 <= label_smoothing < 1.0:
             raise ValueError(f"label_smoothing must be in [0, 1), is {label_smoothing}")
-        if penalty_on not in ("data", "simulated", "both"):
-            raise ValueError(f"unknown penalty_on {penalty_on!r}, expected 'data', 'simulated' or 'both'")
-        if instance_noise and not noise_keys:
-            raise ValueError("instance_noise needs noise_keys")
         self.convert_to_functional(discriminator, "discriminator")
-        self.penalty_keys = None if penalty_keys is None else self._inputs("penalty_keys", penalty_keys)
-        self.noise_keys = self._inputs("noise_keys", noise_keys)
         self.gradient_penalty = gradient_penalty
-        self.penalty_on = penalty_on
-        self.instance_noise = instance_noise
-        self.generator = generator
         self.label_smoothing = label_smoothing
         self.out_keys = [
             "loss_discriminator",
@@ -118,13 +95,6 @@ class DiscriminatorLoss(MaskedLoss):
             *(["gradient_penalty"] if gradient_penalty else []),
         ]
 
-    def _inputs(self, name: str, given: Sequence[NestedKey]) -> list[NestedKey]:
-        wanted = [unravel_key(key) for key in given]
-        strange = [key for key in wanted if key not in self.discriminator.in_keys]
-        if strange:
-            raise ValueError(f"{name}: the discriminator does not read {strange}")
-        return wanted
-
     def _read_keys(self) -> list[NestedKey]:
         return [*self.discriminator.in_keys, self.tensor_keys.simulated]
 
@@ -135,7 +105,7 @@ class DiscriminatorLoss(MaskedLoss):
         penalised = bool(self.gradient_penalty)
         # The penalty takes a gradient, also where its caller wants none.
         with torch.set_grad_enabled(training or penalised):
-            inputs = self._noisy(tensordict.select(*self.discriminator.in_keys).detach())
+            inputs = tensordict.select(*self.discriminator.in_keys).detach()
             leaves = self._leaves(inputs) if penalised else []
             with self.discriminator_params.to_module(self.discriminator):
                 logit = self.discriminator(inputs).get(self.tensor_keys.score, default=None)
@@ -147,40 +117,20 @@ class DiscriminatorLoss(MaskedLoss):
             loss = self._cross_entropy(logit, fake, real)
             statistics = self._statistics(logit.detach(), fake, real)
             if penalised:
-                where = {"data": real, "simulated": fake, "both": counted}[self.penalty_on]
-                squared = _squared_norm(logit, leaves, where, create_graph=training)
-                loss = loss + self.gradient_penalty * self._reduced(squared, where)
-                statistics["gradient_penalty"] = self._reduced(squared.detach(), where, "mean")
+                squared = _squared_norm(logit, leaves, real, create_graph=training)
+                loss = loss + self.gradient_penalty * self._reduced(squared, real)
+                statistics["gradient_penalty"] = self._reduced(squared.detach(), real, "mean")
         result = TensorDict({"loss_discriminator": loss if training else loss.detach(), **statistics})
         self._clear_weakrefs(tensordict, result, "discriminator_params")
         return result
 
-    def _noisy(self, inputs: TensorDictBase) -> TensorDictBase:
-        if not (self.instance_noise and self.training):
-            return inputs
-        for key in self.noise_keys:
-            value = self._floating(inputs, key)
-            source = value.device if self.generator is None else self.generator.device
-            noise = torch.randn(value.shape, generator=self.generator, dtype=value.dtype, device=source)
-            inputs.set(key, value + self.instance_noise * noise.to(value.device))
-        return inputs
-
     def _leaves(self, inputs: TensorDictBase) -> list[Float[Tensor, "*_"]]:
         """The inputs to differentiate by, put in place as leaves."""
-        chosen = self.penalty_keys
-        if chosen is None:
-            chosen = [key for key in self.discriminator.in_keys if inputs.get(key).is_floating_point()]
-        leaves = [self._floating(inputs, key).detach().requires_grad_() for key in chosen]
+        chosen = [key for key in self.discriminator.in_keys if inputs.get(key).is_floating_point()]
+        leaves = [inputs.get(key).detach().requires_grad_() for key in chosen]
         for key, leaf in zip(chosen, leaves, strict=True):
             inputs.set(key, leaf)
         return leaves
-
-    @staticmethod
-    def _floating(inputs: TensorDictBase, key: NestedKey) -> Float[Tensor, "*_"]:
-        value = inputs.get(key)
-        if not value.is_floating_point():
-            raise ValueError(f"{key!r} is {value.dtype}, expected floating point")
-        return value
 
     def _cross_entropy(
         self, logit: Float[Tensor, "*b"], fake: Bool[Tensor, "*b"], real: Bool[Tensor, "*b"]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Literal
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, dispatch
@@ -16,15 +14,13 @@ from symphony.objectives.base import ActorLoss, Reduction
 class DistillationLoss(ActorLoss):
     """Likelihood of expert actions and of actions in rollouts that survived a search (paper, III).
 
-    The mean negative log-likelihood over the valid expert entries plus `rollout_weight` times that over the valid
-    rollout entries: each kind has its own mean, so the balance does not depend on how many of each a batch holds.
+    The mean negative log-likelihood over the valid expert entries plus that over the valid rollout entries: each
+    kind has its own mean, so the balance does not depend on how many of each a batch holds.
 
     Args:
         actor_network: probabilistic module with a `get_dist`, over discrete or continuous actions.
-        rollout_weight: weight of the rollouts beside the experts, at least 0.
-        survivors: rollouts to learn from: `"all"` that survived, or of each tree only the `"best"`.
         reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
-            `[...]` of the log-probability: rollout entries times the weight, zeros where an entry does not count.
+            `[...]` of the log-probability, zeros where an entry does not count.
         label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
             only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
@@ -47,14 +43,11 @@ class DistillationLoss(ActorLoss):
             valid (NestedKey): bool mask, True where an agent counts. Defaults to `symphony.keys.VALID`.
             rollout (NestedKey): bool, True where the action comes from a rollout, False where from an expert.
                 Defaults to `symphony.keys.ROLLOUT`.
-            rank (NestedKey): int, place of a rollout among those of its tree, 0 for the best; read with
-                `survivors="best"` only. Defaults to `symphony.keys.RANK`.
         """
 
         action: NestedKey = keys.ACTION
         valid: NestedKey = keys.VALID
         rollout: NestedKey = keys.ROLLOUT
-        rank: NestedKey = keys.RANK
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -63,25 +56,16 @@ class DistillationLoss(ActorLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
         *,
-        rollout_weight: float = 1.0,
-        survivors: Literal["all", "best"] = "all",
         reduction: Reduction | None = None,
         label_smoothing: float = 0.0,
         use_mask: bool | None = None,
     ) -> None:
         super().__init__(actor_network, reduction, label_smoothing, use_mask)
-        if not (math.isfinite(rollout_weight) and rollout_weight >= 0.0):
-            raise ValueError(f"rollout_weight must be at least 0, is {rollout_weight}")
-        if survivors not in ("all", "best"):
-            raise ValueError(f"unknown survivors {survivors!r}, expected 'all' or 'best'")
-        self.rollout_weight = rollout_weight
-        self.survivors = survivors
         statistics = ["entropy", "accuracy"] if self.categorical else []
         self.out_keys = ["loss_distillation", "nll_expert", "nll_rollout", *statistics]
 
     def _read_keys(self) -> list[NestedKey]:
-        read = [*super()._read_keys(), self.tensor_keys.rollout]
-        return [*read, self.tensor_keys.rank] if self.survivors == "best" else read
+        return [*super()._read_keys(), self.tensor_keys.rollout]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -90,13 +74,10 @@ class DistillationLoss(ActorLoss):
         shape = fit.counted.shape
         rollout = self._flags(tensordict, self.tensor_keys.rollout, "rollout flag", shape)
         expert, rollout = fit.counted & ~rollout, fit.counted & rollout
-        if self.survivors == "best":
-            rollout = rollout & (self._entries(tensordict, self.tensor_keys.rank, "rank", shape) == 0)
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
         result = TensorDict(
             {
-                "loss_distillation": self._reduced(fit.cost, expert)
-                + self.rollout_weight * self._reduced(fit.cost, rollout),
+                "loss_distillation": self._reduced(fit.cost, expert) + self._reduced(fit.cost, rollout),
                 "nll_expert": self._reduced(fit.nll, expert, reduction),
                 "nll_rollout": self._reduced(fit.nll, rollout, reduction),
                 **self._statistics(fit, expert),

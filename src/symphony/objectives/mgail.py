@@ -13,7 +13,6 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torch.func import functional_call
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -49,8 +48,6 @@ class MGAILLoss(MaskedLoss):
         detach_keys: inputs of the actor through which no gradient flows back to earlier states. Without them
             gradients pass through the actor's reactions too.
         truncate: steps after which the gradient is cut; 0: never.
-        checkpoint: steps that are simulated once more in the backward pass instead of being kept; 0: all are
-            kept. Changes no result; memory then grows with T / checkpoint + checkpoint instead of T.
         reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
@@ -100,20 +97,19 @@ class MGAILLoss(MaskedLoss):
         cost: Cost = "log_d",
         detach_keys: Sequence[NestedKey] = (),
         truncate: int = 0,
-        checkpoint: int = 0,
         reduction: Reduction | None = None,
         use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
         if cost not in COSTS:
             raise ValueError(f"unknown cost {cost!r}, expected one of {', '.join(COSTS)}")
-        for name, value in (("horizon", horizon), ("truncate", truncate), ("checkpoint", checkpoint)):
+        for name, value in (("horizon", horizon), ("truncate", truncate)):
             if value < 0:
                 raise ValueError(f"{name} must be at least 0, is {value}")
         self.convert_to_functional(actor_network, "actor_network")
         # Neither is trained here: in a container they are neither saved nor reset with the loss.
         self._held: dict[str, Any] = {"discriminator": discriminator, "env": env}
-        self.horizon, self.cost, self.truncate, self.checkpoint = horizon, cost, truncate, checkpoint
+        self.horizon, self.cost, self.truncate = horizon, cost, truncate
         self.detach_keys = [key for key in detach_keys if key in actor_network.in_keys]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -162,32 +158,9 @@ class MGAILLoss(MaskedLoss):
         if steps < 1:
             raise ValueError("nothing to simulate: give a horizon, or random numbers for at least one step")
         self._mask(start)  # or complain now
-        size = self.checkpoint or steps
-        scores, going = [], []
-        for first in range(0, steps, size):
-            length = min(size, steps - first)
-            numbers = None if plan is None else plan.narrow(batch, first, length)
-            if self.checkpoint and torch.is_grad_enabled():
-                # An early stop would leave the actor by an exception, its weights still in place.
-                with set_checkpoint_early_stop(False):
-                    score, alive, now = checkpoint(
-                        self._simulate,
-                        env,
-                        now,
-                        numbers,
-                        first,
-                        length,
-                        use_reentrant=False,
-                        # Given numbers leave nothing to chance; otherwise the same must be drawn again.
-                        preserve_rng_state=plan is None,
-                    )
-            else:
-                score, alive, now = self._simulate(env, now, numbers, first, length)
-            scores.append(score)
-            going.append(alive)
-        score = torch.cat(scores, batch)
+        score, going = self._simulate(env, now, plan, steps)
         valid = self._counted(start, score.select(batch, 0).shape, done.device)
-        counted = valid.unsqueeze(batch) & torch.cat(going, batch)
+        counted = valid.unsqueeze(batch) & going
         result = TensorDict(
             {
                 "loss_mgail": self._reduced(COSTS[self.cost](score), counted),
@@ -202,19 +175,17 @@ class MGAILLoss(MaskedLoss):
         env: EnvBase,
         now: TensorDictBase,
         numbers: Float[Tensor, "*_"] | None,
-        first: int,
-        length: int,
-    ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"], TensorDictBase]:
-        """Logits and whether the episode still ran, `[..., length, N]`, and the state after the last step."""
+        steps: int,
+    ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"]]:
+        """Logits and whether the episode still ran, `[..., steps, N]`."""
         batch, scores, going = now.batch_dims, [], []
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
-        # Entered here, since a checkpoint calls this again when the loss has returned.
         with (
             self.actor_network_params.to_module(self.actor_network),
             set_exploration_type(ExplorationType.RANDOM),
         ):
-            for t in range(length):
-                if self.truncate and (first + t) % self.truncate == 0:
+            for t in range(steps):
+                if self.truncate and t % self.truncate == 0:
                     now = now.detach()
                 acting = now.copy()
                 for key in self.detach_keys:
@@ -234,4 +205,4 @@ class MGAILLoss(MaskedLoss):
                 scores.append(score)
                 going.append(alive.reshape(alive.shape[:batch] + (1,) * (score.ndim - batch)))
         score = torch.stack(scores, batch)
-        return score, torch.stack(going, batch).expand_as(score), now
+        return score, torch.stack(going, batch).expand_as(score)

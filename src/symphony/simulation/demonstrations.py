@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
@@ -16,9 +15,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from symphony import keys
-from symphony.config import PerturbConfig, SamplingConfig
+from symphony.config import PerturbConfig
 from symphony.data.segment import RunSegment
-from symphony.data.selection import interactive_choice
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
@@ -28,11 +26,9 @@ from symphony.errors import DataError
 from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph
 from symphony.simulation.experts import Experts, fit_experts
-from symphony.simulation.kept import KeptExperts, KeptLists
+from symphony.simulation.kept import KeptExperts
 from symphony.simulation.logged import expert_batch, logged, logged_routes
 from symphony.simulation.memory import ItemCache
-from symphony.simulation.weights import segment_weights, some_of, state_weights
-from symphony.streams import stream_of, uniform
 
 if TYPE_CHECKING:
     from symphony.simulation.personas import PersonaScale
@@ -41,8 +37,6 @@ GRAPHS = 64
 """Lane graphs held in memory."""
 DISPLACED = 2.0
 """Metres that a state to learn from may lie from the log, for which its place along the route is looked for."""
-_COUNT = (1 << 40) + 3
-"""Number, in a segment's stream, of the draw of how many agents act: far above those of rollouts and steps."""
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
@@ -62,16 +56,10 @@ class SceneDataset:
         routes: whether scenes and experts come with their routes.
         duration: seconds of each segment that are used; 0 for all.
         keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
-            machine's memory; 170 kB each in the built-in data, with routes, 220 with lists).
-        sampling: what is drawn more often than the rest; nothing by default.
-        most: where it is more than ``interactive``, the number that act is drawn for every segment, once and for all,
-            between the two; a segment with fewer has those that there are.
+            machine's memory; 170 kB each in the built-in data, with routes).
         persona: whether the driving style of all agents is measured.
-        num_points: how many of the nearest map points agents will see: lists of what these can be are made for each
-            map and kept with the store. 0: what is near is found when it is asked for; the same, in more time.
 
     Raises:
-        ConfigError, DataError: if its record is of another store or can't be read.
         DataError: on access, for a segment shorter than the duration.
     """
 
@@ -85,28 +73,19 @@ class SceneDataset:
         routes: bool = False,
         duration: float = 0,
         keep: int | None = None,
-        sampling: SamplingConfig | None = None,
-        most: int = 0,
         persona: bool = False,
-        num_points: int = 0,
     ) -> None:
         self.store = store
-        self.least, self.interactive = interactive, max(interactive, most)
+        self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.persona = routes, duration, keep, persona
-        self.num_points = num_points
-        self.sampling = SamplingConfig() if sampling is None else sampling
-        self._weights = segment_weights(self.sampling, store, self.indices)
         self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
-        self.lists = KeptLists(store.path, num_points) if num_points else None
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
         # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
-        # Of a drawn number of agents the rest is padding, so that N stays what it is.
-        agents = 0 if self.least == self.interactive else self.interactive
-        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items), agents))
+        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         build = partial(
@@ -114,12 +93,9 @@ class SceneDataset:
             routes=self.routes,
             duration=self.duration,
             keep=self.keep,
-            sampling=self.sampling,
-            most=self.interactive,
             persona=self.persona,
-            num_points=self.num_points,
         )
-        return build, (self.store, self.least, self.dynamics, self.indices)
+        return build, (self.store, self.interactive, self.dynamics, self.indices)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -156,10 +132,8 @@ class SceneDataset:
         return min(longest, round(self.duration / self.dt)) if self.duration else longest
 
     def checksum(self) -> str:
-        """Of the store, and of the record that says which segments are hard, if there is one."""
-        if self._weights is None or self.sampling.hard is None:
-            return self.store.checksum()
-        return hashlib.sha256(self.store.checksum().encode() + self._weights.numpy().tobytes()).hexdigest()
+        """The store's."""
+        return self.store.checksum()
 
     def segment(self, i: int) -> RunSegment:
         """The run segment behind item ``i``, up to the duration."""
@@ -185,7 +159,7 @@ class SceneDataset:
         """Item ``i`` as a batch of one scene."""
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
         persona = self.personas.personas(self._styles(i)) if self.persona else None
-        return scene(segment, self._interactive(segment), graph, number=i, persona=persona)
+        return scene(segment, self.interactive, graph, number=i, persona=persona)
 
     @cached_property
     def personas(self) -> PersonaScale:
@@ -199,21 +173,8 @@ class SceneDataset:
 
         return styles(self.segment(i), self.graph(i))
 
-    def _interactive(self, segment: RunSegment) -> int | list[int]:
-        """How many agents of a segment act, or which."""
-        if self.least == self.interactive:
-            return self.interactive
-        # Of the segment's own stream, so that neither its place in the store nor an interruption matters.
-        share = float(uniform(0, torch.tensor(stream_of(segment.segment_id)), _COUNT))
-        count = self.least + int(share * (self.interactive - self.least + 1))
-        chosen = interactive_choice(segment, count, fewer=True).agents.tolist()
-        return chosen if len(chosen) >= self.least else self.least
-
     def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
-        prepared = [self._scene(i) for i in items]
-        if self.lists is None:
-            return prepared
-        return [self.lists.of(one).beside(one) for one in prepared]
+        return [self._scene(i) for i in items]
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Several items as one padded batch."""
@@ -234,8 +195,6 @@ class SceneDataset:
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Different items at random (all, if there are fewer)."""
-        if self._weights is not None:
-            return some_of(self._weights, count, self.sampling.share, rng)
         return torch.randperm(len(self), generator=rng)[:count].tolist()
 
     def sample_states(
@@ -247,7 +206,7 @@ class SceneDataset:
         device: torch.device | str = "cpu",
         perturb: PerturbConfig | None = None,
     ) -> TensorDict:
-        """A training batch: expert states drawn from some segments (see ``sampling``), some of them displaced.
+        """A training batch: expert states drawn from some segments, some of them displaced.
 
         Returns:
             TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
@@ -256,7 +215,7 @@ class SceneDataset:
         places = [expert.valid.nonzero(as_tuple=True) for expert in found]
         sizes = torch.tensor([len(which) for which, _ in places])
         scenes = self.scenes(items)
-        pick = self._pick(found, places, scenes, states, rng)
+        pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
         item = torch.repeat_interleave(torch.arange(len(items)), sizes)[pick]
         which, when = (torch.cat(parts)[pick] for parts in zip(*places, strict=True))
         ends = torch.tensor([len(expert.agent) for expert in found]).cumsum(0)
@@ -270,11 +229,17 @@ class SceneDataset:
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
         if perturb is not None:
-            from symphony.simulation.perturbation import perturbed  # noqa: PLC0415 - likewise
+            from symphony.simulation.perturbation import (  # noqa: PLC0415 - few learn from displaced states
+                AHEAD,
+                AHEAD_IN_STYLE,
+                perturbed,
+            )
 
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
-            size = scenes.box_size[item, agent]
-            state, action = perturbed(state, action, now, later, size, self.dynamics, self.dt, perturb, rng)
+            size, ahead = scenes.box_size[item, agent], AHEAD_IN_STYLE if self.persona else AHEAD
+            state, action = perturbed(
+                state, action, now, later, size, self.dynamics, self.dt, perturb.share, rng, ahead
+            )
         seen = None
         if observation.route:
             progress = torch.cat([e.progress.flatten() for e in found])[begin[row] + when]
@@ -289,33 +254,6 @@ class SceneDataset:
             action=action.to(device),
             routes=None if seen is None else RouteWindow(*(part.to(device) for part in seen)),
         )
-
-    def _pick(
-        self,
-        experts: Sequence[Experts],
-        places: Sequence[tuple[Tensor, ...]],
-        scenes: SceneBatch,
-        count: int,
-        rng: torch.Generator,
-    ) -> Int[Tensor, " count"]:
-        """Numbers of some of all valid expert states."""
-        if self.sampling.even:
-            return torch.randint(sum(len(which) for which, _ in places), (count,), generator=rng)
-        acts = [
-            torch.isin(expert.agent[which], chosen[real])
-            for expert, (which, _), chosen, real in zip(
-                experts, places, scenes.interactive, scenes.interactive_valid, strict=True
-            )
-        ]
-        speed = [expert.states[place][:, 3] for expert, place in zip(experts, places, strict=True)]
-        weights = state_weights(torch.cat(acts), torch.cat(speed), self.sampling)
-        if not (weights > 0).any():
-            raise DataError(
-                "none of the states drawn for an update counts; give a larger batch or weights above 0",
-                file=self.store.path,
-                field="sampling",
-            )
-        return torch.multinomial(weights, count, replacement=True, generator=rng)
 
     def sample_goals(
         self,

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import BeamSearchResult, KeepAll
+from symphony.collectors import BeamSearchResult, KeepAll, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle
@@ -24,7 +24,6 @@ from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
 from symphony.simulation.control import Tempered, given_personas
 from symphony.simulation.finite import FiniteWatch
-from symphony.simulation.importance import Tilt
 from symphony.simulation.logged import logged
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import (
@@ -35,7 +34,7 @@ from symphony.simulation.rollouts import (
     simulate,
     start_states,
 )
-from symphony.simulation.search import aggregate_of, pruning_rule, search
+from symphony.simulation.search import pruning_rule, search
 
 RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
@@ -54,7 +53,6 @@ class Simulation(NamedTuple):
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
-        log_weight: [B, K] logarithm of what each rollout weighs after a tilt; None without one.
     """
 
     rollouts: Rollouts
@@ -63,7 +61,6 @@ class Simulation(NamedTuple):
     at_states: Bool[Tensor, "B K T N"]
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
-    log_weight: Float[Tensor, "B K"] | None = None
 
 
 def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
@@ -112,7 +109,7 @@ def simulation(
         policy = ConstantVelocity(Bicycle())
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    trees, branches, taken = planned_trees(agent, config)
+    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
@@ -123,17 +120,15 @@ def simulation(
         branches=branches,
         seed=config.seed,
         logged_goals=config.logged_goals,
-        goals_per=config.pruning(agent.search).goals,
+        goals_per=settings.goals,
         personas=given_personas(agent.personas, config.persona),
         fix=_fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None),
     )
-    settings, planned = config.pruning(agent.search), None
+    planned = None
     if egos is not None:
         kind = search_kind(agent, config)
-        # Nothing else simulates a period again.
-        keep_every = settings.prune_every if config.retries and kind in ("tree", "oracle") else 0
         forked = kind not in ("none", "log")
-        planned = egos.begin(env, start, seed=config.seed, keep_every=keep_every, forked=forked)
+        planned = egos.begin(env, start, seed=config.seed, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
     drawn = goal
@@ -155,14 +150,10 @@ def simulation(
                 seed=config.seed,
                 rule=KeepAll() if best else pruning_rule(settings),
                 prune_every=settings.prune_every,
-                aggregate=aggregate_of(settings),
                 leaves=None if best else taken,
-                retries=0 if best else config.retries,
-                retry_above=config.retry_above,
                 keep_tree=keep_tree and not best,
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
-                tilt=Tilt(env, config.tilt, config.tilt_on, ego=planned is None) if config.tilt else None,
             )
         found = rollouts_of(env, start, result.trajectories)
         # A copy of a branch follows the goals of its parent.
@@ -170,21 +161,15 @@ def simulation(
         number = result.trajectories.get(keys.PLANNER, None)
         number = None if number is None else number[..., -1, :]
         if best:
-            order = aggregate_of(settings)(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
             found, result = Rollouts(*(_branches(part, order) for part in found)), None
             goal = _branches(goal, order)
             number = None if number is None else _branches(number, order)
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
-    weights = None if result is None or result.log_weights is None else result.log_weights.flatten(1)
     whole = Simulation(
-        rollouts,
-        goal,
-        result,
-        at_states=rollouts.collision,
-        drawn=None if result is None else drawn,
-        log_weight=weights,
+        rollouts, goal, result, at_states=rollouts.collision, drawn=None if result is None else drawn
     )
     if planned is None or number is None:
         return whole
@@ -292,21 +277,14 @@ def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
     if kind in ("none", "log"):
-        if config.tilt:
-            raise ConfigError("a tilt needs a search: the agent has none, see --search")
         return config.rollouts, 1, 1
-    branches = config.branches or agent.search.test_branches
+    branches = config.pruning(agent.search).test_branches
     if kind == "best":
         return config.rollouts, branches, 1
     taken = config.rollouts // config.trees
     if taken > branches:
         raise ConfigError(
             f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-        )
-    if config.tilt and taken < branches:
-        raise ConfigError(
-            f"with a tilt every branch is a rollout: {config.trees} trees of {branches} branches are "
-            f"{config.trees * branches} rollouts, not {config.rollouts}"
         )
     return config.trees, branches, taken
 
@@ -316,15 +294,10 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     each as that takes: what is independent of each other are segments.
 
     It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
-    rollouts than a tree has branches come from as few trees as that takes; with a tilt every branch stays a rollout.
+    rollouts than a tree has branches come from as few trees as that takes.
     """
     kind, least = search_kind(agent, config), -(-runs // segments)
-    branches = config.branches or agent.search.test_branches
-    if config.tilt:
-        each = config.rollouts * -(-least // config.rollouts)
-        return -(-runs // each), dataclasses.replace(
-            config, rollouts=each, trees=config.trees * each // config.rollouts
-        )
+    branches = config.pruning(agent.search).test_branches
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""

@@ -1,4 +1,4 @@
-"""What is made once for a store and kept in its folder: demonstrations by segment, lists of near points by map."""
+"""What is made once for a store and kept in its folder: demonstrations by segment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import io
 import os
 import zipfile
-from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,19 +17,13 @@ from torch import Tensor
 
 import symphony
 from symphony.data.npz import read_npz
-from symphony.envs.map_lists import MapLists, map_parts
 from symphony.envs.routes import RouteTable
-from symphony.envs.scene import SceneBatch
 from symphony.errors import DataError
 from symphony.files import replacing
 from symphony.simulation.experts import Experts
 
 VERSION = 3
 """Of the fit: raised when it gives something else for the same segment, or other routes (a test says when)."""
-LISTS_VERSION = 1
-"""Of the lists: raised when the same points and edges give others (likewise)."""
-RECENT = 64
-"""Maps whose lists are held in memory for the next scene on one of them."""
 PACKAGE = Path(symphony.__file__).parent
 
 
@@ -69,8 +62,7 @@ class KeptFiles:
         except (DataError, OSError):
             return None
 
-    def _save(self, content: str, arrays: Mapping[str, NDArray[Any]], *, small: bool = False) -> None:
-        """Keep arrays, ``small`` in a quarter of the space and a little more time."""
+    def _save(self, content: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         path = self._path(content)
         if path is None or not os.access(path.parent, os.W_OK):
             return
@@ -81,8 +73,7 @@ class KeptFiles:
                     np.save(part, array)
                     # Of no date, so that equal arrays are equal files.
                     entry = zipfile.ZipInfo(f"{name}.npy")
-                    how = zipfile.ZIP_DEFLATED if small else zipfile.ZIP_STORED
-                    file.writestr(entry, part.getvalue(), how, 1)
+                    file.writestr(entry, part.getvalue())
         except OSError:
             self.folder = None
 
@@ -109,44 +100,6 @@ class KeptExperts(KeptFiles):
     def save(self, content: str, experts: Experts) -> None:
         """Keep those of a segment, if the folder can be written and the disk has room."""
         self._save(content, _to_arrays(experts))
-
-
-class KeptLists(KeptFiles):
-    """Lists of near points and edges kept with their store, so that they are made once for each map.
-
-    Args:
-        store: the store's folder.
-        num_points: nearest points that are looked for.
-    """
-
-    def __init__(self, store: Path, num_points: int) -> None:
-        super().__init__(store, "lists", LISTS_VERSION, str(num_points))
-        self.num_points = num_points
-        self._recent: OrderedDict[str, MapLists] = OrderedDict()
-
-    def of(self, scene: SceneBatch) -> MapLists:
-        """Those of the map on which a scene lies, named after its points and edges; scenes on one map share them."""
-        digest = hashlib.sha256()
-        for part in map_parts(scene):
-            digest.update(str(part.shape).encode() + np.ascontiguousarray(part).tobytes())
-        content = digest.hexdigest()
-        if content not in self._recent:
-            self._recent[content] = self._read(content, scene) or self._make(content, scene)
-            if len(self._recent) > RECENT:
-                self._recent.popitem(last=False)
-        return self._recent[content]
-
-    def _read(self, content: str, scene: SceneBatch) -> MapLists | None:
-        arrays = self._load(content)
-        if arrays is None or set(arrays) != set(MapLists._fields):
-            return None
-        found = MapLists(**arrays)
-        return found if found.fit(scene) else None
-
-    def _make(self, content: str, scene: SceneBatch) -> MapLists:
-        made = MapLists.of(scene, self.num_points)
-        self._save(content, made._asdict(), small=True)
-        return made
 
 
 def _to_arrays(experts: Experts) -> dict[str, Any]:

@@ -10,12 +10,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from symphony.config import PerturbConfig
 from symphony.envs.dynamics import Bicycle, Displacement, bicycle_inverse, bicycle_step
 from symphony.geometry.frames import rotate, wrap
 
 ALONG, ACROSS = 1.5, 1.0
 """Seconds in which an error along and across the road dies out to a third or so."""
+AHEAD, AHEAD_IN_STYLE = 1.5, 8.0
+"""Standard deviations of displacements along the road in metres; the second is that of agents with personas, which
+have to see other headways than the one that a driver keeps in the log."""
+ASIDE, TURNED, FASTER = 0.5, 0.1, 1.5
+"""Standard deviations of displacements to the side in metres, in heading in radians and in speed in m/s."""
 SLOWEST = 2.0
 """m/s below which steering is not made harder, however slow the vehicle."""
 STEERING, BRAKING = 0.5, 4.0
@@ -23,7 +27,7 @@ STEERING, BRAKING = 0.5, 4.0
 
 
 def displaced(
-    logged: Float[Tensor, "M 4"], config: PerturbConfig, rng: torch.Generator
+    logged: Float[Tensor, "M 4"], rng: torch.Generator, ahead: float = AHEAD
 ) -> Float[Tensor, "M 4"]:
     """States x, y, heading, speed near logged ones.
 
@@ -34,9 +38,9 @@ def displaced(
     share = torch.rand(len(logged), generator=rng)
     speed = logged[:, 3].abs()
     slow = (speed / 4.0).clamp_max(1.0)
-    shift = torch.stack([normal[:, 0] * config.along, normal[:, 1] * config.across * slow], -1)
-    turn = normal[:, 2] * config.heading * slow * (8.0 / speed.clamp_min(8.0))
-    faster = normal[:, 3] * config.speed
+    shift = torch.stack([normal[:, 0] * ahead, normal[:, 1] * ASIDE * slow], -1)
+    turn = normal[:, 2] * TURNED * slow * (8.0 / speed.clamp_min(8.0))
+    faster = normal[:, 3] * FASTER
     return torch.cat(
         [
             logged[:, :2] + rotate(share[:, None] * shift, logged[:, 2]),
@@ -87,8 +91,9 @@ def perturbed(
     size: Float[Tensor, "M 2"],
     dynamics: Bicycle | Displacement,
     dt: float,
-    config: PerturbConfig,
+    share: float,
     rng: torch.Generator,
+    ahead: float = AHEAD,
 ) -> tuple[Float[Tensor, "M 4"], Tensor]:
     """Expert states and actions, a share of them displaced and labelled with the action that comes nearest to the way
     back.
@@ -101,11 +106,12 @@ def perturbed(
         size: of the boxes, metres.
         dynamics: the action space.
         dt: seconds per step.
-        config: how many and how far.
+        share: of the states that are displaced.
         rng: for all draws.
+        ahead: standard deviation of displacements along the road, metres.
     """
-    chosen = (torch.rand(len(state), generator=rng) < config.share).nonzero()[:, 0]
-    moved, before, size = displaced(logged, config, rng)[chosen], logged[chosen], size[chosen]
+    chosen = (torch.rand(len(state), generator=rng) < share).nonzero()[:, 0]
+    moved, before, size = displaced(logged, rng, ahead)[chosen], logged[chosen], size[chosen]
     target = way_back(moved, before, following[chosen], size[:, 0], dt)
     label = dynamics.towards(moved, target, size, dt).to(action.dtype)
     return state.index_copy(0, chosen, moved), action.index_copy(0, chosen, label)

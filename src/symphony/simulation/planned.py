@@ -24,10 +24,7 @@ from symphony.envs.routes import ONWARD, SPACING
 from symphony.errors import ConfigError
 from symphony.simulation.planner import Planner, Traffic, checked_plan, fixed, scenario_of
 from symphony.simulation.planner_calls import SECONDS, answer, plans_of
-from symphony.streams import fold_in
-
-_PLANNERS = (1 << 40) + 3
-"""Number of the stream that the seeds of planners come from, far above those of rollouts and agents."""
+from symphony.streams import Stream, fold_in
 
 
 class PlannedEnv(DrivingEnv):
@@ -81,7 +78,6 @@ class EgoPlanners:
         start: TensorDictBase,
         *,
         seed: int,
-        keep_every: int = 0,
         forked: bool = False,
     ) -> EgoPolicy:
         """A planner for every start state, which gets its number, and what asks them.
@@ -90,7 +86,6 @@ class EgoPlanners:
             env: the environment.
             start: [...] of it, the egos on the routes of the log.
             seed: of all rollouts.
-            keep_every: steps at whose multiples the search may come back to try again; 0 for never.
             forked: a search will copy planners with its branches.
 
         Raises:
@@ -98,7 +93,7 @@ class EgoPlanners:
         """
         number = torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
         start.set(keys.PLANNER, number)
-        policy = EgoPolicy(env, self, start, seed, keep_every)
+        policy = EgoPolicy(env, self, start, seed)
         if forked:
             policy.check_copies()
         return policy
@@ -115,23 +110,19 @@ class EgoPolicy(TensorDictModuleBase):
         egos: how egos are planned.
         start: [...] states at which planners begin, each with its number.
         seed: of all rollouts.
-        keep_every: as of :meth:`EgoPlanners.begin`.
     """
 
     in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012 - the type declared
     out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
 
-    def __init__(
-        self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int, keep_every: int
-    ) -> None:
+    def __init__(self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int) -> None:
         super().__init__()
-        self.env, self.egos, self.keep_every = env, egos, keep_every
-        self._kept_from = 0
+        self.env, self.egos = env, egos
         self._last = env.scenes.last_step.cpu().numpy()
         self._held: dict[int, Planner | Failure] = {}
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
-        stream = fold_in(fold_in(start.get(keys.STREAM), _PLANNERS), seed).flatten().tolist()
+        stream = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed).flatten().tolist()
         self._routes = routes = [self._route(row) for row in range(len(egos.segments))]
         for number, row in enumerate(scene):
             made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))
@@ -163,7 +154,7 @@ class EgoPolicy(TensorDictModuleBase):
         going = [
             step < self._last[row] and there for row, step, there in zip(rows, steps, driving, strict=True)
         ]
-        numbers = self._own(number.tolist(), going, steps[0])
+        numbers = self._own(number.tolist(), going)
         own = state[:, 0].cpu().double()
         moves, there = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
         # One that is over, or has failed, keeps its speed.
@@ -197,19 +188,15 @@ class EgoPolicy(TensorDictModuleBase):
         found = (self._held[n] for n in number.flatten().tolist())
         return [planner if isinstance(planner, Failure) else None for planner in found]
 
-    def _own(self, numbers: list[int], going: list[bool], step: int) -> list[int]:
+    def _own(self, numbers: list[int], going: list[bool]) -> list[int]:
         """Numbers of planners that may be changed, one for each rollout that goes on."""
-        keeps = self.keep_every > 0 and step % self.keep_every == 0
-        if step > self._kept_from and (keeps or self.keep_every == 0):
-            # Only the first time: whoever comes again are some of the branches, and the others go on, too.
-            self._held = {n: self._held[n] for n in set(numbers)}
-            self._kept_from = step
+        self._held = {n: self._held[n] for n in set(numbers)}
         taken: set[int] = set()
         out = []
         for number, goes in zip(numbers, going, strict=True):
             planner, chosen = self._held[number], number
             if goes and not isinstance(planner, Failure):
-                if keeps or number in taken:
+                if number in taken:
                     chosen, self._next = self._next, self._next + 1
                     self._held[chosen] = self._copy(planner)
                 taken.add(chosen)

@@ -5,11 +5,8 @@ Legend: B scenes, S branches, T steps, N agents, K states drawn.
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
 from symphony import keys
 from symphony.collectors import BeamSearchCollector
@@ -18,7 +15,6 @@ from symphony.envs.observation import ObservationConfig
 from symphony.objectives import auc
 from symphony.simulation.demonstrations import SceneDataset
 
-_RANK = ("collector", "beam_rank")
 _LEARNED = (
     *keys.SEEN,
     keys.OBJECTS_MASK,
@@ -28,7 +24,6 @@ _LEARNED = (
     keys.PERSONA,
     keys.ACTION,
     keys.ROLLOUT,
-    keys.RANK,
 )
 
 
@@ -73,7 +68,6 @@ class SearchReplay:
         count: int,
         rng: torch.Generator,
         observation: ObservationConfig,
-        which: Literal["all", "best"] = "all",
     ) -> TensorDict:
         """States of surviving rollouts and what was done in them, drawn uniformly from all before the scenes' ends.
 
@@ -81,17 +75,14 @@ class SearchReplay:
             count: K.
             rng: of the draw.
             observation: what the policy observes.
-            which: of every surviving rollout, or only of the best of each tree.
 
         Returns:
-            TensorDict [K, N]: observation, ``ACTION``, ``RANK`` of the rollout in its tree, ``ROLLOUT`` (True).
+            TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True).
         """
-        wanted = self.leaves.get(_RANK) == 0 if which == "best" else None
-        chosen = _drawn(self.env, self.leaves, count, rng, wanted)
+        chosen = _drawn(self.env, self.leaves, count, rng)
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
         valid = batch.get(keys.VALID)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
-        batch.set(keys.RANK, chosen.get(_RANK)[:, None].expand(valid.shape))
         return batch.set(keys.ROLLOUT, torch.ones_like(valid))
 
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
@@ -151,7 +142,6 @@ def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
     """One batch [M, 1] of expert states [K, 1] and rollout states [L, N], told apart by ``ROLLOUT``."""
     valid = experts.get(keys.VALID)
     experts.set(keys.ROLLOUT, torch.zeros_like(valid))
-    experts.set(keys.RANK, torch.zeros_like(valid, dtype=torch.int64))
     present = [key for key in _LEARNED if experts.get(key, None) is not None]
     flat = TensorDict(
         {key: rollouts.get(key).flatten(0, 1)[:, None] for key in present},
@@ -189,10 +179,9 @@ def _drawn(
     steps: TensorDictBase,
     count: int,
     rng: torch.Generator,
-    wanted: Tensor | None = None,
 ) -> TensorDictBase:
-    """Some [K] of the wanted steps [*b] before their scenes' last, uniformly with replacement."""
+    """Some [K] of the steps [*b] before their scenes' last, uniformly with replacement."""
     counted = (steps.get(keys.STEP) < env.scenes.last_step[steps.get(keys.SCENE)]).squeeze(-1)
-    rows = (counted if wanted is None else counted & wanted).nonzero()
+    rows = counted.nonzero()
     pick = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)]
     return steps[tuple(pick.unbind(-1))]

@@ -18,12 +18,10 @@ from symphony.envs.driving import DrivingEnv
 from symphony.envs.scene import SceneBatch
 from symphony.metrics import collisions
 from symphony.modules import drawn_goals
-from symphony.streams import fold_in, uniform
+from symphony.streams import Stream, fold_in, uniform
 
 _WORLD = 1 << 22
 """Agents times states of scenes that are looked at together."""
-_GOALS, _PERSONAS = 1 << 40, (1 << 40) + 4
-"""Numbers of the streams that goals and personas draw from, far above those of rollouts and agents."""
 
 
 class Rollouts(NamedTuple):
@@ -100,7 +98,7 @@ def draw_goals(
         seed: of the draw.
         tree: [...] number of the draw within its scene, so that it is the same whatever the batch.
     """
-    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], _GOALS), tree[..., None])
+    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], Stream.GOALS), tree[..., None])
     noise = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
 
     def drawn(state: TensorDictBase) -> Tensor:
@@ -132,7 +130,7 @@ def draw_personas(
         seed: of the draw.
         number: [...] of the draw within its scene.
     """
-    stream = fold_in(fold_in(env.scenes.stream[scene], _PERSONAS), number)[..., None]
+    stream = fold_in(fold_in(env.scenes.stream[scene], Stream.PERSONAS), number)[..., None]
     share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=scene.device)), 0)
     return personas[(share * len(personas)).long()]
 

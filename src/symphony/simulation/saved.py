@@ -82,7 +82,6 @@ class SavedRollouts:
         drivers: [N] who drove each agent.
         failed: reason why a rollout broke off, by its number; its later steps don't count.
         trees: the searches, where they are kept.
-        log_weight: [K] logarithm of what each rollout weighs, where rare manoeuvres were made more frequent.
     """
 
     segment: RunSegment
@@ -97,7 +96,6 @@ class SavedRollouts:
     drivers: tuple[str, ...] = ()
     failed: Mapping[int, str] = field(default_factory=dict)
     trees: SavedTrees | None = None
-    log_weight: NDArray[np.float64] | None = None
 
     @property
     def there(self) -> NDArray[np.bool_]:
@@ -147,7 +145,6 @@ def saved_rollouts(
     driver: str | Sequence[str] = "",
     others: str = "",
     failed: Mapping[int, str] | None = None,
-    log_weight: Tensor | None = None,
 ) -> SavedRollouts:
     """Rollouts of one run segment, ready to be written.
 
@@ -161,7 +158,6 @@ def saved_rollouts(
         driver: of all interactive agents, or of each [N].
         others: what drives background agents.
         failed: see :class:`SavedRollouts`.
-        log_weight: [B, K] likewise.
 
     Raises:
         DataError: a search without its tree, or whose leaves are not the rollouts.
@@ -188,7 +184,6 @@ def saved_rollouts(
         drivers=tuple(name for name, there in zip(names, real, strict=True) if there),
         failed=dict(failed or {}),
         trees=None if search is None else _trees(search, row, steps, real, len(counted), segment.segment_id),
-        log_weight=None if log_weight is None else _array(log_weight[row]),
     )
 
 

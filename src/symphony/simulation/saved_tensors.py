@@ -47,8 +47,6 @@ _SHAPES: dict[str, tuple[Any, str]] = {
     "offroad": (np.bool_, "KTN"),
     "goal": (np.int64, "KN"),
 }
-_WEIGHT = "log_weight"
-"""Of an array that only some files have."""
 _TREE_SHAPES: dict[str, tuple[Any, str]] = {
     "state": (np.float32, "RSTN4"),
     "there": (np.bool_, "RSTN"),
@@ -65,8 +63,6 @@ def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str,
     """All arrays of a file by name, and what JSON holds beside them."""
     segment, road = saved.segment, saved.segment.road
     arrays = {name: getattr(saved, name) for name in _SHAPES}
-    if saved.log_weight is not None:
-        arrays[_WEIGHT] = saved.log_weight
     arrays |= _split("routes", saved.routes)
     arrays |= {f"log.{name}": getattr(segment, name) for name in _LOG}
     arrays |= {f"road.{name}": getattr(road, name) for name in _ROAD}
@@ -147,6 +143,10 @@ class _Reader:
 
 
 def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedRollouts:
+    if "log_weight" in arrays:
+        raise DataError(
+            "is of a search with a tilt, which needs these weights: simulate anew", field="log_weight"
+        )
     reader = _Reader(arrays, facts)
     parts: dict[str, Any] = {name: reader.lines(f"road.{name}") for name in _LINES}
     road = RoadMap(**parts | {name: reader.array(f"road.{name}") for name in _ROAD})
@@ -180,7 +180,6 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
         drivers=tuple(drivers),
         failed={int(number): str(reason) for number, reason in failed.items()},
         trees=trees,
-        log_weight=arrays.get(_WEIGHT),
     )
 
 
@@ -206,9 +205,6 @@ def _checked(saved: SavedRollouts, facts: dict[str, Any], segment_id: str) -> Sa
     if any(number >= sizes["K"] for number in saved.failed):
         raise DataError(f"names a rollout outside the {sizes['K']}", field="failed")
     _check_state("state", saved.state[saved.there])
-    if saved.log_weight is not None:
-        _check_shape(_WEIGHT, saved.log_weight, np.float64, "K", sizes)
-        _check_finite(_WEIGHT, saved.log_weight)
     if saved.trees is not None:
         _check_trees(saved.trees, sizes)
     return saved

@@ -137,7 +137,6 @@ class _Drive:
                     driver=self._drivers(on_cpu.interactive.shape[1]),
                     others=self.config.others,
                     failed=found.failed[b] if found.failed else None,
-                    log_weight=found.log_weight,
                 )
                 for b, segment in enumerate(segments)
             ]

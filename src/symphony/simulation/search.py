@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -22,22 +21,17 @@ from symphony.collectors import (
     Systematic,
     beam_search,
     max_then_sum,
-    mean_then_sum,
 )
 from symphony.collectors.rules import takes_groups
 from symphony.config import SearchConfig
 from symphony.envs.driving import DrivingEnv
-from symphony.imports import build_object, load_object
+from symphony.imports import build_object
 from symphony.modules import SeededNoise
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.importance import Tilt
-from symphony.streams import fold_in, uniform
+from symphony.streams import Stream, fold_in, uniform
 
 ENDED = -100.0
 """Score past a scene's last logged step, below all others: it decides no maximum, and other totals leave it out."""
-_PRUNING = (1 << 40) + 1
-_RETRIES = (1 << 40) + 2
-"""Numbers of the streams that prunings and repeats draw from, far above those of rollouts and agents."""
 OUTCOME: Sequence[keys.Key] = [
     ("next", *key) for key in (keys.STATE, keys.VALID, keys.PROGRESS, keys.COLLISION, keys.OFFROAD)
 ]
@@ -61,37 +55,16 @@ def kept_keys(env: DrivingEnv, also: Sequence[keys.Key] = ()) -> list[keys.Key]:
     return [*KEPT, *([keys.PERSONA] if env.observation.persona else []), *also]
 
 
-AGGREGATES = {"max_then_sum": max_then_sum, "mean_then_sum": mean_then_sum}
-
-
 def pruning_rule(config: SearchConfig) -> PruningRule:
     """Which branches go on."""
     if ":" in config.rule:
         return build_object(config.rule)
     rules: dict[str, Callable[[], PruningRule]] = {
-        "best": lambda: KeepBest(config.keep),
+        "best": lambda: KeepBest(0.5),
         "systematic": lambda: Systematic(config.temperature),
         "replace": lambda: ReplaceBad(config.threshold),
     }
     return rules[config.rule]()
-
-
-def aggregate_of(config: SearchConfig) -> Callable[[Tensor], Tensor]:
-    """From scores of steps and agents to one per branch; what lies past a scene's end has no say in it."""
-    if ":" in config.aggregate:
-        return partial(_until_the_end, load_object(config.aggregate))
-    return AGGREGATES[config.aggregate]
-
-
-def _until_the_end(
-    aggregate: Callable[[Tensor], Tensor], scores: Float[Tensor, "*b S T N"]
-) -> Float[Tensor, "*b S"]:
-    """Totals of the steps before the scenes' ends; where none is, those of scores that are all the same."""
-    found, going = aggregate(scores), (scores != ENDED).all(-1).sum(-1)
-    for count in going.unique().tolist():
-        if 0 < count < scores.shape[-2]:
-            found = torch.where(going == count, aggregate(scores[..., :count, :].contiguous()), found)
-    return found
 
 
 def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
@@ -136,13 +109,13 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 
     def noise(start: TensorDictBase, periods: int) -> Float[Tensor, "*b P"]:
         root = start.get(keys.STREAM)[..., 0, :]
-        return uniform(seed, fold_in(root, _PRUNING), torch.arange(periods, device=start.device))
+        return uniform(seed, fold_in(root, Stream.PRUNING), torch.arange(periods, device=start.device))
 
     return noise
 
 
 def collector_settings(
-    config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset
+    config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset, segments: int
 ) -> dict[str, Any]:
     """What a collector of driving needs beside environment, policy and scores: whole trees, random numbers that
     depend on nothing but seed, segment, branch and step.
@@ -151,20 +124,21 @@ def collector_settings(
         config: of the search.
         env: that is searched.
         seed: of the pruning.
-        data: that the environment draws its scenes from, as many at a time as the search takes, or all.
+        data: that the environment draws its scenes from.
+        segments: how many at a time, or all, if there are fewer.
     """
     return {
         "branches": config.branches,
         "leaves": config.branches,
         "keep_tree": True,
         "prune_every": config.prune_every,
-        "aggregate": aggregate_of(config),
+        "aggregate": max_then_sum,
         "rule_noise": pruning_noise(seed),
         # A copy takes the random numbers of the place it lands in, so that forks part.
         "slot_keys": (keys.STREAM,),
         "group_key": keys.GOAL if takes_groups(pruning_rule(config)) else None,
         "keep": kept_keys(env),
-        "frames_per_batch": min(config.segments, len(data)) * config.branches * data.decisions,
+        "frames_per_batch": min(segments, len(data)) * config.branches * data.decisions,
         "total_frames": -1,
     }
 
@@ -178,14 +152,10 @@ def search(
     seed: int,
     rule: PruningRule,
     prune_every: int,
-    aggregate: Callable[[Tensor], Tensor] = max_then_sum,
     leaves: int | None = None,
     keep_tree: bool = False,
-    retries: int = 0,
-    retry_above: float = 0.0,
     ego: bool = True,
     also: Sequence[keys.Key] = (),
-    tilt: Tilt | None = None,
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S] to the last logged step. Scenes beside each other change nothing.
 
@@ -197,15 +167,10 @@ def search(
         seed: of the actions.
         rule: which branches go on.
         prune_every: T_p.
-        aggregate: from scores of steps and agents to one per branch.
         leaves: return only so many of each tree, the best of their scene's last period; by default all.
         keep_tree: also return the pruned branches.
-        retries: how often a period is simulated again, from its start, for branches that end it with a total above
-            ``retry_above``.
-        retry_above: that total.
         ego: whether the first agent is scored, too.
         also: what is kept of every step beside :data:`KEPT`.
-        tilt: importance of rare manoeuvres.
     """
     steps, scene = env.decisions, start.get(keys.SCENE)[..., 0, 0]
     return beam_search(
@@ -216,7 +181,7 @@ def search(
         steps=steps,
         prune_every=prune_every,
         rule=rule,
-        aggregate=aggregate,
+        aggregate=max_then_sum,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
         leaves=leaves,
         # In the last period of all, branches of a shorter scene are equal.
@@ -226,12 +191,4 @@ def search(
         group_key=keys.GOAL if takes_groups(rule) else None,
         keep=kept_keys(env, also),
         keep_tree=keep_tree,
-        retries=retries,
-        retry_above=retry_above if retries else None,
-        reseed=_reseed,
-        tilt=tilt,
     )
-
-
-def _reseed(state: TensorDictBase, attempt: int) -> TensorDictBase:
-    return state.set(keys.STREAM, fold_in(state.get(keys.STREAM), _RETRIES + attempt))

@@ -221,11 +221,12 @@ def _driven(
         taken = [route_table(log, graph, int(row)).logged for row in vehicles]
         scenes.route_logged = torch.tensor([taken])
     scenes = scenes.to(torch.device(settings.device))
-    if search_kind(agent, settings.config(1, 0)) == "none":
+    one = settings.config(1, 0)
+    if search_kind(agent, one) == "none":
         plans = [settings.config(ROLLOUTS, settings.seed)]
     else:
         # All branches of all trees together would take gigabytes.
-        branches = settings.branches or agent.search.test_branches
+        branches = one.pruning(agent.search).test_branches
         trees = max(AT_ONCE // (branches * len(vehicles)), 1)
         plans = [
             settings.config(min(trees, ROLLOUTS - first), settings.seed * ROLLOUTS + first)

@@ -7,7 +7,7 @@ import math
 import os
 import re
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,9 +29,6 @@ class Tracker:
         settings: shown by Weights & Biases beside the curves.
         wandb: ``offline``, ``online`` or ``disabled``. The environment variable ``WANDB_MODE`` overrides it, as
             it does everywhere else.
-        project: of Weights & Biases.
-        group: of runs there; empty for none.
-        tags: of the run there.
         after: keep only records up to this step of an earlier, interrupted run, which this one goes on with.
 
     Attributes:
@@ -49,9 +46,6 @@ class Tracker:
         settings: dict[str, Any],
         wandb: Literal["offline", "online", "disabled"] = "offline",
         *,
-        project: str = "symphony",
-        group: str = "",
-        tags: Sequence[str] = (),
         after: int = 0,
     ) -> None:
         self.path = folder / RECORDS
@@ -65,9 +59,7 @@ class Tracker:
 
             try:
                 self._run = tracking.init(
-                    project=project,
-                    group=group or None,
-                    tags=list(tags) or None,
+                    project=os.environ.get("WANDB_PROJECT", "symphony"),
                     name=folder.name,
                     dir=str(folder),
                     config=settings,

@@ -29,6 +29,8 @@ from symphony.training.validation import undisturbed
 
 PANELS = 2
 """Run segments in the animation, at most."""
+SEGMENTS = 8
+"""Run segments simulated for a preview, evenly spaced; the animation has the first two."""
 ROLLOUTS = 2
 """Of each segment, at most; the animation has the first."""
 QUANTILES = (10, 50, 90)
@@ -80,7 +82,7 @@ class Previewer:
         device: torch.device,
         replay: SearchReplay | None = None,
     ) -> None:
-        self.items = evenly_spaced(len(dataset), config.preview.segments)
+        self.items = evenly_spaced(len(dataset), SEGMENTS)
         self.agent, self.dataset, self.device, self.replay = agent, dataset, device, replay
         # Before the first update, so that one that can't be used is found then.
         dataset.scenes(self.items)

@@ -20,9 +20,6 @@ FREE = (
     "resume",
     "device",
     "wandb",
-    "wandb_project",
-    "wandb_group",
-    "wandb_tags",
     "preview",
     "checkpoint_every",
     "log_every",
@@ -50,9 +47,7 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
         # Scores on other segments could not be compared with those so far.
         free["validation"] = config.validation
         if before.validation.data is not None:
-            free["validation"] = dataclasses.replace(
-                before.validation, data=config.validation.data, every=config.validation.every
-            )
+            free["validation"] = dataclasses.replace(before.validation, data=config.validation.data)
         before = dataclasses.replace(before, **free)
         changed = _changed(before, config)
         if changed:

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""
+CLIP = 1.0
+"""Largest norm of a network's gradient."""
 LOCK = "run.lock"
 """Held by the process that trains."""
 _SEED_STRIDE = 1_000_003
@@ -164,9 +166,6 @@ class Trainer:
                 config.out,
                 settings,
                 config.wandb,
-                project=config.wandb_project,
-                group=config.wandb_group,
-                tags=config.wandb_tags,
                 after=step,
             )
             self.alarms = Alarms(self.tracker.kept)
@@ -200,8 +199,7 @@ class Trainer:
             if self.tracker is None:
                 continue
             paused = time.perf_counter()
-            every = config.validation.every or config.checkpoint_every
-            if self.validator is not None and (last or step % every == 0):
+            if self.validator is not None and (last or step % config.checkpoint_every == 0):
                 numbers |= self._validate(self.validator, step)
             if self.previewer is not None and (last or step % config.preview.every == 0):
                 numbers |= self._preview(self.previewer, self.tracker, step)
@@ -245,7 +243,7 @@ class Trainer:
         weights = [weight for group in optimizer.param_groups for weight in group["params"]]
         optimizer.zero_grad(set_to_none=True)
         total.backward()
-        norm = nn.utils.clip_grad_norm_(weights, self.config.clip)
+        norm = nn.utils.clip_grad_norm_(weights, CLIP)
         if bool(norm.isfinite()):  # else the update is skipped; the loop counts them
             optimizer.step()
         return {**named, f"loss_{name}": total.detach(), f"{NORM}{name}": norm}
