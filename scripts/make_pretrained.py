@@ -387,7 +387,7 @@ def _scores_of(record: dict[str, Any]) -> dict[str, Any]:
     ways = {
         "none": f"{how['rollouts']} independent rollouts",
         "tree": f"{how['rollouts']} leaves of {trees} of {how['branches']} branches, pruned {_pruning(how)}",
-        "oracle": "trees pruned by the true collision and off-road flags",
+        "backtrack": f"{how['rollouts']} rollouts that go back where they are bad",
         "best": f"the best of {how['branches']} independent rollouts by the discriminator",
     }
     numbers = [name for key, _, _ in COLUMNS for name in (key, f"{key}_se")]

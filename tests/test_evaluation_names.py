@@ -16,7 +16,8 @@ from symphony.evaluation.records import evaluation_name
 CHANGES: dict[str, Any] = {
     "persona": "speed=.8",
     "rollouts": 8,
-    "search": "oracle",
+    "search": "backtrack",
+    "score": "rule",
     "trees": 2,
     "branches": 8,
     "rule": "systematic",

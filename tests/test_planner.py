@@ -116,7 +116,7 @@ SEARCHES: list[dict[str, Any]] = [
     {"search": "none"},
     {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5},
     {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2},
-    {"search": "oracle", "branches": 4},
+    {"search": "tree", "score": "flags", "branches": 4},
     {"search": "best", "branches": 2},
 ]
 
@@ -148,11 +148,11 @@ def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
         simulated(Locked, search="tree", branches=6, rule="replace", threshold=1e9, prune_every=5)
 
 
-@pytest.mark.parametrize("search", ["tree", "oracle"])
-def test_the_search_scores_learned_agents_only(search: str) -> None:
-    result = simulated(Wanderer, search=search, branches=6).search
+@pytest.mark.parametrize("score", ["discriminator", "flags", "rule"])
+def test_the_search_scores_learned_agents_only(score: str) -> None:
+    result = simulated(Wanderer, search="tree", score=score, branches=6).search
     assert (result.simulated_scores[..., 0] == 0).all()
-    if search == "tree":
+    if score == "discriminator":
         assert (result.simulated_scores[..., 1] != 0).all()
 
 

@@ -37,7 +37,7 @@ from symphony.simulation.search import ENDED, flag_score, search
 
 EVERY = 2
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=EVERY)
-KINDS = ("none", "tree", "oracle", "best")
+KINDS = ("none", "tree", "backtrack", "best")
 
 
 def make_agent(seed: int = 0, discriminator: int = 0, **changes: Any) -> Agent:
@@ -341,11 +341,11 @@ def test_trees_of_one_branch_are_independent_rollouts(dataset: SceneDataset, age
     assert same(none, tree)
 
 
-@pytest.mark.parametrize("kind", ["tree", "oracle"])
-def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
+@pytest.mark.parametrize("score", ["discriminator", "flags", "rule"])
+def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, score: Any) -> None:
     scenes = dataset.scenes(range(4))
-    few = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2))
-    many = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=6, trees=3))
+    few = simulated(agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=4, trees=2))
+    many = simulated(agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=6, trees=3))
     assert same(few, part(many, slice(None), slice(0, 4)))
 
 
@@ -391,9 +391,10 @@ def test_neither_discriminator_nor_search_touches_the_goals(
     assert len(reference[1, :, 0].unique()) > 1  # else there is nothing to bias
     strict = replace(agent, discriminator=make_agent(discriminator=1).discriminator)
     driven = []
-    for kind, scorer in (("tree", agent), ("tree", strict), ("oracle", agent), ("best", strict)):
+    ways: list[tuple[Any, Any, Agent]] = [("tree", "discriminator", scorer) for scorer in (agent, strict)]
+    for kind, score, scorer in (*ways, ("tree", "flags", agent), ("best", "discriminator", strict)):
         trees = 1 if kind == "best" else 5
-        config = EvaluateConfig(search=kind, rollouts=5, trees=trees, branches=3, rule="best")
+        config = EvaluateConfig(search=kind, score=score, rollouts=5, trees=trees, branches=3, rule="best")
         goals, state = goals_of(monkeypatch, scorer, scenes, config)
         assert torch.equal(goals, reference)
         driven.append(state)
@@ -480,11 +481,12 @@ def test_the_oracle_lowers_what_it_measures() -> None:
 
     def bad(kind: Any) -> tuple[float, float]:
         """Share of rollouts with a collision, and of agent-steps with a collision or off the road."""
-        found = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=16, trees=2, branches=8))
+        config = EvaluateConfig(search=kind, score="flags", rollouts=16, trees=2, branches=8)
+        found = simulated(agent, scenes, config)
         flags = (found.collision | found.offroad) & found.counted
         return found.collision.any(-1).any(-1).float().mean().item(), flags.float().mean().item()
 
-    none, oracle = bad("none"), bad("oracle")
+    none, oracle = bad("none"), bad("tree")
     assert none[0] > 0.3
     assert oracle[0] < 0.7 * none[0]
     assert oracle[1] < 0.5 * none[1]
@@ -494,13 +496,15 @@ def test_the_oracle_lowers_what_it_measures() -> None:
 def test_an_oracle_replaces_what_is_flagged_whatever_the_agent_was_trained_with(trained: float) -> None:
     """Flags are 1, as is a usual threshold of a discriminator's scores; one agent that is bad makes a branch bad."""
     settings = SearchConfig(rule="replace", threshold=trained)
-    assert EvaluateConfig(search="oracle").pruning(settings).threshold == 0.0
-    assert EvaluateConfig(search="oracle", threshold=2.0).pruning(settings).threshold == 2.0
+    for score in ("flags", "rule"):
+        assert EvaluateConfig(score=score).pruning(settings).threshold == 0.0
+        assert EvaluateConfig(score=score, threshold=2.0).pruning(settings).threshold == 2.0
     assert EvaluateConfig(search="tree").pruning(settings).threshold == trained
     agent, scenes = make_agent(goals=False), scene(blocked(), [0, 1])
-    how: dict[str, Any] = {"rollouts": 16, "trees": 2, "branches": 8, "rule": "replace", "prune_every": 2}
+    how: dict[str, Any] = {"score": "flags", "rule": "replace", "prune_every": 2}
+    how |= {"rollouts": 16, "trees": 2, "branches": 8}
     rates = []
-    kinds: tuple[Any, ...] = ("none", "oracle")
+    kinds: tuple[Any, ...] = ("none", "tree")
     for kind in kinds:
         found = simulation(agent, scenes, EvaluateConfig(search=kind, **how)).rollouts
         rates.append(float((found.collision & found.counted).any(-1).any(-1).float().mean()))
@@ -523,7 +527,7 @@ def test_the_oracle_scores_flags_of_real_agents_alone() -> None:
 
 def test_kinds_and_sizes_that_do_not_fit_are_refused(store: SegmentStore, agent: Agent) -> None:
     without = replace(agent, discriminator=None)
-    for kind in ("tree", "best"):
+    for kind in ("tree", "best", "backtrack"):
         with pytest.raises(ConfigError, match="needs an agent with a discriminator"):
             evaluate(without, store, EvaluateConfig(search=kind))
     with pytest.raises(ConfigError, match="less than 16 rollouts"):

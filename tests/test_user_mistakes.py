@@ -392,7 +392,7 @@ def test_of_two_planners_the_better_one_is_better_where_both_drove() -> None:
     assert "20.0 above quick, in the 1 segments that both drove" in sentence
 
 
-@pytest.mark.parametrize("changes", [{}, {"search": "oracle"}])
+@pytest.mark.parametrize("changes", [{}, {"search": "tree", "score": "flags"}])
 def test_the_tree_that_is_drawn_is_the_one_that_is_simulated(
     store: Path, run: Path, tmp_path: Path, changes: dict[str, Any]
 ) -> None:

@@ -106,8 +106,8 @@ def test_settings_are_those_of_the_evaluation() -> None:
     assert (agent.search.rule, agent.search.goals) == ("replace", "branch")
     how = simulated_how(agent, WosacSettings.of(EvaluateConfig(action_temperature=0.5)))
     assert {"rule": "replace", "goals": "branch", "action_temperature": 0.5}.items() <= how.items()
-    with pytest.raises(ConfigError, match="search is one of"):
-        WosacSettings.of(EvaluateConfig(search="oracle"))
+    with pytest.raises(ConfigError, match="score is one of"):
+        WosacSettings.of(EvaluateConfig(score="flags"))
 
 
 # --- the log at the agent's rate ---
@@ -241,13 +241,13 @@ def test_oracles_have_no_score(tmp_path: Path, capsys: pytest.CaptureFixture[str
         AGENT,
         "--data",
         str(tmp_path / "store"),
-        "--search",
-        "oracle",
+        "--score",
+        "flags",
         "--metrics",
         "wosac",
     ]
     assert main(command) != 0
-    assert "search is one of agent, none, tree, best" in capsys.readouterr().err
+    assert "score is one of discriminator, rule" in capsys.readouterr().err
 
 
 def test_the_table_of_scores(

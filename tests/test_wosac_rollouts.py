@@ -176,8 +176,8 @@ def test_playback_and_other_steps_are_refused() -> None:
         wosac_rollouts(load_agent(AGENT), straight_road())
     with pytest.raises(DataError, match="no agent"):
         constant_velocity(mixed_segment().replace(valid=np.zeros((5, 91), bool)))
-    with pytest.raises(ConfigError, match="search"):
-        WosacSettings(search="oracle")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="score"):
+        WosacSettings(score="flags")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("agent", [AGENT, "constant_velocity"])

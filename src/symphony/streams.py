@@ -31,6 +31,8 @@ class Stream(IntEnum):
     """Seeds of the planners of egos."""
     PERSONAS = (1 << 40) + 4
     """Styles of driving."""
+    BACKTRACKING = 1 << 41
+    """Lines that go back, each of its tries: this and how many there were."""
 
 
 # SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.

@@ -1,4 +1,4 @@
-"""Beam search over simulated futures, as a function and as a TorchRL collector.
+"""Beam search over simulated futures, and backtracking in them, as a function and as a TorchRL collector.
 
 Works with environments that keep all of their state in the TensorDict, whatever they simulate; not with those that
 wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (ParallelEnv).
@@ -6,6 +6,7 @@ wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (Paralle
 
 from __future__ import annotations
 
+from symphony.collectors.backtracking import Backtrack
 from symphony.collectors.beam_search import beam_search
 from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
@@ -15,6 +16,7 @@ from symphony.collectors.scores import Aggregate, KeyScore, max_then_sum, mean_t
 
 __all__ = [
     "Aggregate",
+    "Backtrack",
     "BeamSearchCollector",
     "BeamSearchResult",
     "GroupRule",

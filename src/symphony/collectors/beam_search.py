@@ -18,6 +18,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from symphony.collectors._rows import take, take_values
+from symphony.collectors.backtracking import Backtrack, Lines, follow
 from symphony.collectors.branching import check_branching
 from symphony.collectors.result import BeamSearchResult, lineage, ranking
 from symphony.collectors.rules import (
@@ -44,7 +46,7 @@ def beam_search(
     *,
     steps: int,
     prune_every: int = 10,
-    rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
+    rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
     aggregate: Aggregation = max_then_sum,
     prune_last: bool = True,
     noise: Float[Tensor, "*b P"] | None = None,
@@ -73,7 +75,9 @@ def beam_search(
         start: [*b, S], e.g. ``branch(env.reset(...), S)``.
         steps: T, decisions per branch.
         prune_every: T_p, steps per period.
-        rule: which branches go on, see :mod:`symphony.collectors.rules`.
+        rule: which branches go on, see :mod:`symphony.collectors.rules`; or :class:`Backtrack`, with which nothing is
+            copied: branches are independent lines that go back where they are bad. That takes no gradients and gives
+            all leaves, and what is said below of slots, groups and noise has no meaning for it.
         aggregate: any function of the scores of a period [*b, S, T_p, N] that gives totals [*b, S], e.g.
             ``lambda scores: scores.amax((-1, -2))``; see :class:`symphony.collectors.Aggregate`.
         prune_last: prune after the last period too.
@@ -96,6 +100,19 @@ def beam_search(
     if last_period is not None and last_period.shape != start.shape[:-1]:
         raise ConfigError(f"last_period is {list(last_period.shape)}, rows are {list(start.shape[:-1])}")
     check_branching(env, start)
+    if isinstance(rule, Backtrack):
+        if leaves not in (None, start.shape[-1]):
+            raise ConfigError("rule Backtrack gives all branches as leaves")
+        with set_exploration_type(exploration_type):
+            lines = follow(
+                lambda now, length: _simulate(env, policy, score, now, length, aggregate, keep),
+                aggregate,
+                start,
+                rule,
+                steps,
+                prune_every,
+            )
+        return _independent(lines, prune_every, keep_tree)
     groups = None if group_key is None else _groups(start, group_key)
     members = None if groups is None or takes_groups(rule) else group_members(groups)
     periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
@@ -139,12 +156,12 @@ def beam_search(
         best = ranking(last_totals, last_slots)[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
     steps_at = _step_rows(slots, start.shape[-1], periods)
-    trajectories = _take(tree, steps_at)
+    trajectories = take(tree, steps_at)
     trajectories.refine_names(..., "time")
     tree.refine_names(..., "time")
     return BeamSearchResult(
         trajectories=trajectories,
-        scores=_take_rows(simulated_scores, steps_at, tree.batch_dims),
+        scores=take_values(simulated_scores, steps_at, tree.batch_dims),
         slots=slots,
         totals=all_totals,
         parents=all_parents,
@@ -152,6 +169,23 @@ def beam_search(
         tree=tree if keep_tree else None,
         prune_every=prune_every,
         simulated_steps=simulated,
+    )
+
+
+def _independent(lines: Lines, prune_every: int, keep_tree: bool) -> BeamSearchResult:
+    """Lines as the leaves of a search in which every branch goes on from itself."""
+    slots = torch.arange(lines.totals.shape[-1], device=lines.totals.device).expand(lines.totals.shape)
+    lines.steps.refine_names(..., "time")
+    return BeamSearchResult(
+        trajectories=lines.steps,
+        scores=lines.scores,
+        slots=slots,
+        totals=lines.totals,
+        parents=slots,
+        simulated_scores=lines.scores,
+        tree=lines.steps.copy() if keep_tree else None,
+        prune_every=prune_every,
+        simulated_steps=lines.simulated,
     )
 
 
@@ -219,29 +253,13 @@ def _fork(
     # Places in the flattened [*b, S]: of the first branch of each row, and of the parents beside it.
     first = torch.arange(0, parents.numel(), branches, device=parents.device)
     rows = first.reshape(*parents.shape[:-1], 1) + parents
-    return _set_slots(_take(state, rows), state, slot_keys)
+    return _set_slots(take(state, rows), state, slot_keys)
 
 
 def _set_slots(state: TensorDictBase, slots: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
     for key in keys:
         state.set(key, slots.get(key))
     return state
-
-
-def _take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None = None) -> TensorDictBase:
-    """Rows of the flattened batch, in a batch of the shape of `rows`."""
-    dims = tensordict.batch_dims if dims is None else dims
-    taken = {
-        key: _take(value, rows, dims) if isinstance(value, TensorDictBase) else _take_rows(value, rows, dims)
-        for key, value in tensordict.items()
-    }
-    return TensorDict(taken, [*rows.shape, *tensordict.batch_size[dims:]], device=tensordict.device)
-
-
-def _take_rows(values: Shaped[Tensor, "*_"], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*_"]:
-    # index_select on whole rows is many times faster than gather or advanced indexing on wide entries.
-    taken = values.flatten(0, dims - 1).index_select(0, rows.flatten())
-    return taken.reshape(*rows.shape, *values.shape[dims:])
 
 
 def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) -> Int[Tensor, "*b L T"]:

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import RandomPolicy
 
 from symphony.collectors._torchrl import bind, new_trajectories, policy_of, seed_worker
+from symphony.collectors.backtracking import Backtrack
 from symphony.collectors.beam_search import Aggregation, Policy, Score, beam_search, score_state
 from symphony.collectors.branching import branch, branched_env
 from symphony.collectors.result import BeamSearchResult
@@ -77,7 +78,7 @@ class BeamSearchCollector(Collector):
         branches: int,
         leaves: int | None = None,
         prune_every: int = 10,
-        rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
+        rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
         aggregate: Aggregation = max_then_sum,
         prune_last: bool = True,
         prepare: Callable[[TensorDictBase], TensorDictBase] | None = None,

@@ -55,7 +55,7 @@ class GroupRule(Protocol):
         """Parents of the S slots; groups are given where the search has a ``group_key``."""
 
 
-def takes_groups(rule: PruningRule | GroupRule) -> TypeGuard[GroupRule]:
+def takes_groups(rule: object) -> TypeGuard[GroupRule]:
     """Whether a rule wants to see the groups itself."""
     return bool(getattr(rule, "takes_groups", False))
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from symphony.config.evaluation import (
         EvaluateConfig,
         PaperData,
+        Score,
         Search,
         Setting,
         TableColumns,
@@ -49,6 +50,7 @@ __all__ = [
     "PreviewConfig",
     "Profile",
     "RunConfig",
+    "Score",
     "Search",
     "SearchConfig",
     "Setting",

@@ -10,7 +10,8 @@ from symphony.config.agent import RULES, SearchConfig
 from symphony.config.checks import not_negative, one_of, positive
 from symphony.errors import ConfigError
 
-Search = Literal["agent", "none", "tree", "oracle", "best"]
+Search = Literal["agent", "none", "tree", "backtrack", "best"]
+Score = Literal["discriminator", "flags", "rule"]
 Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 MOST = 128
@@ -73,8 +74,11 @@ class EvaluateConfig:
     rollouts: int = 16
     """Simulations per run segment that count."""
     search: Search = "agent"
-    """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `oracle`: by the true collision
-    and off-road flags; `best`: independent rollouts, of which the one with the best score counts."""
+    """`agent`: as it was trained; `none`; `tree`: beam search; `backtrack`: independent rollouts, each of which goes
+    back and tries again where it is bad; `best`: independent rollouts, of which that with the best score counts."""
+    score: Score = "discriminator"
+    """What a search looks for. `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off
+    the road; `rule`: the same, and collisions within half a second, were everyone to keep speed and course."""
     trees: int = 1
     """Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
     less than all of its leaves, take `goals` of the tree: among those of branches the discriminator would choose."""
@@ -83,12 +87,12 @@ class EvaluateConfig:
     rule: str = "agent"
     """How trees are pruned: `agent` as it was trained, else see `search.rule` of training."""
     prune_every: int = 0
-    """Steps between prunings; 0: as the agent was trained."""
+    """Steps between prunings, or after which a rollout may go back; 0: as the agent was trained."""
     temperature: float = 0.0
     """Of rule `systematic`; 0: as the agent was trained."""
     threshold: float | None = None
-    """Of rule `replace`; by default as the agent was trained, and 0 for an oracle, whose scores are 1 for an agent
-    that collides or is off the road."""
+    """Of rule `replace` and of `backtrack`: the highest total of a good branch; by default as the agent was trained,
+    and 0 where a score is 1 for each agent that is bad (`flags`, `rule`)."""
     goals: Goals = "agent"
     """Who draws goals together: all branches of a `tree` (the paper), or each `branch` alone; `agent`: as it is
     meant."""
@@ -130,6 +134,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         one_of(self, "search", get_args(Search))
+        one_of(self, "score", get_args(Score))
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         one_of(self, "engine", get_args(Engine))
@@ -149,8 +154,8 @@ class EvaluateConfig:
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
         """The search: as in training, but for what is set here."""
-        # A threshold learned for a discriminator says nothing of flags: with one of them a branch is bad.
-        threshold = 0.0 if self.search == "oracle" else trained.threshold
+        # A threshold of logits says nothing of flags: with one of them a branch is bad.
+        threshold = {"discriminator": trained.threshold}.get(self.score, 0.0)
         return dataclasses.replace(
             trained,
             test_branches=self.branches or trained.test_branches,

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Literal, Self, get_args
 
 from symphony.config.checks import not_negative, one_of, positive
-from symphony.config.evaluation import EvaluateConfig, Goals
+from symphony.config.evaluation import EvaluateConfig, Goals, Search
 from symphony.errors import ConfigError
 
-WosacSearch = Literal["agent", "none", "tree", "best"]
-"""Without the search by true flags: what is simulated must not know them beforehand."""
+WosacScore = Literal["discriminator", "rule"]
+"""Without the true flags: what is simulated must not know beforehand what it is scored by."""
 FUTURE, DT = 80, 0.1
 """Steps that the challenge asks for, and the seconds between them."""
 
@@ -20,9 +20,12 @@ FUTURE, DT = 80, 0.1
 class WosacSettings:
     """How the agent is simulated."""
 
-    search: WosacSearch = "agent"
-    """`agent`: as it was trained; `none`; `tree`: beam search by its discriminator; `best`: the best of independent
-    rollouts. Each of the 32 rollouts of a search comes from a tree of its own."""
+    search: Search = "agent"
+    """`agent`: as it was trained; `none`; `tree`: beam search; `backtrack`: rollouts that go back where they are bad;
+    `best`: the best of independent rollouts. Each of the 32 rollouts of a search comes from a tree of its own."""
+    score: WosacScore = "discriminator"
+    """What a search looks for: what the `discriminator` calls unreal, or collisions, also those within half a second,
+    were everyone to keep speed and course, and time off the road (`rule`)."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: str = "agent"
@@ -51,7 +54,7 @@ class WosacSettings:
     """Processes that share the run segments, with one thread each (changes speed, not results)."""
 
     def __post_init__(self) -> None:
-        one_of(self, "search", get_args(WosacSearch))
+        one_of(self, "score", get_args(WosacScore))
         not_negative(self, "branches", "seed")
         positive(self, "workers")
         if not 1.0 <= self.horizon <= FUTURE * DT or abs(self.horizon / DT - self.future) > 1e-6:

@@ -76,9 +76,10 @@ class Evaluation:
         metrics: accumulated over all run segments.
         config: how it was evaluated.
         interactive: agents per segment that acted, at most, or ``all``.
-        search: how the rollouts came about: ``none``, ``tree``, ``oracle``, ``best``; ``log`` for playback.
+        search: how the rollouts came about: ``none``, ``tree``, ``backtrack``, ``best``; ``log`` for playback.
         own: mean of each metric of the user's own by run segment, by import path.
         seconds: CPU time of the simulation, what it costs.
+        steps: that were simulated, each of a rollout or branch, those that a search dropped included.
         horizon: seconds that the longest rollout lasts.
         baselines: the same of :data:`BASELINES`, where they were asked for.
     """
@@ -90,6 +91,7 @@ class Evaluation:
     search: str
     own: dict[str, dict[str, float]] = field(default_factory=dict)
     seconds: float = 0.0
+    steps: int = 0
     horizon: float = 0.0
     baselines: tuple[Evaluation, ...] = ()
 
@@ -104,7 +106,7 @@ class Evaluation:
             **own,
             "interactive": self.interactive,
             "search": self.search,
-            "trees": self.config.trees if self.search in ("tree", "oracle") else 0,
+            "trees": self.config.trees if self.search == "tree" else 0,
             "seed": self.config.seed,
         }
 
@@ -188,7 +190,7 @@ def evaluate_dataset(
     ]
     for path in config.metric:
         load_object(path)  # or complain before anything is simulated
-    seconds = [0.0] * len(everyone)
+    seconds, steps = [0.0] * len(everyone), [0] * len(everyone)
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
     tasks = batches(range(len(dataset)), segments_together(agent, config, dataset.interactive), config)
     with closing(shared(evaluator, tasks, config, dataset)) as results:
@@ -198,6 +200,7 @@ def evaluate_dataset(
                 for path, values in part.own.items():
                     found[k].own.setdefault(path, {}).update(values)
                 seconds[k] += part.seconds
+                steps[k] += part.steps
             if observe is not None and batch.seen is not None:
                 scenes, rollouts, goal = batch.seen
                 segments = [dataset.segment(i) for i in batch.items]
@@ -205,7 +208,8 @@ def evaluate_dataset(
             done += len(batch.items)
             if progress is not None:
                 progress(done, len(dataset))
-    found = [dataclasses.replace(one, seconds=spent) for one, spent in zip(found, seconds, strict=True)]
+    costs = zip(found, seconds, steps, strict=True)
+    found = [dataclasses.replace(one, seconds=spent, steps=made) for one, spent, made in costs]
     # The evaluated agent itself where it is one of the baselines.
     named = {evaluation.agent: evaluation for evaluation in found}
     return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
@@ -247,7 +251,9 @@ class _BatchEvaluator:
                 except NotFiniteError as error:
                     raise error.named(self.dataset.segment(items[error.row]).segment_id) from error
                 seconds = time.process_time() - began
-                part = dataclasses.replace(blank, metrics=RolloutMetrics(), own={}, seconds=seconds)
+                part = dataclasses.replace(
+                    blank, metrics=RolloutMetrics(), own={}, seconds=seconds, steps=found.steps
+                )
                 own = {path: load_object(path) for path in blank.config.metric}
                 _add(part, self.dataset, items, scenes, found, own, regions)
                 parts.append(part)

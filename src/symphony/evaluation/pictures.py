@@ -176,7 +176,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
     if agent.policy is None or agent.discriminator is None:
         raise ConfigError(f"{agent.name} has no discriminator to search by: it was not trained with one")
     settings = config.pruning(agent.search)
-    if search_kind(agent, config) not in ("tree", "oracle"):
+    if search_kind(agent, config) != "tree":
         raise ConfigError(
             f"with search '{search_kind(agent, config)}' there is no tree to draw: ask for one, --search tree"
         )

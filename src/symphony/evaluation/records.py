@@ -35,6 +35,7 @@ _LONGEST = 200
 _MEMORY = ("batch", "device", "workers", "engine")
 """Settings that change no result."""
 _USUAL = {
+    "score": "discriminator",
     "threshold": None,
     "goals": "tree",
     "logged_goals": False,
@@ -67,11 +68,11 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
 
     Returns:
         The numbers of ``result`` themselves; ``playback`` and ``constant_velocity``: those of baselines; ``cost``:
-        seconds of CPU time for ``simulation``, all rollouts of all segments together; ``run``: ``method``, ``seed``,
-        ``interactive``, ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether
-        that is ``named``, not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the
-        store; ``config``: the settings of the evaluation, with what was left to the agent filled in; ``horizon``:
-        seconds of the longest rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy``
+        seconds of CPU time for ``simulation``, all rollouts of all segments together, and the ``steps`` of single
+        rollouts or branches in it; ``run``: ``method``, ``seed``, ``interactive``,
+        ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether that is ``named``,
+        not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the store; ``config``: the settings of the
+        evaluation, with what was left to the agent filled in; ``horizon``: seconds of the longest rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy``
         and ``log``, and ``parts``, pseudo-values of the divergence by recording (see
         :func:`symphony.metrics.sampled_divergence`); ``per_segment``: a row for each run segment. `symphony evaluate
         --metrics wosac` adds ``wosac`` and numbers whose names begin so (see
@@ -88,7 +89,7 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         "config": _filled_in(agent, result),
         "horizon": result.horizon,
         **{baseline.agent: baseline.numbers() for baseline in result.baselines},
-        "cost": {"simulation": result.seconds},
+        "cost": {"simulation": result.seconds, "steps": result.steps},
         "curvature": {"policy": visited.tolist(), "log": visited_log.tolist(), "parts": parts},
         "per_segment": result.metrics.rows(),
     }
@@ -115,6 +116,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
     config, used = result.config, result.config.pruning(agent.search)
     filled = dataclasses.asdict(config) | {
         "search": result.search,
+        "score": "discriminator",
         "interactive": result.interactive,
         "duration": config.duration or agent.duration,
         "goals": "tree",
@@ -126,8 +128,12 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "threshold": None,
     }
     if result.search not in ("none", "log"):
+        filled["score"] = config.score
+    if result.search in ("tree", "best"):
         filled["branches"] = used.test_branches
-    if result.search in ("tree", "oracle"):
+    if result.search == "backtrack":
+        filled["prune_every"], filled["threshold"] = used.prune_every, used.threshold
+    if result.search == "tree":
         filled["trees"] = config.trees
         filled["rule"], filled["prune_every"] = used.rule, used.prune_every
         filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
@@ -161,12 +167,12 @@ def evaluation_name(record: dict[str, Any]) -> str:
 
 
 def simulation_name(config: dict[str, Any]) -> str:
-    """How rollouts came about, such as ``none`` or ``tree-1x16-best-every10``."""
+    """How rollouts came about, such as ``none``, ``backtrack-every2`` or ``tree-1x16-best-every10``."""
     if config["search"] == "best":
         return f"best-of-{config['branches']}"
-    if config["search"] not in ("tree", "oracle"):
-        return config["search"]
-    words = [config["search"], f"{config['trees']}x{config['branches']}", config["rule"]]
+    words = [config["search"]]
+    if config["trees"]:
+        words += [f"{config['trees']}x{config['branches']}", config["rule"]]
     if config.get("prune_every"):
         words.append(f"every{config['prune_every']}")
     if config.get("temperature"):

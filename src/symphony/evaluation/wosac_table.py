@@ -117,9 +117,11 @@ def how_in_words(how: dict[str, Any]) -> str:
         way = f"32 trees of {how['branches']}, {how['rule']} every {how['prune_every']}"
     elif how["search"] == "best":
         way = f"the best of {how['branches']}"
+    elif how["search"] == "backtrack":
+        way = f"back where bad, every {how['prune_every']}"
     else:
         way = "no search"
-    return way + goals
+    return way + (f", by {how['score']}" if "score" in how else "") + goals
 
 
 def grid_note(records: Sequence[dict[str, Any]]) -> str:

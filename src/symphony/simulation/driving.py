@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Int
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import BeamSearchResult, KeepAll, max_then_sum
+from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle
@@ -29,12 +30,13 @@ from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import (
     Rollouts,
     between_states,
+    draw_goals,
     existing,
     rollouts_of,
     simulate,
     start_states,
 )
-from symphony.simulation.search import pruning_rule, search
+from symphony.simulation.search import going_back, pruning_rule, search
 
 RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
@@ -49,7 +51,8 @@ class Simulation(NamedTuple):
     Attributes:
         rollouts: [B, K, ...].
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
-        search: of which the rollouts are the leaves, [B, trees]; None without, and where the best of each was chosen.
+        search: the trees of which the rollouts are the leaves, [B, trees]; None without any.
+        steps: that were simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
@@ -59,6 +62,7 @@ class Simulation(NamedTuple):
     goal: Int[Tensor, "B K N"]
     search: BeamSearchResult | None
     at_states: Bool[Tensor, "B K T N"]
+    steps: int = 0
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
 
@@ -113,6 +117,7 @@ def simulation(
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
+    fix = _fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None)
     start = start_states(
         env,
         goals,
@@ -122,24 +127,35 @@ def simulation(
         logged_goals=config.logged_goals,
         goals_per=settings.goals,
         personas=given_personas(agent.personas, config.persona),
-        fix=_fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None),
+        fix=fix,
     )
-    planned = None
+    planned, kind = None, search_kind(agent, config)
+
+    def begin(state: TensorDictBase) -> TensorDictBase:
+        if goals is None or config.logged_goals:
+            return state
+        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
+        return env.with_goals(state, fix(state.get(keys.SCENE).squeeze(-1), goal))
+
     if egos is not None:
-        kind = search_kind(agent, config)
+        if kind == "backtrack":
+            raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
         forked = kind not in ("none", "log")
         planned = egos.begin(env, start, seed=config.seed, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
-    drawn = goal
-    if search_kind(agent, config) in ("none", "log"):
+    drawn, steps = goal, start.numel() * env.decisions
+    if kind in ("none", "log"):
         found = simulate(
             env, TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor), start
         )
     else:
-        best = config.search == "best"
-        scorer = None
-        if config.search != "oracle" and agent.discriminator is not None:
+        best, scorer = kind == "best", None
+        rules: dict[str, Callable[[], PruningRule | Backtrack]] = {
+            "best": KeepAll,
+            "backtrack": lambda: going_back(env, settings.threshold, start.numel(), begin),
+        }
+        if agent.discriminator is not None:
             scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
             result = search(
@@ -148,29 +164,30 @@ def simulation(
                 scorer,
                 start,
                 seed=config.seed,
-                rule=KeepAll() if best else pruning_rule(settings),
+                rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
+                score=config.score,
                 leaves=None if best else taken,
-                keep_tree=keep_tree and not best,
+                keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
             )
-        found = rollouts_of(env, start, result.trajectories)
+        found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         # A copy of a branch follows the goals of its parent.
         goal = result.trajectories.get(keys.GOAL)[..., -1, :]
         number = result.trajectories.get(keys.PLANNER, None)
         number = None if number is None else number[..., -1, :]
         if best:
             order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
-            found, result = Rollouts(*(_branches(part, order) for part in found)), None
+            found = Rollouts(*(_branches(part, order) for part in found))
             goal = _branches(goal, order)
             number = None if number is None else _branches(number, order)
+        result = result if kind == "tree" else None
     watch.check()
     rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
     goal = goal[:, :, :taken].flatten(1, 2)
-    whole = Simulation(
-        rollouts, goal, result, at_states=rollouts.collision, drawn=None if result is None else drawn
-    )
+    of_tree = None if result is None else drawn
+    whole = Simulation(rollouts, goal, result, at_states=rollouts.collision, steps=steps, drawn=of_tree)
     if planned is None or number is None:
         return whole
     return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
@@ -261,14 +278,16 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
 
 
 def search_kind(agent: Agent, config: EvaluateConfig) -> str:
-    """How the rollouts come about: ``none``, ``tree``, ``oracle`` or ``best``; ``log`` for playback."""
+    """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
     if agent.policy is None:
         return "log"
+    blind = config.score == "discriminator" and agent.discriminator is None
     if config.search == "agent":
-        return "tree" if agent.searches and agent.discriminator is not None else "none"
-    if config.search in ("tree", "best") and agent.discriminator is None:
+        return "tree" if agent.searches and not blind else "none"
+    if config.search != "none" and blind:
         raise ConfigError(
-            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none"
+            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
+            "score: --score flags or rule"
         )
     return config.search
 
@@ -276,7 +295,7 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
 def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
-    if kind in ("none", "log"):
+    if kind in ("none", "log", "backtrack"):
         return config.rollouts, 1, 1
     branches = config.pruning(agent.search).test_branches
     if kind == "best":
@@ -301,7 +320,7 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
-        trees = max(config.trees, -(-each // branches)) if kind in ("tree", "oracle") else 1
+        trees = max(config.trees, -(-each // branches)) if kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
     exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)

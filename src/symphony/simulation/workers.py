@@ -15,7 +15,8 @@ from symphony.config.evaluation import TOGETHER
 from symphony.data.engine import WorkerError, ordered_map
 from symphony.errors import ConfigError, SymphonyError
 from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import planned_trees
+from symphony.simulation.driving import planned_trees, search_kind
+from symphony.simulation.search import FILL
 
 POINTS = 1 << 19
 """Map points that all agents of a batch see together, at most: some 50 MB of features."""
@@ -45,7 +46,8 @@ def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) ->
     everyone = config.interactive == "all" or config.open_traffic or config.others != "log"
     trees, branches, _ = planned_trees(agent, config)
     agents = trees * branches * (IN_TRAFFIC if everyone else interactive)
-    return min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
+    found = min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
+    return found * FILL if search_kind(agent, config) == "backtrack" else found
 
 
 def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:

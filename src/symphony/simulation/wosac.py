@@ -28,7 +28,7 @@ from symphony.envs.routes import route_table
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.driving import search_kind, simulation
+from symphony.simulation.driving import planned_trees, search_kind, simulation
 from symphony.simulation.finite import NotFiniteError
 
 Doubles = NDArray[np.float64]
@@ -226,7 +226,7 @@ def _driven(
         plans = [settings.config(ROLLOUTS, settings.seed)]
     else:
         # All branches of all trees together would take gigabytes.
-        branches = one.pruning(agent.search).test_branches
+        _, branches, _ = planned_trees(agent, one)
         trees = max(AT_ONCE // (branches * len(vehicles)), 1)
         plans = [
             settings.config(min(trees, ROLLOUTS - first), settings.seed * ROLLOUTS + first)
