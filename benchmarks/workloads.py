@@ -88,7 +88,8 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
         "edge_following": np.concatenate([(k + 1) % half, half + (k + 1) % half]),
         "edge_valid": np.ones(points),
         "stream": seed,
-        "route": np.zeros((agents, 0, *base.route.shape[3:])),
+        "route_point": np.zeros((0, 2)),
+        "route_first": np.zeros((agents, 0)),
         "route_count": np.zeros((agents, 0)),
         "route_logged": np.full(agents, -1),
     }

@@ -125,6 +125,12 @@ def scored(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> 
     steps = states.shape[2] - 1
     whole = [*start.shape, steps]
     state = start.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL).unsqueeze(-1).expand(*whole).clone()
+    before, come = env._read(start), []
+    for t in range(steps):
+        now = env._progress(before, states[:, :, t + 1])
+        before = before._replace(state=states[:, :, t + 1], progress=now)
+        come.append(now)
+    state.set(keys.PROGRESS, torch.stack(come, 2))
     state.set(keys.STATE, states[:, :, 1:])
     state.set(keys.STEP, torch.arange(1, steps + 1)[:, None].expand(*whole, 1))
     with torch.no_grad():

@@ -178,8 +178,8 @@ def _features(
         dark = torch.zeros_like(static[..., LIGHT_COLUMN:])
         parts += [static[..., 6:LIGHT_COLUMN], dark.scatter(-1, state[..., None], shown)]
     features = torch.cat(parts, -1)
-    # Where every scene has enough points, nothing is masked.
-    return features if on_host(mask) and tables.enough_points else features * mask[..., None]
+    # Most maps have enough points, and then there is nothing to mask.
+    return features if on_host(mask) and bool(mask.all()) else features * mask[..., None]
 
 
 def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:
