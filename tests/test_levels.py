@@ -25,7 +25,7 @@ from symphony.envs.tables import Tables
 
 HIGH = 6.0
 STEPS = 41
-SEEN = ObservationConfig(num_objects=8, num_points=400, num_lights=0, road=True, gaps=True, foresight=(1.0,))
+SEEN = ObservationConfig(num_objects=8, num_points=400, num_lights=0, clearance=True, foresight=(1.0,))
 
 
 def line(axis: int, across: float, height: float, back: bool = False) -> NDArray[Any]:
