@@ -101,9 +101,7 @@ def test_a_changed_copy_elsewhere_is_what_runs(
     source, update = (RECIPES / "bc.py").read_text(encoding="utf-8"), 'yield "policy", policy_loss(experts)'
     assert update in source
     changed = tmp_path / "mine.py"
-    changed.write_text(
-        source.replace(update, f'{update}; print("mine")'), encoding="utf-8"
-    )
+    changed.write_text(source.replace(update, f'{update}; print("mine")'), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(recipes, "settle", lambda: None)
     monkeypatch.setattr(sys, "argv", ["mine.py", "--data", "data", "--test", "data", "--out", "run", *COMMON])
