@@ -93,6 +93,24 @@ def test_recipe(
     assert f"{found['ade']:.2f}" in capsys.readouterr().out
 
 
+def test_a_changed_copy_elsewhere_is_what_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with StoreWriter(tmp_path / "data") as writer:
+        writer.append(crossing(4, steps=8))
+    source, update = (RECIPES / "bc.py").read_text(encoding="utf-8"), 'yield "policy", policy_loss(experts)'
+    assert update in source
+    changed = tmp_path / "mine.py"
+    changed.write_text(source.replace(update, f'{update}; print("mine")'), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recipes, "settle", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["mine.py", "--data", "data", "--test", "data", "--out", "run", *COMMON])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(changed), run_name="__main__")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.count("mine\n") == 3  # updates
+
+
 def test_mistakes_are_told_in_a_line_before_the_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
