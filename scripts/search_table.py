@@ -36,7 +36,6 @@ WAYS: dict[str, dict[str, Any]] = {
     "tree, by flags": {"search": "tree", "score": "flags"},
     "tree, by the rule": {"search": "tree", "score": "rule"},
     "back, by the discriminator": {"search": "backtrack"},
-    "back, by flags": {"search": "backtrack", "score": "flags"},
     "back, by the rule": {"search": "backtrack", "score": "rule"},
 }
 FIGURES = {
