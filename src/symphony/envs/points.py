@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.envs.objects import levels_apart
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
+from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import nearest, on_host, smallest
 
 _DISTANCES = 1 << 16
@@ -69,7 +69,7 @@ def nearest_points(
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
     """Numbers of the nearest points among all points of all scenes, and which of them exist.
 
-    With heights and levels, points on other levels do not (see :func:`symphony.envs.objects.levels_apart`).
+    With heights and levels, points on other levels do not (see :func:`symphony.geometry.levels_apart`).
     """
     x, y = tables.position
     count, total = tables.config.num_points, x.shape[1]

@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.data.levels import LEVEL
 from symphony.data.segment import RunSegment
 from symphony.errors import DataError, DataWarning
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
+from symphony.geometry.levels import LEVEL
 from symphony.geometry.nearest import first_smallest, on_host
 from symphony.geometry.stations import stations_along
 from symphony.roadgraph import LaneGraph, Route, ground_truth_routes, route_lines, routes, starting_lanes

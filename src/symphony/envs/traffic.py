@@ -10,8 +10,9 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.objects import Objects, levels_apart
+from symphony.envs.objects import Objects
 from symphony.geometry.boxes import box_gap
+from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import on_host
 
 CLEAR = 1.0

@@ -18,14 +18,15 @@ from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRul
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle
+from symphony.envs.flags import offroad_flags
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.metrics import collisions, offroad
+from symphony.metrics import collisions
 from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
 from symphony.simulation.control import Tempered, given_personas
 from symphony.simulation.finite import FiniteWatch
-from symphony.simulation.logged import logged
+from symphony.simulation.logged import logged, logged_heights
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import (
     Rollouts,
@@ -360,14 +361,9 @@ def driven_by(
 def playback(scenes: SceneBatch) -> Rollouts:
     """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
     log, valid = logged(scenes)
-    edges = (
-        scenes.edge_start,
-        scenes.edge_end,
-        scenes.edge_valid,
-        scenes.edge_previous,
-        scenes.edge_following,
-    )
-    off = offroad(log[..., :2], *edges) & valid
+    row, height = torch.arange(len(scenes), device=log.device), logged_heights(scenes)
+    height = None if height is None else height.flatten(1, 2)
+    off = offroad_flags(scenes, row, log[..., :2].flatten(1, 2), height=height).view(valid.shape) & valid
     hit = _logged_collisions(scenes)
     return Rollouts(log[:, None], hit[:, None], off[:, None, 1:], valid[:, None, 1:])
 
@@ -376,5 +372,8 @@ def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[T
     """See :func:`symphony.metrics.collisions`; what an agent does that is not there is no collision."""
     moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
-    hit = collisions(moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, at_states=at_states)
+    height = scenes.agent_height.transpose(1, 2) if scenes.agent_height.shape[1] else None
+    hit = collisions(
+        moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, height, at_states=at_states
+    )
     return hit.transpose(1, 2)

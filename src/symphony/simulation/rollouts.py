@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
 from symphony.envs.driving import DrivingEnv
+from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
 from symphony.metrics import collisions
 from symphony.modules import drawn_goals
@@ -211,7 +212,7 @@ def existing(scenes: SceneBatch, rollouts: Rollouts) -> Bool[Tensor, "B K T+1 N"
 def between_states(
     scenes: SceneBatch, state: Float[Tensor, "B K T+1 N 4"], there: Bool[Tensor, "B K T+1 N"]
 ) -> Bool[Tensor, "B K T N"]:
-    """Whether the box of each driven agent overlaps another's at some time of each step (see
+    """Whether the box of each driven agent overlaps another's on its level at some time of each step (see
     :func:`symphony.metrics.collisions`), among all others of its scene as they were driven or logged.
 
     Args:
@@ -227,12 +228,18 @@ def between_states(
     found = []
     for part in torch.arange(len(scenes), device=state.device).split(each):
         rollouts = (len(part), state.shape[1])
-        pose = pad(scenes.log_state[part, None, :steps, :, :3].expand(*rollouts, -1, -1, -1), (0, 0, 0, 1))
+        moved, logged = state[part, ..., :3], scenes.log_state[part, :steps, :, :3]
+        level = rollout_heights(scenes, state[part], part)
+        if level is not None:
+            moved = torch.cat([moved, level], -1)
+            logged = torch.cat([logged, scenes.agent_height[part, :steps]], -1)
+        pose = pad(logged[:, None].expand(*rollouts, -1, -1, -1), (0, 0, 0, 1))
         seen = pad(scenes.log_valid[part, None, :steps].expand(*rollouts, -1, -1), (0, 1))
         index = column[part, None, None].expand(*rollouts, steps, -1)
-        pose = pose.scatter(-2, index[..., None].expand(*index.shape, 3), state[part, ..., :3].to(pose.dtype))
+        pose = pose.scatter(-2, index[..., None].expand_as(moved), moved.to(pose.dtype))
         seen = seen.scatter(-1, index, there[part])
         pose, seen = pose[..., :count, :].transpose(2, 3), seen[..., :count].transpose(2, 3)
         size = scenes.box_size[part, None]
-        found.append(collisions(pose[..., :2], pose[..., 2], size, seen, subject[part, None]))
+        at = None if level is None else pose[..., 3:]
+        found.append(collisions(pose[..., :2], pose[..., 2], size, seen, subject[part, None], at))
     return torch.cat(found).transpose(2, 3) & there[:, :, 1:]
