@@ -24,7 +24,7 @@ help:  ## what there is
 
 setup: $(DEV)  ## create .venv with everything for development
 
-demo: $(CORE)  ## learn from the built-in data and write pictures and numbers to out/demo
+demo: $(CORE)  ## an included agent, then one learned from the built-in data: pictures and numbers in out/demo
 	$(BIN)/symphony demo --out out/demo
 
 table: $(CORE)  ## train, evaluate and compare all eight methods, tiny, in out/table

@@ -42,7 +42,7 @@ SIMULATOR = {
     "symphony.envs:Bicycle.step": "dynamics",
     "symphony.envs.driving:collision_flags": "collisions",
     "symphony.envs.driving:offroad_flags": "road edge",
-    "symphony.envs.driving:observe": "observation",
+    "symphony.envs.observation:observe": "observation",
 }
 SEARCH = {
     "symphony.envs:DrivingEnv._step": "environment",

@@ -39,7 +39,7 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.evaluation import evaluate
 from symphony.geometry import boxes_overlap
 from symphony.modules import ElementGroup, discrete_policy, discriminator
-from symphony.recipes import RECIPES
+from symphony.recipes import recipe_of
 from symphony.simulation import SceneDataset
 from symphony.training import Processes
 
@@ -88,7 +88,8 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
         "edge_following": np.concatenate([(k + 1) % half, half + (k + 1) % half]),
         "edge_valid": np.ones(points),
         "stream": seed,
-        "route": np.zeros((agents, 0, *base.route.shape[3:])),
+        "route_point": np.zeros((0, 2)),
+        "route_first": np.zeros((agents, 0)),
         "route_count": np.zeros((agents, 0)),
         "route_logged": np.full(agents, -1),
     }
@@ -210,7 +211,7 @@ def update(method: str, *, states: int = 1024, points: int = 200, count: int = 1
         agent=AgentConfig(num_points=points),
         wandb="disabled",
     )
-    trainer = RECIPES[method](config, Processes(torch.device("cpu")))
+    trainer = recipe_of(method)(config, Processes(torch.device("cpu")))
     steps = itertools.count()
 
     def once() -> None:

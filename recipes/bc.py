@@ -1,17 +1,43 @@
-"""Behavioural cloning: the row "BC" of the paper's tables.
-
-python recipes/bc.py --data TRAIN --test TEST --out runs/bc
-"""
+"""Behavioural cloning: the row "BC" of the paper's tables (section II-B)."""
 
 from __future__ import annotations
 
-from symphony.cli.recipe import run
+import torch
+
+from symphony import BCLoss, SegmentStore, TrainConfig
+from symphony.agents import Agent, bicycle, observation_of, policy_network
+from symphony.simulation import SceneDataset
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
-def main(args: list[str] | None = None) -> None:
-    """Run the recipe."""
-    run("bc", __doc__, args)
+def bc(config: TrainConfig, processes: Processes) -> Trainer:
+    """Imitate the logged actions of every vehicle that moves or waits."""
+    torch.manual_seed(config.seed)
+    rng, device = torch.Generator(), processes.device
+    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
+    data = SceneDataset(store, dynamics=dynamics, routes=False, **config.scenes)
+
+    # Networks.
+    spec = config.spec("bicycle", data.dt)
+    policy = policy_network(spec)
+    agent = Agent(str(config.out), policy, spec).to(device)
+
+    # Losses and optimizers.
+    policy_loss = processes.share(BCLoss(policy))
+    optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+
+    # The order of updates.
+    def update(step: int) -> Updates:
+        items, observation = data.draw(config.segments, rng), observation_of(spec)
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        yield "policy", policy_loss(experts)
+
+    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes)
 
 
 if __name__ == "__main__":
-    main()
+    from symphony.cli.recipe import main
+
+    main(bc, __doc__)

@@ -1,17 +1,46 @@
-"""Behavioural cloning with goals: the row "BC+H" of the paper's tables.
-
-python recipes/bc_h.py --data TRAIN --test TEST --out runs/bc_h
-"""
+"""Behavioural cloning with goals: the row "BC+H" of the paper's tables (sections III-B and IV-B)."""
 
 from __future__ import annotations
 
-from symphony.cli.recipe import run
+import torch
+
+from symphony import BCLoss, GoalLoss, SegmentStore, TrainConfig
+from symphony.agents import Agent, bicycle, goal_network, observation_of, policy_network
+from symphony.config.training import GOALS
+from symphony.simulation import SceneDataset
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
-def main(args: list[str] | None = None) -> None:
-    """Run the recipe."""
-    run("bc_h", __doc__, args)
+def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
+    """Imitate the logged actions given the route that was taken, and learn which routes are taken."""
+    torch.manual_seed(config.seed)
+    rng, device = torch.Generator(), processes.device
+    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
+    data = SceneDataset(store, dynamics=dynamics, routes=True, **config.scenes)
+
+    # Networks.
+    spec = config.spec("bicycle", data.dt, goals=True)
+    policy, goals = policy_network(spec), goal_network(spec)
+    agent = Agent(str(config.out), policy, spec, goals).to(device)
+
+    # Losses and optimizers.
+    policy_loss = processes.share(BCLoss(policy))
+    goal_loss = processes.share(GoalLoss(goals))
+    optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+
+    # The order of updates.
+    def update(step: int) -> Updates:
+        items, observation = data.draw(config.segments, rng), observation_of(spec)
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        yield "policy", policy_loss(experts)
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
+
+    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes)
 
 
 if __name__ == "__main__":
-    main()
+    from symphony.cli.recipe import main
+
+    main(bc_h, __doc__)

@@ -1,17 +1,80 @@
-"""Adversarial imitation through the model with goals: the row "MGAIL+H" of the paper's tables.
-
-python recipes/mgail_h.py --data TRAIN --test TEST --out runs/mgail_h
-"""
+"""Adversarial imitation through the model with goals: the row "MGAIL+H" of the paper's tables."""
 
 from __future__ import annotations
 
-from symphony.cli.recipe import run
+import torch
+from tensordict.nn import TensorDictSequential
+
+from symphony import BCLoss, DiscriminatorLoss, GoalLoss, MGAILLoss, SegmentStore, TrainConfig
+from symphony.agents import Agent, discriminator_network, goal_network, observation_of, policy_network
+from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
+from symphony.config.training import GOALS
+from symphony.envs import Displacement, DrivingEnv
+from symphony.modules import SeededNoise
+from symphony.simulation import SceneDataset, SearchReplay
+from symphony.simulation.search import branched_streams, collector_settings, realism_score
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
-def main(args: list[str] | None = None) -> None:
-    """Run the recipe."""
-    run("mgail_h", __doc__, args)
+def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
+    """Regress to the log, then follow the gradient of the discriminator through the simulation; given routes."""
+    torch.manual_seed(config.seed)
+    seed, rng, dynamics = processes.seed(config.seed), torch.Generator(), Displacement()
+    data = SceneDataset(SegmentStore(config.data), dynamics=dynamics, routes=True, **config.scenes)
+
+    # Networks.
+    spec = config.spec("displacement", data.dt, goals=True, discriminator=True)
+    policy, goals, discriminator = policy_network(spec), goal_network(spec), discriminator_network(spec)
+    agent = Agent(str(config.out), policy, spec, goals, discriminator).to(processes.device)
+
+    # Environment and collector: nothing is pruned; rollouts follow the routes of the log.
+    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
+    collector = BeamSearchCollector(
+        with_rows(env, [min(config.segments, len(data))]),
+        TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
+        score=realism_score(env, discriminator),
+        rule=KeepAll(),
+        prepare=lambda start: env.with_goals(branched_streams(start)),
+        **collector_settings(config.search, env, seed, data, config.segments),
+    )
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+
+    # Losses and optimizers.
+    regression_loss, goal_loss = processes.share(BCLoss(policy)), processes.share(GoalLoss(goals))
+    mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
+    optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+    seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device
+
+    # The order of updates, in three phases; goals are learned in all.
+    def regression(step: int) -> Updates:
+        items = data.draw(config.segments, rng)
+        experts = data.sample_states(items, config.states, seen, rng, device, config.perturb.at(step))
+        yield "policy", regression_loss(experts)
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, seen, rng, device))
+
+    def head_start(step: int) -> Updates:
+        yield "search", replay.refresh(step)
+        for _ in range(config.mgail.discriminator_updates):
+            yield "discriminator", realism_loss(replay.both_kinds(rng))
+        items = data.draw(config.segments, rng)
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, seen, rng, device))
+
+    def adversarial(step: int) -> Updates:
+        yield from head_start(step)
+        losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
+        if config.mgail.expert_weight:
+            losses["loss_regression"] = config.mgail.expert_weight * next(regression(step))[1]["loss_bc"]
+        yield "policy", losses
+
+    slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
+    ready = Phase(begin + config.mgail.head_start, head_start, slower)
+    phases = [Phase(begin, regression, cosine(rates, begin)), ready, Phase(config.steps, adversarial, slower)]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 
 if __name__ == "__main__":
-    main()
+    from symphony.cli.recipe import main
+
+    main(mgail_h, __doc__)

@@ -1,17 +1,76 @@
-"""Adversarial imitation through the model with tree search: the row "MGAIL+TS" of the paper's tables.
-
-python recipes/mgail_ts.py --data TRAIN --test TEST --out runs/mgail_ts
-"""
+"""Adversarial imitation through the model with tree search: the row "MGAIL+TS" of the paper's tables."""
 
 from __future__ import annotations
 
-from symphony.cli.recipe import run
+import torch
+from tensordict.nn import TensorDictSequential
+
+from symphony import BCLoss, DiscriminatorLoss, MGAILLoss, SegmentStore, TrainConfig
+from symphony.agents import Agent, discriminator_network, observation_of, policy_network
+from symphony.collectors import BeamSearchCollector, with_rows
+from symphony.envs import Displacement, DrivingEnv
+from symphony.modules import SeededNoise
+from symphony.simulation import SceneDataset, SearchReplay
+from symphony.simulation.search import branched_streams, collector_settings, pruning_rule, realism_score
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
-def main(args: list[str] | None = None) -> None:
-    """Run the recipe."""
-    run("mgail_ts", __doc__, args)
+def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
+    """Regress to the log, then follow the gradient of the discriminator through the survivors of a search."""
+    torch.manual_seed(config.seed)
+    seed, rng, dynamics = processes.seed(config.seed), torch.Generator(), Displacement()
+    data = SceneDataset(SegmentStore(config.data), dynamics=dynamics, routes=False, **config.scenes)
+
+    # Networks.
+    spec = config.spec("displacement", data.dt, discriminator=True, searches=True)
+    policy, discriminator = policy_network(spec), discriminator_network(spec)
+    agent = Agent(str(config.out), policy, spec, discriminator=discriminator).to(processes.device)
+
+    # Environment and collector: the discriminator prunes branches of every segment.
+    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
+    collector = BeamSearchCollector(
+        with_rows(env, [min(config.segments, len(data))]),
+        TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
+        score=realism_score(env, discriminator),
+        rule=pruning_rule(config.search),
+        prepare=branched_streams,
+        **collector_settings(config.search, env, seed, data, config.segments),
+    )
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+
+    # Losses and optimizers.
+    regression_loss = processes.share(BCLoss(policy))
+    mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    realism_loss = processes.share(DiscriminatorLoss(discriminator))
+    optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+    seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device
+
+    # The order of updates, in three phases.
+    def regression(step: int) -> Updates:
+        items = data.draw(config.segments, rng)
+        experts = data.sample_states(items, config.states, seen, rng, device, config.perturb.at(step))
+        yield "policy", regression_loss(experts)
+
+    def head_start(step: int) -> Updates:
+        yield "search", replay.refresh(step)
+        for _ in range(config.mgail.discriminator_updates):
+            yield "discriminator", realism_loss(replay.both_kinds(rng))
+
+    def adversarial(step: int) -> Updates:
+        yield from head_start(step)
+        losses = mgail_loss(replay.repeatable(config.mgail.rollouts, rng))
+        if config.mgail.expert_weight:
+            losses["loss_regression"] = config.mgail.expert_weight * next(regression(step))[1]["loss_bc"]
+        yield "policy", losses
+
+    slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
+    ready = Phase(begin + config.mgail.head_start, head_start, slower)
+    phases = [Phase(begin, regression, cosine(rates, begin)), ready, Phase(config.steps, adversarial, slower)]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 
 if __name__ == "__main__":
-    main()
+    from symphony.cli.recipe import main
+
+    main(mgail_ts, __doc__)

@@ -23,8 +23,9 @@ from symphony.data.selection import interactive_agents
 from symphony.data.sources.sumo import generate_run
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
+from symphony.envs.routes import route_table
 from symphony.evaluation.logs import measure
-from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
+from symphony.roadgraph import LaneGraph, route_errors
 
 SplitName = Literal["train", "test"]
 DURATION = 150.0
@@ -109,11 +110,9 @@ def _route_errors(segment: RunSegment, pair: NDArray[np.int64]) -> list[float]:
     graph = LaneGraph(segment.road)
     errors = []
     for agent in pair:
-        path = segment.position[agent, :, :2]
-        choices = feasible_routes(graph, path[0], float(segment.heading[agent, 0]))
-        errors.append(
-            float(route_errors(graph, choices, path, segment.valid[agent]).min()) if choices else np.inf
-        )
+        path, table = segment.position[agent, :, :2][segment.valid[agent]], route_table(segment, graph, agent)
+        lines = [table.line(route) for route in range(len(table.count))]
+        errors.append(float(route_errors(lines, path).min()) if lines else np.inf)
     return errors
 
 

@@ -8,16 +8,15 @@ further argument goes to every recipe, such as ``--steps 1000 --rollouts 16``.
 from __future__ import annotations
 
 import argparse
-import runpy
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from symphony.cli import main as symphony
+from symphony.cli.recipe import main as recipe
 from symphony.config import METHODS
 from symphony.data.builtin import builtin_store
-
-RECIPES = Path(__file__).resolve().parents[1] / "recipes"
+from symphony.recipes import recipe_of
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -37,9 +36,8 @@ def main(args: Sequence[str] | None = None) -> int:
         given = {word.partition("=")[0] for word in further}
         places = {"--data": builtin_store("train"), "--test": builtin_store("test"), "--out": run}
         flags = {**places, "--profile": "tiny", "--rollouts": "4"}
-        recipe = runpy.run_path(str(RECIPES / f"{method}.py"))
         kept = [str(word) for flag, value in flags.items() if flag not in given for word in (flag, value)]
-        recipe["main"]([*kept, *further])
+        recipe(recipe_of(method), None, [*kept, *further])
     table = ["table", "--setting", "main", "--runs", str(out)]
     return symphony([*table, "--format", "markdown", "--out", str(out / "table.md")]) or symphony(table)
 

@@ -22,7 +22,7 @@ from symphony import keys
 from symphony.agents.choice import choose
 from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError
-from symphony.recipes import RECIPES, train
+from symphony.recipes import recipe_of, train
 from symphony.simulation import SceneDataset
 from symphony.training import Processes, Trainer, processes
 
@@ -47,7 +47,7 @@ def config(method: Any, store: Path, out: Path) -> TrainConfig:
 
 def fresh(method: str, store: Path, world: Processes) -> Trainer:
     """Networks and losses that are the same at every call."""
-    return RECIPES[method](tiny(method, store, store.parent / "nowhere"), world)
+    return recipe_of(method)(tiny(method, store, store.parent / "nowhere"), world)
 
 
 def batch_for(kind: str, trainer: Trainer) -> TensorDictBase:

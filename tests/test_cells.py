@@ -78,23 +78,19 @@ def test_the_nearest_points_are_those_among_all(scenes: SceneBatch, count: int) 
 
 
 @pytest.mark.usefixtures("at_once")
-def test_points_are_seen_as_by_the_plain_formula_with_and_without_a_gradient(scenes: SceneBatch) -> None:
+def test_points_are_seen_as_by_the_plain_formula(scenes: SceneBatch) -> None:
     row, where = places(scenes, 3)
     rng = torch.Generator().manual_seed(1)
     pose = torch.cat([where, torch.randn(*where.shape[:2], 2, generator=rng) * 5], -1)
     step = torch.randint(60, (len(row),), generator=rng)
     tables = Tables(scenes, FEW)
     inputs = pose[..., :2].clone().requires_grad_(), pose[..., 2], pose[..., 3]
-    with_graph, mask = observed_points(tables, row, step, *inputs)
-    plain, again = observed_points(tables, row, step, pose[..., :2], pose[..., 2], pose[..., 3])
+    found, mask = observed_points(tables, row, step, *inputs)
     chosen = oracle.nearest_points(scenes, row, where, FEW.num_points)
     expected, exist = oracle.observed_points(scenes, row, step, chosen, pose, FEW)
-    assert with_graph.requires_grad
-    assert not plain.requires_grad
+    assert found.requires_grad
     assert torch.equal(mask, exist)
-    assert torch.equal(again, exist)
-    assert torch.equal(with_graph.detach(), expected)
-    assert torch.equal(plain, expected)
+    assert torch.equal(found.detach(), expected)
     assert (expected[..., -9:].sum((-1, -2)) > 0).any()
 
 

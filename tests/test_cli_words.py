@@ -59,7 +59,12 @@ def test_numbers_are_told_where_there_are_some(
     row |= {"agent": "runs/bc", "collision_rate": 12.5, "collision_crossing": 12.5}
     row |= {"curvature_jsd_corrected": math.nan, "curvature_jsd_se": math.nan, "curvature_jsd_floor": 0.25}
     row |= {"my:jerk": 1.5, "my:jerk_se": 0.5, "standing": math.nan}
-    print_metrics([row | {"interactive": 2, "rollouts": 4, "segments": 2, "groups": 2, "seed": 0}])
+    row |= {"interactive": 2, "rollouts": 4, "segments": 2, "groups": 2, "seed": 0}
+    print_metrics([row])
+    short = capsys.readouterr().out.splitlines()
+    assert "bc: my:jerk 1.5000 ± 0.5000" in short  # was asked for
+    assert len(short) == 8  # with the table's lines, and one of what it is of
+    print_metrics([row], details=True)
     told = capsys.readouterr().out
     assert "bc: collisions, % of rollouts: 12.5 crossing\n" in told
     assert "bc: my:jerk 1.5000 ± 0.5000\n" in told

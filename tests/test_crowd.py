@@ -449,7 +449,7 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:
     for m in range(3):
         lane = 8 + 3 * 0 + m
         route = int(given_goals([f"{name[0]}=lane:{100 + lane}"], [segment], scenes)[0, 0])
-        points = scenes.route[0, 0, route, : int(scenes.route_count[0, 0, route])].numpy()
+        points = scenes.whole_route(0, 0, route).numpy()
         ends = segment.road.lanes[lane][[0, -1], :2]
         assert max(np.linalg.norm(points - end, axis=-1).min() for end in ends) < 3.5
         x, y = segment.road.lanes[4 + (2, 3, 1)[m]][-20, :2].tolist()

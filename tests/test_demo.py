@@ -11,10 +11,11 @@ import pytest
 
 from helpers_segments import crossing, straight_road
 from symphony.cli import main
-from symphony.config import Method
+from symphony.config import Method, TrainConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
+from symphony.errors import ConfigError
 
 
 def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,15 +33,43 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "2", "--rollouts", "1"]) == 0
     assert not (earlier.parent / "left").exists()
     rows = json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]
-    assert [row["agent"] for row in rows] == ["log playback", "constant velocity", "BC+H", "included BC+TS+H"]
+    assert [row["agent"] for row in rows] == [
+        "log playback",
+        "constant velocity",
+        "included BC+TS+H",
+        "your BC+H",
+    ]
     assert all(row["segments"] == 3 for row in rows)
     assert rows[0]["ade"] == rows[0]["collision_rate"] == 0
     assert rows[1]["ade"] > 1
     # Whatever two updates make of BC+H, an agent that has learned to drive stays on the road.
-    assert rows[3]["search"] == "tree"
-    assert rows[3]["offroad_time"] < rows[1]["offroad_time"]
-    assert (tmp_path / "demo" / "rollouts.png").stat().st_size > 50_000
-    assert f"{rows[1]['ade']:.2f}" in capsys.readouterr().out
+    assert rows[2]["search"] == "tree"
+    assert rows[2]["offroad_time"] < rows[1]["offroad_time"]
+    sizes = [(tmp_path / "demo" / name).stat().st_size for name in ("included.png", "rollouts.png")]
+    assert 50_000 < sizes[0] < sizes[1]
+    told = capsys.readouterr().out
+    assert f"{rows[1]['ade']:.2f}" in told
+    first, _, second = told.partition("Now one of your own")
+    assert "included BC+TS+H" in first
+    assert "your BC+H" not in first
+    assert "your BC+H" in second
+    assert len(told.splitlines()) <= 30  # a screen
+
+
+def test_the_included_agent_is_shown_before_anything_is_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with StoreWriter(tmp_path / "test") as writer:
+        writer.append(SegmentStore(builtin_store("test"))[0])
+    monkeypatch.setattr("symphony.data.builtin.builtin_store", lambda _: tmp_path / "test")
+
+    def stop(config: TrainConfig) -> None:
+        raise ConfigError("here it would learn")
+
+    monkeypatch.setattr("symphony.recipes.train", stop)
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--rollouts", "1"]) == 1
+    assert (tmp_path / "demo" / "included.png").stat().st_size > 10_000
+    assert len(json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]) == 3
 
 
 def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -320,14 +320,7 @@ def test_step_gradient_matches_finite_differences() -> None:
         after = env.dynamics.step(state, action, scenes.box_size[:, :2].double(), env.dt)
         double = scenes.apply(lambda x: x.double() if x.is_floating_point() else x)
         twin = DrivingEnv(double, Displacement(), ALL)
-        out = twin._from_state(
-            start["scene"][:, 0],
-            start["step"][:, 0] + 1,
-            start["stream"][:, 0],
-            after,
-            start[keys.VALID],
-            start[keys.GOAL],
-        )
+        out = twin._from_state(twin._read(start)._replace(step=start[keys.STEP][:, 0] + 1, state=after))
         # The farthest elements may swap at the cut; all of them are seen here, so pooling is smooth but at ties.
         return torch.cat([out[keys.OBJECTS].sum(-2), out[keys.POINTS].mean(-2)], -1)
 

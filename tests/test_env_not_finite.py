@@ -106,7 +106,7 @@ def test_a_route_that_is_not_there_is_none() -> None:
     segment = crossing(3, steps=9, seed=1)
     scenes = scene(segment, [0, 1], LaneGraph(segment.road))
     env = DrivingEnv(scenes, observation=ObservationConfig(num_objects=2, num_points=2, route=True))
-    start, many = env.start(torch.tensor([0])), scenes.route.shape[2]
+    start, many = env.start(torch.tensor([0])), scenes.route_count.shape[2]
     for goal in (-1, many, many + 1):
         seen = env.with_goals(start, torch.tensor([[goal, 0]]))["agents", "observation", "route"]
         assert not seen[0, 0].any()

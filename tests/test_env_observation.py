@@ -5,14 +5,11 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from dataclasses import replace
 from typing import Any
-from unittest import mock
 
-import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -25,10 +22,10 @@ from symphony.envs import (
     DrivingEnv,
     ObservationConfig,
     collate,
-    points,
     scene,
 )
-from symphony.envs.tables import POINT_FEATURES
+from symphony.envs.observation import observe_states
+from symphony.roadgraph import LaneGraph
 
 NOTHING = ObservationConfig.nothing()
 EVERYTHING = ObservationConfig(num_objects=4, num_points=60, clearance=True, foresight=(0.5, 1.0))
@@ -82,6 +79,22 @@ def test_what_is_observed_changes_no_state_and_no_flag(dynamics: Any) -> None:
     assert flags < 0
 
 
+def test_states_can_be_observed_without_an_environment() -> None:
+    logs = [crossing(4, seed=1, steps=9), straight_road(4, steps=9)]
+    scenes = collate([scene(log, [0, 1], LaneGraph(log.road)) for log in logs])
+    config = replace(EVERYTHING, num_objects=3, num_points=12, route=True)
+    env = DrivingEnv(scenes, None, config)
+    now = env.start(torch.tensor([0, 1, 1]), goal=torch.tensor([[0, -1], [0, 0], [1, 0]]))
+    for _ in range(3):
+        now = env.step(now.set(keys.ACTION, torch.full((3, 2), 90)))["next"]
+    row, step = now[keys.SCENE].squeeze(-1), now[keys.STEP].squeeze(-1)
+    state, valid, goal, come = (now[key] for key in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS))
+    seen, _ = observe_states(scenes, row, step, state, valid, config, goal=goal, progress=come)
+    assert now[keys.ROUTE].any()
+    for name, value in now["agents", "observation"].items():
+        assert torch.equal(getattr(seen, name), value), name
+
+
 def test_constant_velocity_needs_no_observation() -> None:
     env = make_env(NOTHING)
     policy, now = ConstantVelocity(env.dynamics), env.start(torch.tensor([0]))
@@ -129,35 +142,6 @@ def test_agents_see_their_size_their_speed_and_that_the_log_ends() -> None:
         state = env.step(state)["next"]
     # With three and five steps to take; what goes on after its end is told so, too.
     assert told == [[k >= 3, k >= 5] for k in range(6)]
-
-
-@given(
-    st.integers(1, 9),
-    st.integers(1, 12),
-    st.integers(1, 12),
-    st.sampled_from([np.float32, np.float64]),
-    st.integers(0, 1 << 16),
-)
-def test_points_of_all_agents_are_written_as_one_by_one(
-    agents: int, count: int, rows: int, kind: type[np.floating[Any]], seed: int
-) -> None:
-    """By the operations of a plain loop in their order, so to the same bits, however many fit into a block."""
-    rng = np.random.default_rng(seed)
-    table = rng.normal(0, 30, (rows, POINT_FEATURES)).astype(kind)
-    index = rng.integers(0, rows, (agents, count))
-    pose = [rng.normal(0, 30, agents).astype(kind) for _ in range(5)]
-    scale = kind(rng.uniform(5, 50))
-    found = np.full((agents, count, POINT_FEATURES), np.nan, kind)
-    with mock.patch.object(points, "_ROWS", int(rng.integers(1, 40))):
-        points._write_in_blocks(index, table, pose, scale, found)
-    for (r, k), row in np.ndenumerate(index):
-        x, y, cos, sin, own = (values[r] for values in pose)
-        right, up, (ahead, left) = table[row, 0] - x, table[row, 1] - y, table[row, 2:4]
-        expected = table[row].copy()
-        expected[:2] = (cos * right - sin * up) / scale, (sin * right + cos * up) / scale
-        expected[2:4] = cos * ahead - sin * left, sin * ahead + cos * left
-        expected[5] = own
-        np.testing.assert_array_equal(found[r, k], expected)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])

@@ -504,7 +504,8 @@ def test_a_route_that_passes_itself_is_followed_in_order(speed: float, aside: fl
     # Chords cut a circle of 12 m radius by up to 0.1 m; beside it the way is as much longer or shorter.
     np.testing.assert_allclose(found, stations[: len(found)], atol=1.5)
     reference = stations_along(line[None], path.numpy()[None], np.ones((1, len(path)), bool))[0]
-    np.testing.assert_allclose(found, reference[: len(found)], atol=0.5)
+    # Where two chords meet, both are as near to what is outside of the bend.
+    np.testing.assert_allclose(found, reference[: len(found)], atol=1.0)
     # What is seen ahead belongs to the pass that the agent is on.
     middle = len(found) // 2
     seen = routes.window(torch.tensor([[found[middle]]], dtype=torch.float64))

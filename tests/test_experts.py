@@ -82,10 +82,7 @@ def test_the_cache_makes_what_is_missing_together_and_lets_the_oldest_go() -> No
 
     def make(items: Any) -> list[Experts]:
         asked.append(list(items))
-        return [
-            Experts(torch.tensor([item]), torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.zeros(1))
-            for item in items
-        ]
+        return [Experts(torch.tensor([item]), *(torch.zeros(1) for _ in range(5))) for item in items]
 
     cache = ItemCache(make, lambda e: e.nbytes, keep=3)
     assert [int(e.agent) for e in cache.many([4, 2, 4])] == [4, 2, 4]

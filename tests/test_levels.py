@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,21 +13,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from helpers_saved import played
 from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, straight_road
+from helpers_store import fill
 from symphony import keys
-from symphony.data.levels import LEVEL, Levels, dense, levels_of
+from symphony.config import EvaluateConfig
+from symphony.data.levels import Levels, agent_heights, dense, levels_of
 from symphony.data.overlaps import overlapping
 from symphony.data.segment import Polylines, RunSegment, validate
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
-from symphony.envs.objects import levels_apart
+from symphony.envs.objects import rollout_heights
 from symphony.envs.points import nearest_points
 from symphony.envs.road import road_distance
 from symphony.envs.scene import PointType
 from symphony.envs.tables import Tables
+from symphony.evaluation import evaluate
+from symphony.geometry import LEVEL, levels_apart
+from symphony.simulation.world import world_of
 
 HIGH = 6.0
 STEPS = 41
-SEEN = ObservationConfig(num_objects=8, num_points=400, num_lights=0, road=True, gaps=True, foresight=(1.0,))
+SEEN = ObservationConfig(num_objects=8, num_points=400, num_lights=0, clearance=True, foresight=(1.0,))
 
 
 def line(axis: int, across: float, height: float, back: bool = False) -> NDArray[Any]:
@@ -125,6 +133,36 @@ def test_at_one_height_all_of_it_counts() -> None:
 def test_the_log_does_not_overlap_there() -> None:
     assert len(overlapping(overpass(HIGH))) == 0
     assert overlapping(overpass(0.0)).tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize("agent", ["playback", "constant_velocity"])
+def test_an_evaluation_holds_to_it(agent: str, tmp_path: Path) -> None:
+    """Of two segments, one with a bridge, half collide, and nobody is off the road but where both roads are one."""
+    fill(tmp_path / "store", [overpass(0.0), overpass(HIGH)])
+    rates = [
+        evaluate(agent, tmp_path / "store", EvaluateConfig(rollouts=2), items=items).numbers()
+        for items in ([0], [1], [0, 1])
+    ]
+    for name in ("collision_rate", "collision_rate_at_states", "collision_crossing"):
+        assert [one[name] for one in rates] == [100.0, 0.0, 50.0]
+    assert rates[0]["offroad_time"] > 0
+    assert rates[1]["offroad_time"] == 0
+
+
+def test_saved_rollouts_are_as_high_as_in_the_simulation() -> None:
+    """Driven back along their logs, from a step later on."""
+    segment = overpass(HIGH, slope=0.03)
+    saved = played(segment, [1, 0], rollouts=2, start=4)
+    saved = replace(saved, state=saved.state[:, :3:-1].copy(), counted=saved.counted[:, 4:])
+    expected = rollout_heights(scene(segment, [1, 0]), torch.from_numpy(saved.state)[None])
+    assert expected is not None
+    assert float(expected[..., 0].std()) > 0.5
+    for k in (0, 1):
+        found = world_of(saved, k).height
+        assert found is not None
+        np.testing.assert_array_equal(found[[1, 0]], expected[0, k].transpose(0, 1))
+        np.testing.assert_array_equal(found[2], agent_heights(segment)[4:, 2])
+    assert world_of(played(overpass(0.0)), 0).height is None
 
 
 def test_a_search_and_a_step_hold_to_it() -> None:
@@ -228,7 +266,7 @@ def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     there = drive(*segments)[1]
     for flag in (keys.COLLISION, keys.OFFROAD, ("agents", "observation", "objects_mask")):
         assert torch.equal(found.get(flag), there.get(flag))
-    for name in ("road", "road_ahead", "points"):
+    for name in ("road", "points"):
         one, other = (each.get(("agents", "observation", name)) for each in (found, there))
         if name == "points":  # in any order
             one, other = one.sort(-2).values, other.sort(-2).values

@@ -343,6 +343,24 @@ def test_the_first_kind_is_counted_like_the_others():
     assert metrics.compute()["collision_into_leader"] == 100
 
 
+def test_nobody_meets_whom_is_on_another_level():
+    """The ego meets a leader on its road while one on a bridge lies nearer and deeper in it."""
+    inputs = stage((0, 0, 0, 10), (2, 1, -90, 0), (6, 0, 0, 0))
+    level = torch.tensor([[0.0, 1], [6, 2], [0, 1]])[:, None].expand(3, STEPS + 1, 2)
+    found = collision_kinds(**inputs, height=(level[:1], level))
+    assert (found.other.tolist(), found.kind.tolist()) == ([2], [KIND.INTO_LEADER])
+    assert collision_kinds(**inputs).other.tolist() == [1]
+    low = level.clone()
+    low[1, :, 0] = 2.4
+    assert collision_kinds(**inputs, height=(low[:1], low)).other.tolist() == [1]
+    # Of a step, both ends must be on another level.
+    for apart in (slice(0, 1), slice(1, 2)):
+        mixed = level.clone()
+        mixed[1] = level[0]
+        mixed[1, apart] = level[1, 0]
+        assert collision_kinds(**inputs, height=(mixed[:1], mixed)).other.tolist() == [1]
+
+
 def test_the_table_refuses_kinds_of_other_collisions_or_for_a_part():
     inputs, metrics = crowd(3), RolloutMetrics()
     kinds = collision_kinds(**inputs)

@@ -55,6 +55,22 @@ def test_collisions_by_hand():
     assert not collisions(position, heading, size, valid, subject).any()
 
 
+def test_on_another_level_is_so_both_before_and_after_a_step():
+    position, heading = torch.zeros(2, 2, 2), torch.zeros(2, 2)
+    size, valid, subject = torch.tensor([[4.5, 2.0]]).expand(2, 2), torch.ones(2, 2).bool(), torch.tensor([0])
+    level = torch.tensor([[[0.0, 1], [0, 1]], [[6, 2], [6, 2]]])
+    for before, after, z in ((2, 2, 6.0), (1, 2, 6.0), (2, 1, 6.0), (0, 0, 6.0), (2, 2, 2.4)):
+        level[1] = torch.tensor([[z, before], [z, after]])
+        met = (before, after, z) != (2, 2, 6.0)
+        assert collisions(position, heading, size, valid, subject, level).tolist() == [[met]]
+        at_states = collisions(position, heading, size, valid, subject, level, at_states=True)
+        assert at_states.tolist() == [[z < 6 or number < 2 for number in (before, after)]]
+    # Who was not there before is where it is now.
+    valid[1, 0] = False
+    level[1] = torch.tensor([[0.0, 0], [6, 2]])
+    assert not collisions(position, heading, size, valid, subject, level).any()
+
+
 def test_padding_and_order_of_agents_change_nothing():
     position, heading, size, valid, subject = scene(3)
     found = collisions(position, heading, size, valid, subject)

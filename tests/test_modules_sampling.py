@@ -77,6 +77,7 @@ def test_streams_keep_the_numbers_that_rollouts_were_made_with():
         "PRUNING": 1,
         "PLANNERS": 3,
         "PERSONAS": 4,
+        "BACKTRACKING": first,
     }
 
 

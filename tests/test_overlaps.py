@@ -17,13 +17,13 @@ from helpers_segments import hide, random_segment, straight_road
 from helpers_sources import ROAD, commonroad, driver
 from symphony.cli import main
 from symphony.data.convert import convert, info
-from symphony.data.levels import LEVEL
 from symphony.data.overlaps import overlapping
 from symphony.data.report import Report, Skip
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import travel
 from symphony.data.sources.base import Item, Reader
 from symphony.data.store import SegmentStore
+from symphony.geometry import LEVEL
 
 
 def boxes(s: RunSegment, step: int) -> list[shapely.Polygon]:

@@ -208,7 +208,8 @@ def test_a_wheel_holds_all_of_the_package(tmp_path: Path) -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copyfile(ROOT / name, source / name)
     ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
-    shutil.copytree(ROOT / "src", source / "src", ignore=ignored)
+    shutil.copytree(ROOT / "recipes", source / "recipes", ignore=ignored)
+    shutil.copytree(ROOT / "src", source / "src", ignore=ignored, symlinks=True)
     code = "from setuptools.build_meta import build_wheel; build_wheel('..')"
     done = subprocess.run(
         [sys.executable, "-W", "default", "-c", code], cwd=source, capture_output=True, text=True, check=False
@@ -222,6 +223,8 @@ def test_a_wheel_holds_all_of_the_package(tmp_path: Path) -> None:
         for file in (package / "symphony").rglob("*")
         if file.is_file() and "__pycache__" not in file.parts
     }
+    # A link to a folder at the top, whose files no search of this kind finds.
+    files |= {f"symphony/recipes/{file.name}" for file in (ROOT / "recipes").glob("*.py")}
     assert held == files
     for part in ("py.typed", "data/builtin/test/store.json", "pretrained/bc_ts_h/config.json"):
         assert f"symphony/{part}" in held

@@ -17,7 +17,7 @@ from symphony.envs import Bicycle, Displacement
 from symphony.envs.dynamics import bicycle_step
 from symphony.envs.observation import ObservationConfig
 from symphony.geometry.frames import rotate, wrap
-from symphony.simulation import SceneDataset, demonstrations, perturbation
+from symphony.simulation import SceneDataset, perturbation
 from symphony.simulation.perturbation import displaced, perturbed, way_back
 
 DT, LENGTH = 0.2, torch.tensor([4.5], dtype=torch.float64)
@@ -133,8 +133,7 @@ def test_training_batches_are_the_log_unless_displaced(monkeypatch: pytest.Monke
 
     plain, action = batch(None)
     with monkeypatch.context() as nowhere:
-        nowhere.setattr(demonstrations, "AHEAD", 0.0)
-        for name in ("ASIDE", "TURNED", "FASTER"):
+        for name in ("AHEAD", "ASIDE", "TURNED", "FASTER"):
             nowhere.setattr(perturbation, name, 0.0)
         still, label = batch(PerturbConfig(share=1.0))
     # Not displaced, an expert is where the log is, not where the fit is: centimetres apart.

@@ -13,15 +13,24 @@ import numpy as np
 import pytest
 
 from helpers_agents import small
-from helpers_segments import crossing, hide, straight_road
+from helpers_segments import crossing, hide, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
+from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.planners import planner_record, read_planner_record, run_score, winners
+from symphony.evaluation.planners import (
+    paired_difference,
+    planner_grid,
+    planner_record,
+    read_planner_record,
+    run_score,
+    winners,
+    without_score,
+)
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.planner import Control, Pose, Scenario, Traffic, checked_plan, planner_maker
 from symphony.simulation.planner_calls import answer
@@ -56,6 +65,10 @@ for line in sys.stdin:
 
 def brakes(observation: Observation) -> Control:
     return Control(-1.0, 0.0)
+
+
+def hurries(observation: Observation) -> Control:
+    return Control(5.0, 0.0)
 
 
 class Together:
@@ -241,6 +254,11 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
         ({"progress_ratio": 1.4}, 100.0),
         ({"progress_ratio": -0.1}, 0.0),
         ({"progress_ratio": None}, 100.0),
+        ({"progress_ratio": None, "beyond_route": 0, "no_route": 0}, 100.0),
+        ({"progress_ratio": None, "beyond_route": 1, "no_route": 0}, None),
+        ({"progress_ratio": None, "beyond_route": 0, "no_route": 1}, None),
+        ({"progress_ratio": None, "beyond_route": 1, "at_fault_collision": True}, 0.0),
+        ({"progress_ratio": None, "beyond_route": None, "failed": "why"}, 0.0),
         ({"failed": "why"}, 0.0),
         ({"at_fault_collision": True}, 0.0),
         ({"collision": True}, 50.0),
@@ -248,7 +266,7 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
         ({"offroad_time": 2.0}, 0.0),
     ],
 )
-def test_the_score_of_a_run(changes: dict[str, Any], score: float) -> None:
+def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> None:
     fine = {
         "failed": "",
         "collision": False,
@@ -308,6 +326,49 @@ def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> Non
         scores[one["group"]].append(run_score(one) - record["score"])
     apart = np.array([sum(scores["a"]), sum(scores["b"])]) / 1.5
     assert record["score_se"] == pytest.approx(np.sqrt((apart**2).sum() / 2))
+
+
+def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
+    """Beside all lanes the ego has no route, beyond a lane that ends inside the map nothing measures its progress,
+    and a log that stands makes none.
+    """
+
+    def driven(name: str, y: float, speed: float, end: int = 400) -> RunSegment:
+        lanes = (end, 0), (400, 60), (400, -60)
+        x = 20 + speed * 0.2 * np.arange(11.0)[None]
+        lines = [np.array([(k, left) for k in range(0, stop, 2)], float) for stop, left in lanes]
+        position, velocity = np.stack([x, y + 0 * x], -1), np.stack([speed + 0 * x, 0 * x], -1)
+        return make_segment(make_road(lines), position, 0 * x, velocity, segment_id=name)
+
+    segments = (
+        driven("way", 0, 10),
+        driven("beside", 200, 10),
+        driven("stands", 200, 0),
+        driven("end", 0, 10, 30),
+    )
+    fill(tmp_path / "store", list(segments))
+    record = planner_record(run(tmp_path / "store", tmp_path / "sim", hurries, "playback", rollouts=1))
+    runs = {one["segment"]: one for one in record["per_run"]}
+    assert [(one["progress_ratio"], one["beyond_route"], one["no_route"]) for one in runs.values()] == [
+        (pytest.approx(1.5, abs=0.05), 0, 0),
+        (None, 0, 1),
+        (None, 0, 0),
+        (None, 1, 0),
+    ]
+    assert (record["score"], record["score_runs"]) == (pytest.approx(100, abs=0.01), 2)
+    assert record["progress_ratio"] == runs["way"]["progress_ratio"]
+    record["planner"] = "hurries"
+    assert without_score([record]) == [
+        "without a score, as progress is not defined: hurries among log 2 of 4 runs"
+    ]
+    lost = [one for one in record["per_run"] if run_score(one) is None]
+    other = record | {"planner": "none", "score": None, "per_run": lost}
+    assert [line[1:3] for line in planner_grid([other, record])[1:]] == [
+        ["hurries", "100.0 ± 0.0"],
+        ["none", "–"],
+    ]
+    assert paired_difference(record, other) == (None, None, 0)
+    assert winners([other, record])[0].startswith("log: hurries is first, within the error, –")
 
 
 def test_a_first_place_is_clear_only_beyond_two_standard_errors() -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
+import runpy
 import sys
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import pytest
 from helpers_segments import crossing, straight_road
 from symphony.cli import recipe as recipes
 from symphony.data.store_writer import StoreWriter
+from symphony.recipes import recipe_of
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
 TINY = [
@@ -60,7 +61,9 @@ ARGUMENTS = {
 }
 
 
-@pytest.mark.parametrize("recipe", sorted(path.name for path in RECIPES.glob("*.py")))
+@pytest.mark.parametrize(
+    "recipe", sorted(path.name for path in RECIPES.glob("*.py") if path.stem != "__init__")
+)
 def test_recipe(
     recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,13 +79,11 @@ def test_recipe(
         "--out",
         str(tmp_path / "run"),
     ]
-    spec = importlib.util.spec_from_file_location("recipe", RECIPES / recipe)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "recipe", module)
-    spec.loader.exec_module(module)
-    module.main([*data, *ARGUMENTS[recipe]])
+    monkeypatch.setattr(recipes, "settle", lambda: None)
+    monkeypatch.setattr(sys, "argv", [recipe, *data, *ARGUMENTS[recipe]])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(RECIPES / recipe), run_name="__main__")
+    assert ended.value.code == 0
     (file,) = (tmp_path / "run" / "evaluations").iterdir()
     found = json.loads(file.read_text())
     assert found["run"]["method"] == Path(recipe).stem
@@ -90,6 +91,24 @@ def test_recipe(
     assert found["ade"] > 0
     assert len(found["per_segment"]) == 2
     assert f"{found['ade']:.2f}" in capsys.readouterr().out
+
+
+def test_a_changed_copy_elsewhere_is_what_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with StoreWriter(tmp_path / "data") as writer:
+        writer.append(crossing(4, steps=8))
+    source, update = (RECIPES / "bc.py").read_text(encoding="utf-8"), 'yield "policy", policy_loss(experts)'
+    assert update in source
+    changed = tmp_path / "mine.py"
+    changed.write_text(source.replace(update, f'{update}; print("mine")'), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recipes, "settle", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["mine.py", "--data", "data", "--test", "data", "--out", "run", *COMMON])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(changed), run_name="__main__")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.count("mine\n") == 3  # updates
 
 
 def test_mistakes_are_told_in_a_line_before_the_training(
@@ -108,7 +127,7 @@ def test_mistakes_are_told_in_a_line_before_the_training(
     monkeypatch.setattr(sys, "argv", ["bc.py", *words, *COMMON])
     monkeypatch.setattr(recipes, "settle", lambda: None)
     with pytest.raises(SystemExit) as ended:
-        recipes.run("bc", None)
+        recipes.main(recipe_of("bc"), None)
     assert ended.value.code == 1
     assert "none: no such directory" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -19,9 +19,10 @@ from symphony.data.selection import MOVING, interactive_agents, travel, usable
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import extract, process, roads, simulate
 from symphony.data.store import SegmentStore
+from symphony.envs.routes import route_table
 from symphony.errors import ConfigError, DataError
 from symphony.geometry import segments_of, signed_distance
-from symphony.roadgraph import LaneGraph, feasible_routes, route_errors
+from symphony.roadgraph import LaneGraph, route_errors
 
 needs_sumo = pytest.mark.skipif(
     importlib.util.find_spec("sumo") is None,
@@ -183,9 +184,10 @@ def test_ego_follows_a_route_of_the_map(segments: list[RunSegment]) -> None:
     errors = []
     for segment in segments:
         graph, path = LaneGraph(segment.road), segment.position[segment.ego, :, :2]
-        choices = feasible_routes(graph, path[0], float(segment.heading[segment.ego, 0]))
-        assert choices, segment.segment_id
-        errors.append(route_errors(graph, choices, path, segment.valid[segment.ego]).min())
+        table = route_table(segment, graph, segment.ego)
+        assert table.logged >= 0, segment.segment_id
+        lines = [table.line(route) for route in range(len(table.count))]
+        errors.append(route_errors(lines, path[segment.valid[segment.ego]]).min())
     assert np.mean(errors) < 0.5
 
 

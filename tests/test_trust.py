@@ -59,7 +59,7 @@ def _stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
 
 
 SHORT = ("--rollouts", "1", "--duration", "1", "--search", "none")
-SETTINGS = ("agent__encoder", "agent__policy", "discriminator__network", "search__rule", "search__aggregate")
+SETTINGS = ("agent__encoder", "agent__policy", "discriminator__network", "search__rule")
 
 
 @pytest.mark.parametrize("place", ["stranger/notes.py", "notes"])
@@ -120,15 +120,13 @@ def test_the_current_folder_is_not_searched_for_it(stranger: Callable[..., Path]
 @pytest.mark.parametrize(
     "settings",
     [
-        {"agent__hidden": 60_000},
-        {"agent__hidden": 60_000_000},
-        {"agent__hidden": 2**62},
-        {"agent__head": 10**9},
+        {"agent__hidden": 60_000, "agent__head": 120_000},
+        {"agent__hidden": 60_000_000, "agent__head": 120_000_000},
+        {"agent__hidden": 2**62, "agent__head": 2**63},
         {"agent__accelerations": 10**9 + 1},
         {"action_space": "displacement", "agent__cells": 10**9 + 1},
-        {"discriminator__hidden": 10**9},
+        {"discriminator__hidden": 10**9, "discriminator__head": 2 * 10**9},
         {"agent__num_points": 10**9},
-        {"agent__num_objects": 10**9},
         {"agent__num_lights": 10**9},
         {"search__test_branches": 10**9},
     ],

@@ -288,6 +288,7 @@ def test_a_link_follows_the_ego_and_the_legend_says_what_is_what(tmp_path: Path)
       for (const row of [r.ego, 0]) scene.box(pen, row, there, "red", 1);
       out.strokes = strokes;
       select(0); out.other = view.follow;
+      r.events.push({ kind: "blocking" }); legend(r); out.blocks = $("legend").textContent;
     """
     out = json.loads(driven_page(tmp_path, script, [saved]))
     assert "error" not in out, out
@@ -302,6 +303,8 @@ def test_a_link_follows_the_ego_and_the_legend_says_what_is_what(tmp_path: Path)
     for text in ("light: stop", "light: go", "goal", "playback", "log"):
         assert text in out["legend"]
     assert "stop sign" not in out["legend"]
+    assert out["blocks"].replace("△blocks traffic", "") == out["legend"]
+    assert "blocks" not in out["legend"]
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int
         ({"branches": 512, "interactive": "all"}, 2),
         ({"branches": 512, "others": "idm"}, 2),
         ({"branches": 512, "open_traffic": True}, 2),
-        ({"rollouts": 10**6, "branches": 10**6}, 1),
+        ({"rollouts": 10**4, "branches": 10**4, "interactive": "all"}, 1),
     ],
 )
 def test_as_many_segments_together_as_see_a_bounded_number_of_points(

@@ -73,11 +73,11 @@ def test_goals_of_the_log_are_those_that_were_taken(monkeypatch: pytest.MonkeyPa
     (sampled, before), (logged, config) = seen
     assert config.logged_goals
     assert not before.logged_goals
-    assert np.array_equal(sampled.route, logged.route)
+    assert np.array_equal(sampled.route_point, logged.route_point)
     graph = LaneGraph(start.road)
     for k in range(3):
         # The logged route passes near every logged position; so did the vehicle.
-        route = logged.route[0, k, int(logged.route_logged[0, k])].numpy()
+        route = logged.whole_route(0, k, int(logged.route_logged[0, k])).numpy()
         away = np.linalg.norm(log.position[k, ::10, None, :2] - route[None], axis=-1).min(1)
         assert away.max() < 3, (k, graph)
 

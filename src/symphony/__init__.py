@@ -1,54 +1,52 @@
-"""Symphony: realistic and diverse traffic agents learned from logged driving."""
+"""Symphony: realistic and diverse traffic agents learned from logged driving.
+
+What is named here is the public interface; it is imported when it is asked for, as torch takes seconds.
+"""
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from symphony._version import __version__
+from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.agents import load_agent
-    from symphony.collectors import BeamSearchCollector
-    from symphony.config import EvaluateConfig, TrainConfig
+    from symphony.agents.agent import load_agent
+    from symphony.collectors import BeamSearchCollector, beam_search
+    from symphony.config.evaluation import EvaluateConfig
+    from symphony.config.training import TrainConfig
     from symphony.data.builtin import builtin_store
     from symphony.data.store import SegmentStore
-    from symphony.envs import DrivingEnv
-    from symphony.evaluation import evaluate
+    from symphony.envs.driving import DrivingEnv
+    from symphony.envs.observation import ObservationConfig
+    from symphony.evaluation.evaluator import evaluate
+    from symphony.objectives.bc import BCLoss
+    from symphony.objectives.discriminator import DiscriminatorLoss
+    from symphony.objectives.distillation import DistillationLoss
+    from symphony.objectives.goal import GoalLoss
+    from symphony.objectives.mgail import MGAILLoss
     from symphony.recipes import train
-
-_ROOMS = {
-    "BeamSearchCollector": "symphony.collectors",
-    "DrivingEnv": "symphony.envs",
-    "EvaluateConfig": "symphony.config",
-    "SegmentStore": "symphony.data.store",
-    "TrainConfig": "symphony.config",
-    "builtin_store": "symphony.data.builtin",
-    "evaluate": "symphony.evaluation",
-    "load_agent": "symphony.agents",
-    "train": "symphony.recipes",
-}
-"""Where the names that this package exports are from; imported when they are asked for, as torch takes seconds."""
+    from symphony.simulation.rollouts import simulate
 
 __all__ = [
+    "BCLoss",
     "BeamSearchCollector",
+    "DiscriminatorLoss",
+    "DistillationLoss",
     "DrivingEnv",
     "EvaluateConfig",
+    "GoalLoss",
+    "MGAILLoss",
+    "ObservationConfig",
     "SegmentStore",
     "TrainConfig",
     "__version__",
+    "beam_search",
     "builtin_store",
     "evaluate",
     "load_agent",
+    "simulate",
     "train",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _ROOMS:
-        raise AttributeError(f"module 'symphony' has no attribute '{name}'")
-    return getattr(importlib.import_module(_ROOMS[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -78,3 +80,30 @@ def build_object(path: str, *args: Any, **kwargs: Any) -> Any:
         return found(*args, **kwargs)
     except TypeError as error:
         raise ConfigError(f"'{path}' can't be called as needed: {error}") from error
+
+
+def lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for.
+
+    Where they are from is what its ``if TYPE_CHECKING`` block says, so that nothing is written twice. A name that is
+    also that of a module of the package does not work: Python would give the module to whoever imported that before.
+
+    Args:
+        package: its name.
+    """
+    source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
+    rooms = {
+        alias.name: node.module
+        for block in ast.parse(source).body
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module is not None
+        for alias in node.names
+    }
+
+    def get(name: str) -> Any:
+        if name not in rooms:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return getattr(importlib.import_module(rooms[name]), name)
+
+    return get, lambda: sorted(sys.modules[package].__all__)

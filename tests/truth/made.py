@@ -40,6 +40,7 @@ class Track:
         size: of the box.
         kind: of the agent.
         there: (begin, end) seconds at which it is seen.
+        z: of the road below it.
     """
 
     x: float
@@ -52,6 +53,7 @@ class Track:
     size: tuple[float, float] = CAR
     kind: AgentType = AgentType.VEHICLE
     there: tuple[float, float] = (-1.0, 99.0)
+    z: float = 0.0
 
     def at(self, time: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Positions [T, 2], headings [T] and velocities [T, 2]."""
@@ -84,6 +86,7 @@ class Case:
         light: of the eastern lanes as (second, state), each until the next; none without.
         lanes: whether the map has lanes that cars drive in.
         boundary: whether it has a boundary.
+        bridge: height of the road across over the other one.
     """
 
     name: str
@@ -95,6 +98,7 @@ class Case:
     light: tuple[tuple[float, SignalState], ...] = ()
     lanes: bool = True
     boundary: bool = True
+    bridge: float = 0.0
 
 
 def _line(*ends: tuple[float, float]) -> NDArray[Any]:
@@ -104,18 +108,24 @@ def _line(*ends: tuple[float, float]) -> NDArray[Any]:
 
 
 @cache
-def road(lanes: bool, boundary: bool) -> RoadMap:
+def road(lanes: bool, boundary: bool, bridge: float) -> RoadMap:
     """The one of all scenes; its eastern lanes are cut at the lights."""
-    paved = shapely.union(shapely.box(-100, -7, 500, 3.5), shapely.box(163.25, -120, 166.75, 120))
-    edge = np.array(shapely.geometry.polygon.orient(paved, 1.0).exterior.coords)
+    paved = shapely.box(-100, -7, 500, 3.5), shapely.box(163.25, -120, 166.75, 120)
+    edges = [
+        shapely.get_coordinates(
+            shapely.force_3d(shapely.geometry.polygon.orient(area, 1.0), z), include_z=True
+        )
+        for area, z in (zip(paved, (0.0, bridge), strict=True) if bridge else [(shapely.union(*paved), 0.0)])
+    ]
     east = [_line((x0, y), (x1, y)) for y in (OWN, RIGHT) for x0, x1 in ((-100.0, STOP), (STOP, 500.0))]
-    lines = [*east, _line((500, WEST), (-100, WEST)), _line((165, -120), (165, 120))]
+    across = _line((165, -120), (165, 120))
+    lines = [*east, _line((500, WEST), (-100, WEST)), np.insert(across, 2, bridge, axis=1)]
     joined: dict[str, Any] = {
         "successors": [(0, 1), (2, 3)],
         "left": [(2, 0), (3, 1)],
         "right": [(0, 2), (1, 3)],
     }
-    found = make_road(lines, boundary=[edge] if boundary else [], **joined)
+    found = make_road(lines, boundary=edges if boundary else [], **joined)
     # Nobody drives on lanes for bikes.
     return found if lanes else replace(found, lane_type=np.full(len(lines), LaneType.BIKE_LANE, np.uint8))
 
@@ -126,6 +136,8 @@ def segment_of(case: Case, dt: float, phase: float) -> tuple[RunSegment, NDArray
     tracks = [case.log or case.ego, *case.others]
     parts = [track.at(time) for track in tracks]
     position, heading, velocity = (np.stack(part) for part in zip(*parts, strict=True))
+    middle = np.array([track.z + 0.8 for track in tracks])[:, None, None]
+    position = np.concatenate([position, np.broadcast_to(middle, (*position.shape[:2], 1))], -1)
     seen = np.stack([(time >= track.there[0]) & (time <= track.there[1]) for track in tracks])
     changes: dict[str, Any] = {
         "valid": seen,
@@ -144,7 +156,7 @@ def segment_of(case: Case, dt: float, phase: float) -> tuple[RunSegment, NDArray
     for part in (position, velocity, heading):
         part[~seen] = 0
     made = make_segment(
-        road(case.lanes, case.boundary), position, heading, velocity, dt, case.name, **changes
+        road(case.lanes, case.boundary, case.bridge), position, heading, velocity, dt, case.name, **changes
     )
     place, turn, moved = case.ego.at(time)
     speed = (moved * np.stack([np.cos(turn), np.sin(turn)], -1)).sum(-1)

@@ -546,5 +546,5 @@ def rules() -> list[Case]:
 
 
 def cases() -> Sequence[Case]:
-    """All of them."""
+    """All but those of roads above each other, see ``bridges``."""
     return [*collisions(), *manoeuvres(), *rules()]

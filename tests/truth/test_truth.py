@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bridges import bridges
 from made import Case, segment_of
 from scenes import cases
 
 from helpers_saved import played
 from symphony.data.segment import AgentType
 from symphony.envs.flags import offroad_flags
+from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import scene
 from symphony.evaluation.contacts import contacts
 from symphony.evaluation.report import KIND_NAMES, Report, add_segment
@@ -27,7 +29,7 @@ KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 BY_TYPE = {int(AgentType.PEDESTRIAN): CollisionKind.PEDESTRIAN, int(AgentType.CYCLIST): CollisionKind.CYCLIST}
 """What the evaluator calls a collision with them, whichever way they went."""
 STEPS = (0.2, 0.1)
-ALL = cases()
+ALL = [*cases(), *bridges()]
 
 
 def rollouts(case: Case, dt: float, phase: float) -> SavedRollouts:
@@ -37,7 +39,9 @@ def rollouts(case: Case, dt: float, phase: float) -> SavedRollouts:
     saved.state[0, :, 0] = state
     scenes = scene(segment, [0])
     position = torch.from_numpy(saved.state[0, 1:, :, :2])
-    off = offroad_flags(scenes, torch.zeros(len(position), dtype=torch.int64), position)
+    height = rollout_heights(scenes, torch.from_numpy(saved.state[:, 1:])[None])
+    row = torch.zeros(len(position), dtype=torch.int64)
+    off = offroad_flags(scenes, row, position, height=None if height is None else height[0, 0])
     there = torch.from_numpy(saved.there[:, :, :])[None]
     hit = between_states(scenes, torch.from_numpy(saved.state)[None], there)
     saved.offroad[0], saved.collision[0] = off.numpy(), hit[0, 0].numpy()

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from symphony.agents.agent import Agent, build_agent, load_agent
-from symphony.agents.networks import (
-    bicycle,
-    discriminator_network,
-    dynamics_of,
-    goal_network,
-    observation_of,
-    policy_network,
-)
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.agents.agent import Agent, build_agent, load_agent
+    from symphony.agents.networks import (
+        bicycle,
+        discriminator_network,
+        dynamics_of,
+        goal_network,
+        observation_of,
+        policy_network,
+    )
 
 __all__ = [
     "Agent",
@@ -23,3 +28,5 @@ __all__ = [
     "observation_of",
     "policy_network",
 ]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -22,7 +22,6 @@ from symphony.agents.networks import (
     policy_network,
 )
 from symphony.config import AgentSpec, SearchConfig, read_json
-from symphony.envs.baselines import ConstantVelocity, RandomActions
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError, DataWarning
@@ -143,6 +142,8 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
         ConfigError: if there is no such agent, checkpoint or device, or the folder names code.
         CheckpointError: if its weights can't be read, or its networks are larger than they are.
     """
+    from symphony.envs.baselines import ConstantVelocity, RandomActions  # noqa: PLC0415 - a training needs none
+
     if name == PLAYBACK:
         return Agent(name, None)
     if name == "constant_velocity":

@@ -7,21 +7,13 @@ from typing import Any
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
-from symphony import keys
+from symphony import keys, modules
 from symphony.config import AgentConfig, AgentSpec
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES, TURN_FEATURES
 from symphony.imports import build_object, load_object
-from symphony.modules import (
-    FORESIGHT,
-    ElementGroup,
-    SceneEncoder,
-    discrete_policy,
-    discriminator,
-    displacement_policy,
-    goal_policy,
-)
+from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder
 
 RADIUS = 20.0
 """Metres around an agent that its discriminator observes."""
@@ -99,14 +91,16 @@ def _policy(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     own = _own_features(spec) + 2 * spec.agent.persona
     dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
-        return discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
+        return modules.discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
     scale = observation_of(spec).size_scale
-    return displacement_policy(own, groups, dt=spec.dt, size_scale=scale, cells=spec.agent.cells, **sizes)
+    return modules.displacement_policy(
+        own, groups, dt=spec.dt, size_scale=scale, cells=spec.agent.cells, **sizes
+    )
 
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Routes from first states, by an encoder of its own (paper, section III-B)."""
-    return goal_policy(
+    return modules.goal_policy(
         SELF_FEATURES,
         _groups(spec, route=False),
         CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features == "turns"),
@@ -122,7 +116,7 @@ def discriminator_network(spec: AgentSpec) -> TensorDictModule:
         raise ValueError("the specification has no discriminator")
     if config.network != "paper":
         return build_object(config.network, spec)
-    return discriminator(
+    return modules.discriminator(
         _own_features(spec),
         OBJECT_FEATURES,
         POINT_FEATURES,

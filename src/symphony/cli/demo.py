@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from symphony.cli.evaluate import evaluate_with_bar
 from symphony.cli.tables import print_metrics
@@ -12,16 +13,19 @@ from symphony.config import EvaluateConfig, TrainConfig
 from symphony.config.profiles import demo
 from symphony.files import Lock, write_json
 
+if TYPE_CHECKING:
+    from symphony.render import Clip
+
 
 @dataclass(frozen=True)
 class Demo:
-    """Learn from the built-in data, evaluate, and draw what came out: some minutes on a laptop.
+    """Evaluate and draw an agent that comes with the package, on the built-in data: half a minute on a laptop.
 
-    An agent that comes with the package is evaluated beside it.
+    Then learn another from the built-in data, some minutes, and show it beside the first.
     """
 
     out: Path = Path("out/demo")
-    """Folder for the trained agent, the picture and the numbers; an earlier demo there is replaced."""
+    """Folder for the trained agent, the pictures and the numbers; an earlier demo there is replaced."""
     steps: int = 1500
     """Updates."""
     rollouts: int = 16
@@ -46,41 +50,42 @@ class Demo:
         from symphony.recipes import train
         from symphony.simulation.demonstrations import evenly_spaced
 
-        console = Console()
-        began = time.perf_counter()
-        run, picture, numbers = self.out / "bc_h", self.out / "rollouts.png", self.out / "metrics.json"
+        console, began = Console(), time.perf_counter()
+        run, numbers = self.out / "bc_h", self.out / "metrics.json"
+        learn, test = builtin_store("train"), builtin_store("test")
+        settings = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
+        items = evenly_spaced(len(SegmentStore(test)), PANELS)
+        rows: list[dict[str, Any]] = []
+        clips: list[Clip] = []
+
+        def show(agents: dict[str, str], picture: Path) -> None:
+            """Evaluate agents by their titles, and show them beside those before."""
+            for title, agent in agents.items():
+                keeper = ClipKeeper(items, title=f"{title}: ")
+                found = evaluate_with_bar(agent, test, settings, observe=keeper)
+                rows.append({**found.numbers(), "agent": title})
+                clips.extend([] if title in BASELINES else keeper.clips)
+            print_metrics(rows, title="Built-in test segments")
+            write_json(numbers, {"rows": rows, "seconds": round(time.perf_counter() - began, 1)})
+            draw_clips(clips, picture, columns=len(items))
+            console.print(f"picture: {picture}", soft_wrap=True, markup=False)
+
+        console.print("An included agent, on segments that it has not seen, with its tree search:")
+        show({**BASELINES, INCLUDED: PRETRAINED}, self.out / "included.png")
+        console.print(
+            f"\nNow one of your own: behavioural cloning with goals (BC+H), {self.steps} updates on far fewer "
+            "segments. This takes some minutes."
+        )
         if (run / "config.json").is_file():
             shutil.rmtree(run)
-        learn, test = builtin_store("train"), builtin_store("test")
-        console.print(
-            f"Learning to drive from {learn} (behavioural cloning with goals, {self.steps} updates)"
-        )
-        config = TrainConfig(method="bc_h", data=learn, out=run, steps=self.steps, seed=self.seed)
-        train(demo(config))
-        console.print(f"Simulating {test}, which it has not seen")
-        settings = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
-        agents = ["playback", "constant_velocity", str(run), PRETRAINED]
-        items = evenly_spaced(len(SegmentStore(test)), PANELS)
-        drawn = {
-            name: ClipKeeper(items, title=f"{title}: ") for name, title in zip(agents, NAMES, strict=True)
-        }
-        results = [evaluate_with_bar(name, test, settings, observe=drawn[name]) for name in agents]
-        rows = [{**result.numbers(), "agent": name} for result, name in zip(results, NAMES, strict=True)]
-        print_metrics(rows, title="Built-in test segments")
-        console.print(
-            f"{NAMES[-1]} is {PRETRAINED}, which learned from far more data of another set and is simulated with its "
-            "tree search.",
-            style="dim",
-        )
-        seconds = time.perf_counter() - began
-        write_json(numbers, {"rows": rows, "steps": self.steps, "seconds": round(seconds, 1)})
-        draw_clips([clip for name in agents[2:] for clip in drawn[name].clips], picture, columns=len(items))
-        console.print(f"Done in {seconds:.0f} s.")
-        for what, where in (("picture of rollouts", picture), ("numbers", numbers), ("trained agent", run)):
-            console.print(f"{what + ':':21}{where}", soft_wrap=True, markup=False)
+        train(demo(TrainConfig(method="bc_h", data=learn, out=run, steps=self.steps, seed=self.seed)))
+        show({"your BC+H": str(run)}, self.out / "rollouts.png")
+        console.print(f"numbers: {numbers}\nagent:   {run}", soft_wrap=True, markup=False)
 
 
 PANELS = 3
 """Run segments in the picture."""
 PRETRAINED = "pretrained:bc_ts_h"
-NAMES = ("log playback", "constant velocity", "BC+H", "included BC+TS+H")
+INCLUDED = "included BC+TS+H"
+BASELINES = {"log playback": "playback", "constant velocity": "constant_velocity"}
+"""Agents by their titles, which are not drawn."""

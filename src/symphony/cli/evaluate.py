@@ -50,6 +50,9 @@ class Evaluate:
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder to keep the very rollouts in that are evaluated (see `symphony view`, `report` and `export`)."""
+    details: bool = False
+    """Print more than the table: kinds of collision, what the divergence owes to sampling, where agents stand at the
+    end, what a search made of the goals, and what becomes of single agents. The file of `--json` has it all."""
     keep: bool = True
     """Leave the folder of the run as it is."""
     metrics: tuple[Literal["wosac"], ...] = ()
@@ -126,7 +129,7 @@ class Evaluate:
             baselines=True,
             items=chosen or None,
         )
-        print_evaluation(found, self.data, aside=str(self.json) == "-")
+        print_evaluation(found, self.data, aside=str(self.json) == "-", details=self.details)
         record = evaluation_record(agent, found, store)
         if "wosac" in self.metrics:
             settings = WosacSettings.of(config)
@@ -187,10 +190,10 @@ class Evaluate:
             tell_failed(folder, lambda line: sys.stderr.write(f"{line}\n"))
 
 
-def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False) -> None:
-    """Print baselines and agent as one table; to stderr if ``aside``."""
+def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False, details: bool = False) -> None:
+    """Print baselines and agent as one table (see :func:`~symphony.cli.tables.print_metrics`)."""
     others = [baseline.numbers() for baseline in found.baselines if baseline.agent != found.agent]
-    print_metrics([*others, found.numbers()], title=str(data), aside=aside)
+    print_metrics([*others, found.numbers()], title=str(data), aside=aside, details=details)
 
 
 def evaluate_with_bar(

@@ -19,7 +19,7 @@ class Planners:
     """Compare planners, each among several crowds: one table, and which planner is first in each crowd.
 
     The score of a run is its progress relative to the log's, in percent, at most 100; 0 if it failed, if the planner
-    is at fault in a collision, runs a red light or leaves the road.
+    is at fault in a collision, runs a red light or leaves the road. Runs whose progress is not defined have none.
     """
 
     found: Annotated[
@@ -61,9 +61,10 @@ class Planners:
 
 def table_text(records: Sequence[dict[str, Any]], form: Literal["text", "markdown"] = "text") -> str:
     """The table of some records, and which planner is first in each crowd."""
-    from symphony.evaluation.planners import counted_at_states, planner_grid, winners
+    from symphony.evaluation.planners import counted_at_states, planner_grid, winners, without_score
 
-    grid, sentences = planner_grid(records), [*winners(records), *counted_at_states(records)]
+    grid = planner_grid(records)
+    sentences = [*winners(records), *without_score(records), *counted_at_states(records)]
     if form == "markdown":
         lines = [f"| {' | '.join(line)} |" for line in grid]
         return "\n".join([lines[0], "| --- " * len(grid[0]) + "|", *lines[1:], "", *sentences]) + "\n"

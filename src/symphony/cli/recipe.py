@@ -1,4 +1,4 @@
-"""What the scripts of the recipes share: train, evaluate beside the baselines, keep the numbers."""
+"""What recipes do as scripts: train, evaluate beside the baselines, keep the numbers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -14,7 +14,10 @@ from symphony.cli import guarded, settle
 from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
 from symphony.cli.helps import PARAGRAPHS
 from symphony.cli.profiles import WORDS, expanded
-from symphony.config import EvaluateConfig, Method, Profile, TrainConfig
+from symphony.config import EvaluateConfig, Profile, TrainConfig
+
+if TYPE_CHECKING:
+    from symphony.recipes import Recipe
 
 
 @dataclass(frozen=True)
@@ -30,21 +33,20 @@ class Arguments:
     profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
 
 
-def run(method: Method, description: str | None, args: Sequence[str] | None = None) -> None:
-    """Run the recipe of a method with command-line arguments; by default with those of the process, which it ends."""
+def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = None) -> None:
+    """Run a recipe with command-line arguments; by default with those of the process, which it ends."""
     if args is None:
         settle()
-        sys.exit(guarded(lambda: run(method, description, sys.argv[1:])))
+        sys.exit(guarded(lambda: main(recipe, description, sys.argv[1:])))
     from symphony.agents import load_agent
     from symphony.data.store import SegmentStore
     from symphony.evaluation.records import evaluation_record, keep_evaluation
     from symphony.recipes import train
 
-    settings = tyro.cli(
-        Arguments, description=description, args=expanded([method, *args]), registry=PARAGRAPHS
-    )
+    words = [recipe.__name__, *args]
+    settings = tyro.cli(Arguments, description=description, args=expanded(words), registry=PARAGRAPHS)
     store = SegmentStore(settings.test)  # or complain now, not after the training
-    folder = train(settings.training)
+    folder = train(settings.training, recipe)
     config = EvaluateConfig(
         rollouts=settings.rollouts, seed=settings.training.seed, device=settings.training.device
     )

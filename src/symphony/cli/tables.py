@@ -54,8 +54,17 @@ def print_table(table: Table, console: Console) -> None:
         console.width = before
 
 
-def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: bool = False) -> None:
-    """Print results of agents as one table, standard errors beside the numbers; to stderr if ``aside``."""
+def print_metrics(
+    rows: Sequence[dict[str, Any]], title: str = "", *, aside: bool = False, details: bool = False
+) -> None:
+    """Print results of agents as one table and a line of what they are of.
+
+    Args:
+        rows: a record for each agent.
+        title: of the table.
+        aside: print to stderr.
+        details: also tell kinds of collision, what the divergence owes to sampling, goals, and single agents.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -83,16 +92,16 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
     print_table(table, console)
     first = rows[0]
     for row in rows:
-        if row["collision_rate"] > 0 and "collision_into_leader" in row:
+        if details and row["collision_rate"] > 0 and "collision_into_leader" in row:
             kinds = ((row[name], text) for name, text in _kinds_of(row))
             parts = ", ".join(f"{value:.1f} {text}" for value, text in kinds if value > 0)
             console.print(
                 f"{escape(short_name(str(row['agent'])))}: collisions, % of rollouts: {parts}", style="dim"
             )
-        for line in _more(row):
+        for line in [*_own_metrics(row), *(_more(row) if details else [])]:
             console.print(f"{escape(short_name(str(row['agent'])))}: {line}", style="dim")
     for row in rows:
-        if first["interactive"] not in (1, 2) and row.get("agent_collision_rate", math.nan) > 0:
+        if details and first["interactive"] not in (1, 2) and row.get("agent_collision_rate", math.nan) > 0:
             console.print(
                 f"{escape(short_name(str(row['agent'])))}: {_agents_of(row)}", style="dim", highlight=False
             )
@@ -104,6 +113,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, aside: boo
         f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
         f"± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}",
         style="dim",
+        soft_wrap=True,
     )
 
 
@@ -115,11 +125,15 @@ def write_numbers(path: Path, numbers: Any) -> None:
         write_json(path, numbers)
 
 
+def _own_metrics(row: dict[str, Any]) -> list[str]:
+    """Metrics of the user's own, in lines."""
+    own = (name for name in row if ":" in name and not name.endswith("_se"))
+    return [f"{name} {number_cell(row[name], row.get(f'{name}_se'), 4)}" for name in own]
+
+
 def _more(row: dict[str, Any]) -> list[str]:
     """What else there is to say of an agent, in lines."""
-    own = (name for name in row if ":" in name and not name.endswith("_se"))
-    lines = [f"{name} {number_cell(row[name], row.get(f'{name}_se'), 4)}" for name in own]
-    at_states = row.get("collision_rate_at_states", math.nan)
+    lines, at_states = [], row.get("collision_rate_at_states", math.nan)
     if not math.isnan(at_states) and at_states != row["collision_rate"]:
         lines.append(
             f"collisions between states count; at states only, as the paper and WOSAC count: {at_states:.1f} %"

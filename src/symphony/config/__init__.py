@@ -6,29 +6,34 @@ of a training; what an agent is and how it is simulated travels with the agent.
 
 from __future__ import annotations
 
-from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
-from symphony.config.evaluation import (
-    EvaluateConfig,
-    PaperData,
-    Score,
-    Search,
-    Setting,
-    TableColumns,
-    TableFormat,
-)
-from symphony.config.files import FORMAT, from_dict, read_json, to_json
-from symphony.config.profiles import PROFILES, Profile
-from symphony.config.training import (
-    METHODS,
-    Method,
-    MGAILConfig,
-    PerturbConfig,
-    PreviewConfig,
-    RunConfig,
-    TrainConfig,
-    ValidationConfig,
-)
-from symphony.config.wosac import WosacSettings
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
+    from symphony.config.evaluation import (
+        EvaluateConfig,
+        PaperData,
+        Score,
+        Search,
+        Setting,
+        TableColumns,
+        TableFormat,
+    )
+    from symphony.config.files import FORMAT, from_dict, read_json, to_json
+    from symphony.config.profiles import PROFILES, Profile
+    from symphony.config.training import (
+        METHODS,
+        Method,
+        MGAILConfig,
+        PerturbConfig,
+        PreviewConfig,
+        RunConfig,
+        TrainConfig,
+        ValidationConfig,
+    )
+    from symphony.config.wosac import WosacSettings
 
 __all__ = [
     "FORMAT",
@@ -58,3 +63,5 @@ __all__ = [
     "read_json",
     "to_json",
 ]
+
+__getattr__, __dir__ = lazily(__name__)

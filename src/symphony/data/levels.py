@@ -2,8 +2,9 @@
 
 Heights alone do not tell: a car 60 m up a steep street is as high as one on a bridge. Where the lines of a map lie
 above each other they are counted from below, and each number spreads along the surface it is on, up to where it meets
-another. Two places are on different levels if their numbers differ, and their heights by :data:`LEVEL`: so cars that
-follow each other up a ramp are never apart. Places that no such surface reaches have no level and see all others.
+another. Two places are on different levels if their numbers differ, and their heights by
+:data:`symphony.geometry.LEVEL`: so cars that follow each other up a ramp are never apart. Places that no such surface
+reaches have no level and see all others.
 """
 
 from __future__ import annotations
@@ -14,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import Polylines, RunSegment
+from symphony.geometry.levels import LEVEL
 
-LEVEL = 2.5
-"""Metres of height, at one place, from which on two things are on different levels."""
 CELL = 5.0
 """Metres of the columns in which heights are compared."""
 RISE = 1.5
@@ -125,6 +125,14 @@ def ground(segment: RunSegment) -> NDArray[np.float32]:
     down = np.zeros((segment.num_agents, 1, 3), np.float32)
     down[:, 0, 2] = segment.size[:, 2] / 2
     return segment.position - down
+
+
+def agent_heights(segment: RunSegment, levels: Levels | None = None) -> NDArray[np.float32]:
+    """[T, A, 2] height and level of logged agents, no level where they are not seen; [0, 0, 2] for a flat map."""
+    levels = levels_of(segment) if levels is None else levels
+    if levels.flat:
+        return np.zeros((0, 0, 2), np.float32)
+    return np.where(segment.valid[..., None], levels.at(ground(segment)), 0).astype(np.float32).swapaxes(0, 1)
 
 
 def dense(lines: Polylines) -> NDArray[np.float64]:

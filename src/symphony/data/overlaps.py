@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from symphony.data.levels import LEVEL, ground
+from symphony.data.levels import ground
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
 from symphony.geometry import boxes_overlap
+from symphony.geometry.levels import LEVEL
 
 MANY = 0.05
 """Share of a store's segments with overlaps above which a conversion warns."""
@@ -25,7 +26,7 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
     """[P, 2] pairs of agents, rows in order, whose oriented boxes overlap at some step.
 
     At least one of the two is a vehicle that moves (more than :data:`~symphony.data.selection.MOVING` metres).
-    Touching does not count, nor do boxes whose logged heights differ by :data:`~symphony.data.levels.LEVEL`.
+    Touching does not count, nor do boxes whose logged heights differ by :data:`~symphony.geometry.LEVEL`.
     """
     drivers = np.flatnonzero((segment.agent_type == AgentType.VEHICLE) & (travel(segment) > MOVING))
     rows = max(BLOCK // segment.valid.size, 1)

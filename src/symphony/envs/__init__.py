@@ -1,11 +1,18 @@
 """The driving environment: dynamics, observation, who drives whom."""
 
-from symphony.envs.baselines import ConstantVelocity
-from symphony.envs.driving import DrivingEnv
-from symphony.envs.dynamics import Bicycle, Displacement
-from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
-from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from symphony.envs.scene import SceneBatch, SceneSource, collate, scene
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.envs.baselines import ConstantVelocity
+    from symphony.envs.driving import DrivingEnv
+    from symphony.envs.dynamics import Bicycle, Displacement
+    from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
+    from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
 
 __all__ = [
     "CHOICE_FEATURES",
@@ -23,3 +30,5 @@ __all__ = [
     "collate",
     "scene",
 ]
+
+__getattr__, __dir__ = lazily(__name__)

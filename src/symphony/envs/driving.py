@@ -15,13 +15,13 @@ from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.objects import Objects, objects_at
-from symphony.envs.observation import Observation, ObservationConfig, observe
+from symphony.envs.objects import Objects, everyone_at
+from symphony.envs.observation import Observation, ObservationConfig, observe_states
 from symphony.envs.routes import route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.specs import make_specs
 from symphony.envs.tables import Tables
-from symphony.envs.traffic import entering, without
+from symphony.envs.traffic import entering
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
 from symphony.geometry.nearest import on_host
@@ -210,25 +210,33 @@ class DrivingEnv(EnvBase):
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_step"}
 
-    def start(self, scene: Int[Tensor, "*b"], rollout: Int[Tensor, "*b"] | int = 0) -> TensorDict:
+    def start(
+        self,
+        scene: Int[Tensor, "*b"],
+        rollout: Int[Tensor, "*b"] | int = 0,
+        goal: Int[Tensor, "*b N"] | None = None,
+        persona: Float[Tensor, "*b N 2"] | None = None,
+    ) -> TensorDict:
         """State at the first logged step, as :meth:`reset` returns it.
 
         Args:
             scene: rows of the scene batch; its shape is the batch size.
             rollout: number of the rollout (branch, repetition) within its scene, so that each draws numbers of
                 its own whatever batch it runs in.
+            goal: routes that agents follow; by default none.
+            persona: driving styles; by default those of the scenes.
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)
         real, early = self.scenes.interactive_valid[scene], self.scenes.enter[scene] == 0
-        goal = torch.full_like(real, -1, dtype=torch.int64)
         waiting = real & ~early if self.open_traffic else None
         first = self._logged_state(scene)
-        persona = None
-        if self.observation.persona:
+        if self.observation.persona and persona is None:
             persona = _rows(self.scenes.persona, scene, self.scenes.interactive[scene])
-        begin, there, progress = torch.zeros_like(scene), real & early, torch.zeros_like(first[..., 0])
-        return self._from_state(State(scene, begin, stream, first, there, goal, progress, waiting, persona))
+        begin, progress = torch.zeros_like(scene), torch.zeros_like(first[..., 0])
+        none = torch.full_like(real, -1, dtype=torch.int64)
+        start = State(scene, begin, stream, first, real & early, none, progress, waiting, persona)
+        return self._from_state(start if goal is None else self._following(start, goal))
 
     def at(self, state: TensorDictBase) -> TensorDict:
         """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
@@ -257,8 +265,11 @@ class DrivingEnv(EnvBase):
         """A start state whose agents follow the given routes (by default those nearest to the log)."""
         start = self._read(state)
         goal = self.scenes.route_logged[start.scene] if goal is None else goal
+        return self._from_state(self._following(start, goal))
+
+    def _following(self, start: State, goal: Int[Tensor, "*b N"]) -> State:
         start = start._replace(goal=goal, progress=torch.zeros_like(start.progress))
-        return self._from_state(start._replace(progress=self._progress(start, start.state)))
+        return start._replace(progress=self._progress(start, start.state))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
@@ -359,12 +370,7 @@ class DrivingEnv(EnvBase):
             state: x, y, heading, speed of the driven agents.
             valid: which of them are there.
         """
-        index = self.scenes.interactive.index_select(0, row)
-        found = objects_at(self.scenes, row, step, state, index, valid)
-        # One that has left, or not entered yet, must not be played back in the meantime.
-        return (
-            without(found, index, self.scenes.interactive_valid[row] & ~valid) if self.open_traffic else found
-        )
+        return everyone_at(self.scenes, row, step, state, valid, open_traffic=self.open_traffic)
 
     def _read(self, tensordict: TensorDictBase) -> State:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
@@ -388,12 +394,19 @@ class DrivingEnv(EnvBase):
         row, at = scene.flatten(), step.flatten()
         moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
         index = self.scenes.interactive.index_select(0, row)
-        objects = self.objects(row, at, moved, real)
-        routes = None
-        if self.observation.route or self.observation.along:
-            follows, come = (part.reshape(-1, part.shape[-1]) for part in (goal, progress))
-            routes = self.scenes.routes.of(row, follows).window(come)
-        seen = observe(self.scenes, row, at, objects, index, self.observation, self._kept(), routes)
+        follows = self.observation.route or self.observation.along
+        seen, objects = observe_states(
+            self.scenes,
+            row,
+            at,
+            moved,
+            real,
+            self.observation,
+            goal=goal.reshape(real.shape) if follows else None,
+            progress=progress.reshape(real.shape) if follows else None,
+            tables=self._kept(),
+            open_traffic=self.open_traffic,
+        )
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}

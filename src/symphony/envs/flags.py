@@ -8,11 +8,12 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.envs.objects import Objects, levels_apart
+from symphony.envs.objects import Objects
 from symphony.envs.road import on_levels, road_distance
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import Tables
 from symphony.geometry.boxes import boxes_overlap
+from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import on_host
 
 _SLACK = 1e-2

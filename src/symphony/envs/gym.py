@@ -165,8 +165,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         )
 
     def _start(self) -> TensorDictBase:
-        start = self.env.start(torch.tensor(0))
-        return self.env.with_goals(start) if self.observation.route else start
+        row = torch.tensor(0)
+        return self.env.start(row, goal=self.env.scenes.route_logged[row] if self.observation.route else None)
 
     def _observed(self, state: TensorDictBase) -> Observed:
         """The ego's observation, as NumPy arrays."""

@@ -12,16 +12,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.data.levels import LEVEL
 from symphony.envs.routes import RouteWindow, along_route
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, Tables
 from symphony.geometry.boxes import gap_between
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import wrap
+from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import nearest, on_host
 
 OBJECT_FEATURES = 8 + AGENT_FEATURES
+_PLACES = 1 << 22
+"""Positions times logged steps that are looked at together."""
 
 
 class Objects(NamedTuple):
@@ -32,7 +34,7 @@ class Objects(NamedTuple):
         valid: [M, A].
         size: [M, A, 2].
         kind: [M, A] int64, ``AgentType``.
-        height: [M, A, 2] height and level, see :func:`levels_apart`; None where no scene has levels.
+        height: [M, A, 2] height and level, see :mod:`symphony.data.levels`; None where no scene has levels.
     """
 
     state: Tensor
@@ -40,12 +42,6 @@ class Objects(NamedTuple):
     size: Tensor
     kind: Tensor
     height: Tensor | None = None
-
-
-def levels_apart(one: Float[Tensor, "*b 2"], other: Float[Tensor, "*b 2"]) -> Bool[Tensor, "*b"]:
-    """Whether two places, by height and level (0 for none), are on two of them, see :mod:`symphony.data.levels`."""
-    levels = (one[..., 1] != other[..., 1]) & (one[..., 1] > 0) & (other[..., 1] > 0)
-    return levels & ((one[..., 0] - other[..., 0]).abs() >= LEVEL)
 
 
 def objects_at(
@@ -83,15 +79,68 @@ def objects_at(
     return Objects(logged, valid, size, kind, height)
 
 
+def everyone_at(
+    scenes: SceneBatch,
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    state: Float[Tensor, "M N 4"],
+    valid: Bool[Tensor, "M N"],
+    *,
+    open_traffic: bool = False,
+) -> Objects:
+    """Everyone at a step: interactive agents in their states, and all others as logged.
+
+    Args:
+        scenes: the static part.
+        scene: rows of ``scenes``.
+        step: logged step.
+        state: x, y, heading, speed of the interactive agents.
+        valid: which of them are there.
+        open_traffic: whether agents enter and leave: one that has left, or not entered yet, is not played back.
+    """
+    index = scenes.interactive.index_select(0, scene)
+    found = objects_at(scenes, scene, step, state, index, valid)
+    if not open_traffic:
+        return found
+    agents = found.valid.shape[1]
+    column = torch.where(scenes.interactive_valid[scene] & ~valid, index, agents)
+    return found._replace(valid=pad(found.valid, (0, 1)).scatter(1, column, False)[:, :agents])
+
+
 def _height(
     scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M N 2"], index: Int[Tensor, "M N"]
 ) -> Float[Tensor, "M N 2"]:
-    """Height and level of simulated agents: those of the nearest place of their own log."""
     row, agent = scene[:, None], index
-    # [M, N, T]
-    away = (scenes.log_state[row, :, agent, :2] - position[..., None, :]).square().sum(-1)
-    step = away.masked_fill(~scenes.log_valid[row, :, agent], torch.inf).argmin(-1)
+    step = nearest_logged(scenes.log_state[row, :, agent, :2], scenes.log_valid[row, :, agent], position)
     return scenes.agent_height[row, step, agent]
+
+
+def nearest_logged(
+    log: Float[Tensor, "*#b T 2"], valid: Bool[Tensor, "*#b T"], position: Float[Tensor, "*#b 2"]
+) -> Int[Tensor, "*b"]:
+    """Step of the log at which an agent came nearest to a position."""
+    away = (log - position[..., None, :]).square().sum(-1)
+    return away.masked_fill(~valid, torch.inf).argmin(-1)
+
+
+def rollout_heights(
+    scenes: SceneBatch, state: Float[Tensor, "B K T N 4"], scene: Int[Tensor, " B"] | None = None
+) -> Float[Tensor, "B K T N 2"] | None:
+    """Height and level of the interactive agents in states of rollouts; None where no scene has levels.
+
+    Args:
+        scenes: the static part.
+        state: of the interactive agents.
+        scene: rows of ``scenes``; by default all of them.
+    """
+    if not scenes.agent_height.shape[1]:
+        return None
+    row = torch.arange(len(scenes), device=state.device) if scene is None else scene
+    row, place = row.repeat_interleave(state[0, ..., 0, 0].numel()), state[..., :2].flatten(0, 2)
+    each = max(1, _PLACES // (state.shape[3] * scenes.log_state.shape[1]))
+    parts = zip(row.split(each), place.split(each), strict=True)
+    found = [_height(scenes, part, at, scenes.interactive[part]) for part, at in parts]
+    return torch.cat(found).unflatten(0, state.shape[:3])
 
 
 def _put(

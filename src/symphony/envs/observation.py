@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
-from symphony.envs.objects import OBJECT_FEATURES, Objects, Seen, observed_objects
+from symphony.envs.objects import OBJECT_FEATURES, Objects, Seen, everyone_at, observed_objects
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, RouteWindow, route_ahead
@@ -28,6 +28,7 @@ __all__ = [
     "Observation",
     "ObservationConfig",
     "observe",
+    "observe_states",
     "road_distance",
 ]
 
@@ -221,6 +222,41 @@ def observe(
         route=route,
         along=seen.along,
     )
+
+
+def observe_states(
+    scenes: SceneBatch,
+    scene: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    state: Float[Tensor, "M N 4"],
+    valid: Bool[Tensor, "M N"],
+    config: ObservationConfig,
+    *,
+    goal: Int[Tensor, "M N"] | None = None,
+    progress: Float[Tensor, "M N"] | None = None,
+    tables: Tables | None = None,
+    open_traffic: bool = False,
+) -> tuple[Observation, Objects]:
+    """What interactive agents observe in given states, and everyone whom they could see. No environment is needed.
+
+    Args:
+        scenes: the static part.
+        scene: rows of ``scenes``.
+        step: logged step.
+        state: x, y, heading, speed of the interactive agents.
+        valid: which of them are there.
+        config: what they see.
+        goal: routes that they follow, -1 for none; without them nothing of routes is observed.
+        progress: metres that they have come along them.
+        tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
+        open_traffic: whether agents enter and leave.
+    """
+    objects = everyone_at(scenes, scene, step, state, valid, open_traffic=open_traffic)
+    routes = None
+    if goal is not None and progress is not None:
+        routes = scenes.routes.of(scene, goal).window(progress)
+    index = scenes.interactive.index_select(0, scene)
+    return observe(scenes, scene, step, objects, index, config, tables, routes), objects
 
 
 def _take(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:

@@ -10,14 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.envs.objects import levels_apart
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
 from symphony.geometry.frames import rotate
-from symphony.geometry.nearest import mere_numbers, nearest, on_host, smallest
+from symphony.geometry.levels import levels_apart
+from symphony.geometry.nearest import nearest, on_host, smallest
 
-_ROWS = 1 << 13
-"""Points whose features are written together, so that they stay in the cache."""
 _DISTANCES = 1 << 16
 """Distances held at a time."""
 
@@ -33,7 +31,7 @@ def observed_points(
 ) -> tuple[Float[Tensor, "M N K F"], Bool[Tensor, "M N K"]]:
     """Features of the nearest points in each agent's frame, on its level, and which of them exist."""
     flat, mask = nearest_points(tables, scene, origin.detach(), height)
-    return _seen(tables, scene, step, flat, mask, origin, heading, speed), mask
+    return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
 
 
 def observed_lights(
@@ -59,20 +57,7 @@ def observed_lights(
             squared = squared.masked_fill(levels_apart(lights[:, None], height[:, :, None]), torch.inf)
         chosen, mask = nearest(squared, count)
         flat = number[scene].gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
-    return _seen(tables, scene, step, flat, mask, origin, heading, speed), mask
-
-
-def _seen(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    step: Int[Tensor, " M"],
-    flat: Int[Tensor, "M N K"],
-    mask: Bool[Tensor, "M N K"],
-    *pose: Float[Tensor, "M N ..."],
-) -> Float[Tensor, "M N K F"]:
-    """Features of the points ``flat``, for agents at a position, with a heading and a speed."""
-    written = _features_in_place if mere_numbers(*pose) else _features
-    return written(tables, scene, step, flat, mask, *pose)
+    return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
 
 
 @torch.no_grad()
@@ -84,7 +69,7 @@ def nearest_points(
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
     """Numbers of the nearest points among all points of all scenes, and which of them exist.
 
-    With heights and levels, points on other levels do not (see :func:`symphony.envs.objects.levels_apart`).
+    With heights and levels, points on other levels do not (see :func:`symphony.geometry.levels_apart`).
     """
     x, y = tables.position
     count, total = tables.config.num_points, x.shape[1]
@@ -174,114 +159,27 @@ def _features(
     heading: Float[Tensor, "M N"],
     speed: Float[Tensor, "M N"],
 ) -> Float[Tensor, "M N K F"]:
-    config, angle = tables.config, -heading[..., None]
-    static = tables.points.index_select(0, flat.flatten()).unflatten(0, flat.shape)
-    lights = static[..., LIGHT_COLUMN:]
-    if tables.light is not None:
-        light = tables.light.index_select(0, flat.flatten()).unflatten(0, flat.shape).long()
-        state = (
-            _light_now(tables, scene, step)
-            .gather(1, light.clamp_min(0).flatten(1))
-            .unflatten(1, light.shape[1:])
-        )
+    """Features of the points ``flat``, for agents at a position, with a heading and a speed."""
+    config, angle, index = tables.config, -heading[..., None], flat.flatten()
+    static = tables.points.index_select(0, index).unflatten(0, flat.shape)
+    parts = [
+        rotate(static[..., :2] - origin[..., None, :], angle) / config.distance_scale,
+        rotate(static[..., 2:4], angle),
+        static[..., 4:5],
+        (speed / config.speed_scale)[..., None, None].expand(*flat.shape, 1),
+    ]
+    if tables.light is None:
+        parts.append(static[..., 6:])
+    else:
+        light = tables.light.index_select(0, index).unflatten(0, flat.shape).long()
+        now = _light_now(tables, scene, step)
+        state = now.gather(1, light.clamp_min(0).flatten(1)).unflatten(1, light.shape[1:])
         shown = (light >= 0).to(static.dtype)[..., None]
-        lights = torch.zeros_like(lights).scatter(-1, state[..., None], shown)
-    features = torch.cat(
-        [
-            rotate(static[..., :2] - origin[..., None, :], angle) / config.distance_scale,
-            rotate(static[..., 2:4], angle),
-            static[..., 4:5],
-            (speed / config.speed_scale)[..., None, None].expand(*flat.shape, 1),
-            static[..., 6:LIGHT_COLUMN],
-            lights,
-        ],
-        -1,
-    )
-    return features * mask[..., None]
-
-
-@torch.no_grad()
-def _features_in_place(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    step: Int[Tensor, " M"],
-    flat: Int[Tensor, "M N K"],
-    mask: Bool[Tensor, "M N K"],
-    origin: Float[Tensor, "M N 2"],
-    heading: Float[Tensor, "M N"],
-    speed: Float[Tensor, "M N"],
-) -> Float[Tensor, "M N K F"]:
-    """The same numbers, written over copied rows block by block; a third of the time, without a gradient."""
-    config, count = tables.config, flat.shape[-1]
-    agents, index = flat.numel() // count, flat.flatten()
-    out = tables.points.new_empty(agents, count, POINT_FEATURES)
-    angle, (x, y) = -heading.flatten(), origin.reshape(-1, 2).t().contiguous()
-    pose = [v.numpy() for v in (x, y, angle.cos(), angle.sin(), (speed / config.speed_scale).flatten())]
-    rows, table = index.view(agents, count).numpy(), tables.points.numpy()
-    _write_in_blocks(rows, table, pose, table.dtype.type(config.distance_scale), out.numpy())
-    seen = out.view(*flat.shape, POINT_FEATURES)
-    if tables.light is not None:
-        light = tables.light.index_select(0, index)
-        place = (light >= 0).nonzero().squeeze(-1)
-        # Of a place in [M, N, K] the row.
-        row = place // (count * origin.shape[1])
-        state = _light_now(tables, scene, step)[row, light[place].long()]
-        out.view(-1, POINT_FEATURES)[place, LIGHT_COLUMN + state] = 1.0
-    if not mask.numpy().all():
-        out.view(-1, POINT_FEATURES)[(~mask).flatten()] = 0.0
-    return seen
-
-
-def _write_in_blocks(
-    rows: np.ndarray, table: np.ndarray, pose: list[np.ndarray], scale: float, out: np.ndarray
-) -> None:
-    """Rows [R, K] of a table [T, F], copied to [R, K, F] and overwritten block by block.
-
-    Args:
-        rows: those that each agent sees.
-        table: features in the world's frame.
-        pose: [R] each of the agents: x, y, cosine and sine of the angle by which the world is turned, scaled speed.
-        scale: metres that become 1, of the table's type.
-        out: written to.
-    """
-    agents, count = rows.shape
-    block = max(1, _ROWS // count)
-    buffers = np.empty((3, block, 2 * count), table.dtype)
-    # A place that is infinite is found by whoever looks at what comes of it.
-    with np.errstate(invalid="ignore"):
-        for a in range(0, agents, block):
-            part = out[a : a + block]
-            # "clip" writes straight to its target; the numbers are in range.
-            np.take(table, rows[a : a + block], axis=0, out=part, mode="clip")
-            _to_frame(part, [value[a : a + block, None] for value in pose], scale, buffers[:, : len(part)])
-
-
-def _to_frame(part: np.ndarray, pose: list[np.ndarray], scale: float, buffers: np.ndarray) -> None:
-    """Overwrite what depends on the agent, by the very operations of :func:`_features`, so to the same bits.
-
-    Of the columns x, y and the direction's two, pairs are moved as one complex number; numbers in a row are quicker
-    to work on than those of a column.
-    """
-    x, y, cos, sin, own = pose
-    pair = np.result_type(part.dtype, np.complex64)
-    place, along, across = buffers
-    pairs, both, turned = part[..., :4].view(pair), place.view(pair), across.view(pair)
-
-    def turn() -> None:
-        """(x cos, y cos) + i (x sin, y sin), which is (x cos - y sin, y cos + x sin)."""
-        np.multiply(place, cos, out=along)
-        np.multiply(place, sin, out=across)
-        np.multiply(turned, 1j, out=turned)
-        np.add(along, across, out=place)
-
-    np.subtract(pairs[..., 0], np.concatenate((x, y), -1).view(pair), out=both)
-    turn()
-    np.divide(place, scale, out=place)
-    pairs[..., 0] = both
-    both[:] = pairs[..., 1]
-    turn()
-    pairs[..., 1] = both
-    part[..., 5] = own
+        dark = torch.zeros_like(static[..., LIGHT_COLUMN:])
+        parts += [static[..., 6:LIGHT_COLUMN], dark.scatter(-1, state[..., None], shown)]
+    features = torch.cat(parts, -1)
+    # Most maps have enough points, and then there is nothing to mask.
+    return features if on_host(mask) and bool(mask.all()) else features * mask[..., None]
 
 
 def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:

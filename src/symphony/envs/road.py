@@ -11,9 +11,9 @@ from jaxtyping import Float, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.envs.objects import levels_apart
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import Tables
+from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import on_host
 from symphony.geometry.polylines import NO_BOUNDARY, distance_to, signed_distance
 
@@ -32,7 +32,7 @@ def road_distance(
 
     Differentiable in the position. With ``tables`` the nearest edge is looked for among those listed for the
     position's cell of the map; the distance is the same within rounding. With heights and levels, edges on other
-    levels do not count (see :func:`symphony.envs.objects.levels_apart`).
+    levels do not count (see :func:`symphony.geometry.levels_apart`).
     """
     if height is not None:
         flat = road_distance(scenes, scene, position, tables)

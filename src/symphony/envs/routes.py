@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.data.levels import LEVEL
 from symphony.data.segment import RunSegment
 from symphony.errors import DataError, DataWarning
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
+from symphony.geometry.levels import LEVEL
 from symphony.geometry.nearest import first_smallest, on_host
 from symphony.geometry.stations import stations_along
 from symphony.roadgraph import LaneGraph, Route, ground_truth_routes, route_lines, routes, starting_lanes
@@ -232,7 +232,7 @@ class FollowedRoutes(NamedTuple):
         """What is seen of the routes by agents that have come so many metres along them."""
         own = (progress / SPACING).round().long().minimum((self.length - 2).clamp_min(0))
         start = (own - BEHIND).clamp_min(0)
-        place = start[..., None] + constant(tuple(range(WINDOW)), torch.int64, start.device)
+        place = start[..., None] + torch.arange(WINDOW, device=start.device)
         points = _points_at(self.point, self.begin, self.length, place)
         return RouteWindow(points, place < self.length[..., None], own - start)
 
@@ -252,7 +252,7 @@ class FollowedRoutes(NamedTuple):
         with torch.no_grad():
             reach = _SLACK if moved is None else _CUT * moved[..., None] + _SLACK
             start = ((about / SPACING).long() - _BACK).clamp_min(0)
-            place = start[..., None] + constant(tuple(range(_SEARCHED)), torch.int64, start.device)
+            place = start[..., None] + torch.arange(_SEARCHED, device=start.device)
             x, y = _points_at(self.point, self.begin, self.length, place).unbind(-1)
             first, way = (x[..., :-1], y[..., :-1]), (x.diff(dim=-1), y.diff(dim=-1))
             length = (way[0].square() + way[1].square()).sqrt()

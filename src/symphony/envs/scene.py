@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tensordict import TensorClass
 from torch import Tensor
 
-from symphony.data.levels import Levels, ground, levels_of
+from symphony.data.levels import Levels, agent_heights, levels_of
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.envs.edge import MapEdge, beyond
@@ -234,7 +234,7 @@ def scene(
         "edge_previous": previous.astype(np.int32),
         "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
-        "agent_height": _heights(segment, levels),
+        "agent_height": agent_heights(segment, levels),
         "edge_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(middle),
         "stream": np.array(stream_of(segment.segment_id)),
         "segment": np.array(number),
@@ -337,13 +337,6 @@ def _edges(boundary: Polylines, levels: Levels) -> tuple[NDArray[Any], ...]:
     # Of two points of a line that differ one after the other.
     pair = np.flatnonzero((line[1:] == line[:-1]) & (points[1:, :2] != points[:-1, :2]).any(-1))
     return *edges, (points[pair] + points[pair + 1]) / 2
-
-
-def _heights(segment: RunSegment, levels: Levels) -> NDArray[np.float32]:
-    """[T, A, 2] of logged agents; no level where they are not seen."""
-    if levels.flat:
-        return np.zeros((0, 0, 2), np.float32)
-    return np.where(segment.valid[..., None], levels.at(ground(segment)), 0).astype(np.float32).swapaxes(0, 1)
 
 
 def _no_heights(part: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -10,21 +10,15 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from symphony.envs.objects import Objects, levels_apart
+from symphony.envs.objects import Objects
 from symphony.geometry.boxes import box_gap
+from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import on_host
 
 CLEAR = 1.0
 """Metres that an agent which enters keeps from all others."""
 FORESEEN = (0.5, 1.0)
 """Seconds ahead at which its box would meet no other, were everyone to keep speed and course."""
-
-
-def without(objects: Objects, index: Int[Tensor, "M N"], absent: Bool[Tensor, "M N"]) -> Objects:
-    """The same agents without those of ``index`` that are absent."""
-    agents = objects.valid.shape[1]
-    column = torch.where(absent, index, agents)
-    return objects._replace(valid=pad(objects.valid, (0, 1)).scatter(1, column, False)[:, :agents])
 
 
 @torch.no_grad()

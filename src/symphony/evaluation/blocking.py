@@ -9,9 +9,11 @@ import math
 
 import numpy as np
 import shapely
+from torch import from_numpy
 
 from symphony.data.segment import RunSegment, SignalState
 from symphony.evaluation.contacts import Bools, Indices, Reals
+from symphony.geometry import levels_apart
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph, lane_of
 from symphony.simulation.world import World
@@ -84,6 +86,9 @@ def _nobody_ahead(world: World, row: Indices, step: Indices) -> Bools:
         0.5 * (one * world.size[:, 0] + two * world.size[:, 1]) for one, two in ((cos, sin), (sin, cos))
     )
     there = world.valid[:, step].T & (row[:, None] != np.arange(len(world.size)))
+    if world.height is not None:
+        level = from_numpy(world.height[:, step].swapaxes(0, 1))
+        there &= ~levels_apart(level, from_numpy(world.height[row, step])[:, None]).numpy()
     near = (ahead + along > 0) & (ahead - along < FREE)
     wide = 0.5 * world.size[row, 1][:, None] + ASIDE
     in_the_way = near & (np.abs(left) - across < wide)

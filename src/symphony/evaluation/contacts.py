@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from symphony.geometry import boxes_overlap, meeting_time, pose_at
+from symphony.geometry import boxes_overlap, levels_apart, meeting_time, pose_at
 from symphony.metrics import collision_kinds, meetings
 from symphony.simulation.world import World
 
@@ -54,7 +54,8 @@ class Contacts(NamedTuple):
 
 
 def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
-    """Collisions of the evaluated agents [M] of rollouts of one segment, from their second states on.
+    """Collisions of the evaluated agents [M] of rollouts of one segment, from their second states on; nobody meets
+    others on another level.
 
     Args:
         worlds: everyone in each rollout.
@@ -66,7 +67,9 @@ def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
     )
     size = torch.from_numpy(worlds[0].size).expand(len(worlds), -1, -1)
     subject = torch.from_numpy(evaluated).expand(len(worlds), -1)
-    found = meetings(position, heading, size, valid, subject)
+    levels = [world.height for world in worlds if world.height is not None]
+    height = torch.from_numpy(np.stack(levels)) if levels else None
+    found = meetings(position, heading, size, valid, subject, height)
     parts = found.subject.numpy(), found.other.numpy(), found.step.numpy() + 1, found.share.numpy()
     each = [tuple(part[found.row.numpy() == k] for part in parts) for k in range(len(worlds))]
     return [_first(world, evaluated[who], *pair) for world, (who, *pair) in zip(worlds, each, strict=True)]
@@ -138,8 +141,8 @@ def _kinds(world: World, agent: Indices, other: Indices, step: Indices) -> Indic
 def time_to_collision(world: World, evaluated: Indices) -> Reals:
     """Seconds [M, U] until an evaluated agent would first overlap one that is not behind it, if both go on so.
 
-    Everyone keeps velocity and heading. Infinite if that is more than :data:`HORIZON` away, or the agent has stopped
-    or is not there.
+    Everyone keeps velocity and heading, and nobody meets others on another level. Infinite if that is more than
+    :data:`HORIZON` away, or the agent has stopped or is not there.
     """
     return np.concatenate([_time_to_collision(world, part) for part in _blocks(world, evaluated)])
 
@@ -164,6 +167,9 @@ def _time_to_collision(world: World, evaluated: Indices) -> Reals:
     moving = np.linalg.norm(world.velocity[evaluated], axis=-1) > STILL
     near &= (moving & world.valid[evaluated])[:, None] & world.valid[None]
     near &= (evaluated[:, None] != np.arange(len(radius)))[..., None]
+    if world.height is not None:
+        level = torch.from_numpy(world.height)
+        near &= ~levels_apart(level[evaluated, None], level[None]).numpy()
     # Boxes can only meet where the circles around them do, which are nearest to each other at this time.
     soonest = np.clip(-(x * u + y * v) / np.maximum(u * u + v * v, 1e-12), 0, HORIZON)
     reach = (radius[evaluated, None] + radius[None] + _SLACK)[..., None]

@@ -20,6 +20,7 @@ from symphony.agents import Agent, load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
+from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
@@ -39,7 +40,7 @@ from symphony.simulation.crowd import crowd_dataset
 from symphony.simulation.demonstrations import SceneDataset
 from symphony.simulation.driving import Simulation, driven_by, search_kind
 from symphony.simulation.finite import NotFiniteError
-from symphony.simulation.logged import logged
+from symphony.simulation.logged import logged, logged_heights
 from symphony.simulation.rollouts import Rollouts, existing
 from symphony.simulation.workers import batches, naming, segments_together, shared
 
@@ -288,13 +289,14 @@ def _add(
         names = (dataset.segment(i).segment_id for i in items)
         means = values.double().nanmean(-1).tolist()
         evaluation.own.setdefault(path, {}).update(zip(names, means, strict=True))
-    kinds = _kinds(scenes, evaluated, exists)
+    heights = _heights(scenes, rollouts, as_logged=evaluation.search == "log")
+    kinds = _kinds(scenes, evaluated, exists, heights)
     bounded = scenes.edge_valid.any(1)
     single = AgentSteps(
         evaluated.counted.transpose(2, 3),
         log_valid[:, 1:].transpose(1, 2),
         rollouts.offroad.transpose(2, 3),
-        _kinds(scenes, both, exists),
+        _kinds(scenes, both, exists, heights),
         rollouts.state[..., 1:, :, 3].transpose(2, 3),
         log[:, 1:, :, 3].transpose(1, 2),
         bounded,
@@ -343,7 +345,23 @@ def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
     return choices(drawn.cpu(), goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
 
 
-def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T+1"]) -> CollisionKinds:
+def _heights(scenes: SceneBatch, rollouts: Rollouts, *, as_logged: bool) -> tuple[Tensor, Tensor] | None:
+    """Height and level of the interactive agents [B, K, N, T+1, 2] and of all as logged [B, 1, A, T+1, 2]."""
+    logged_ones = logged_heights(scenes)
+    driven = rollout_heights(scenes, rollouts.state)
+    if logged_ones is None or driven is None:
+        return None
+    driven = logged_ones[:, None] if as_logged else driven
+    log = scenes.agent_height[:, None, : rollouts.state.shape[2]]
+    return driven.transpose(2, 3), log.transpose(2, 3)
+
+
+def _kinds(
+    scenes: SceneBatch,
+    rollouts: Rollouts,
+    exists: Bool[Tensor, "B K N T+1"],
+    heights: tuple[Tensor, Tensor] | None,
+) -> CollisionKinds:
     """Who ran into whom, in the first collision of each agent."""
     steps = rollouts.state.shape[-3]
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None]
@@ -356,6 +374,7 @@ def _kinds(scenes: SceneBatch, rollouts: Rollouts, exists: Bool[Tensor, "B K N T
         scenes.log_valid[:, None, :steps].transpose(2, 3),
         scenes.box_size[:, None],
         scenes.agent_type[:, None],
+        heights,
     )
 
 

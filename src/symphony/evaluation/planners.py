@@ -41,6 +41,8 @@ _KEPT = (
     "progress_ratio",
 )
 """Of each run, in a record."""
+_LATER = ("beyond_route", "no_route")
+"""Likewise, but in older records there are none; they count as 0."""
 
 FREE = ("planner", "planner_seconds", "rollouts")
 """Settings that are the planner's own, and how often it is tried."""
@@ -52,14 +54,22 @@ _NUMBER = (int, float, type(None))
 Record = dict[str, Any]
 
 
-def run_score(run: Record) -> float:
+def run_score(run: Record) -> float | None:
     """0 to 100 of one run: the progress relative to the log's, at most all of it; 0 for a run that failed, with a
-    collision at fault, a red light, or time off the road. Where the log stays in place there is no progress to make.
+    collision at fault, a red light, or time off the road. 100 where the log stays in place, as there is no progress
+    to make; None where progress is not defined: beyond a route that ends inside the map, or without a route.
     """
     if run["failed"] or run["at_fault_collision"] or run["red_lights"] or run["offroad_time"]:
         return 0.0
-    ratio = 1.0 if run["progress_ratio"] is None else run["progress_ratio"]
-    return 100.0 * min(max(float(ratio), 0.0), 1.0)
+    if run["progress_ratio"] is None:
+        return None if any(run.get(name) for name in _LATER) else 100.0
+    return 100.0 * min(max(float(run["progress_ratio"]), 0.0), 1.0)
+
+
+def _along_route(row: Record) -> Record:
+    """A run whose metres are no progress if the planner had no route but made some: it may have gone anywhere."""
+    lost = bool(row["no_route"]) and row["progress_ratio"] is not None
+    return row | {"no_route": int(lost), "progress_ratio": None if lost else row["progress_ratio"]}
 
 
 def planner_record(folder: RolloutFolder) -> Record:
@@ -68,8 +78,9 @@ def planner_record(folder: RolloutFolder) -> Record:
     Returns:
         ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
         ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
-        evaluated; ``score``, the mean of :func:`run_score`, and ``score_se``; ``search``, what :func:`selection`
-        gives, None where no search was kept; ``per_run``.
+        evaluated, progress relative to the log's along routes only; ``score``, the mean of :func:`run_score`,
+        ``score_se``, and ``score_runs`` that have one; ``search``, what :func:`selection` gives, None where no search
+        was kept; ``per_run``.
 
     Raises:
         DataError: there is no planner in it, or a file of it can't be read.
@@ -78,11 +89,13 @@ def planner_record(folder: RolloutFolder) -> Record:
     if "ego" not in drivers:
         raise DataError("no planner drove here: simulate with --planner", file=folder.path, field="drivers")
     found = report(folder, "ego")
-    per_run = [{name: row[name] for name in _KEPT} for row in found.rows]
-    groups: list[str] = [row["group"] or row["segment"] for row in found.rows]
+    rows = [_along_route(row) for row in found.rows]
+    per_run = [{name: row[name] for name in (*_KEPT, *_LATER)} for row in rows]
+    groups: list[str] = [row["group"] or row["segment"] for row in rows]
     number = np.unique(groups, return_inverse=True)[1] if groups else np.zeros(0, np.int64)
     scores = np.array([run_score(row) for row in per_run], np.float64)
-    score, error = grouped_mean(scores, np.ones_like(scores), number)
+    known = ~np.isnan(scores)
+    score, error = grouped_mean(np.where(known, scores, 0.0), known.astype(np.float64), number)
     return {
         "format": FORMAT,
         "planner": drivers["ego"],
@@ -90,9 +103,10 @@ def planner_record(folder: RolloutFolder) -> Record:
         "settings": dict(folder.about.settings),
         # The path is of no use elsewhere.
         "store": {"name": _store_name(folder.about.store), "checksum": folder.about.store["checksum"]},
-        **total_numbers(found.rows),
+        **total_numbers(rows),
         "score": score,
         "score_se": error,
+        "score_runs": int(known.sum()),
         "search": selection(saved for saved in folder if saved.trees is not None),
         "per_run": per_run,
     }
@@ -189,7 +203,7 @@ def crowd_name(record: Record) -> str:
 def planner_grid(records: Sequence[Record]) -> list[list[str]]:
     """A line for each record, its heading first; planners of a crowd beside each other, the best score first."""
     order = {name: k for k, name in reversed(list(enumerate(crowd_name(one) for one in records)))}
-    ranked = sorted(records, key=lambda one: (order[crowd_name(one)], -(one["score"] or 0.0)))
+    ranked = sorted(records, key=lambda one: (order[crowd_name(one)], *_place(one)))
     grid = [["crowd", "planner", *(heading for _, heading, _ in COLUMNS)]]
     for one in ranked:
         cells = []
@@ -200,6 +214,22 @@ def planner_grid(records: Sequence[Record]) -> list[list[str]]:
             cells.append(text + (spread if bound is None else f" (≤ {bound:.{digits}f})"))
         grid.append([crowd_name(one), planner_title(one), *cells])
     return grid
+
+
+def _place(record: Record) -> tuple[bool, float]:
+    """By which records are in order, the best score first, none last."""
+    return record["score"] is None, -(record["score"] or 0.0)
+
+
+def without_score(records: Sequence[Record]) -> list[str]:
+    """Which runs have no score, in a sentence, where some have none."""
+    lost = [sum(run_score(run) is None for run in one["per_run"]) for one in records]
+    found = [
+        f"{planner_title(one)} among {crowd_name(one)} {count} of {len(one['per_run'])} runs"
+        for one, count in zip(records, lost, strict=True)
+        if count
+    ]
+    return [f"without a score, as progress is not defined: {', '.join(found)}"] if found else []
 
 
 def counted_at_states(records: Sequence[Record]) -> list[str]:
@@ -264,7 +294,7 @@ def winners(records: Sequence[Record]) -> list[str]:
         crowds.setdefault(crowd_name(one), []).append(one)
     found = []
     for crowd, members in crowds.items():
-        first, *rest = sorted(members, key=lambda one: -(one["score"] or 0.0))
+        first, *rest = sorted(members, key=_place)
         if not rest:
             continue
         second = rest[0]
@@ -286,14 +316,15 @@ def winners(records: Sequence[Record]) -> list[str]:
 
 
 def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None, int]:
-    """Mean score of the first less that of the second, paired over segments, its standard error over groups, and how
-    many of these there are.
+    """Mean score of the first less that of the second, paired over segments in which both have one, its standard
+    error over groups, and how many of these there are.
     """
     means = []
     for record in (one, other):
         by_segment: dict[str, list[float]] = {}
         for run in record["per_run"]:
-            by_segment.setdefault(run["segment"], []).append(run_score(run))
+            if (score := run_score(run)) is not None:
+                by_segment.setdefault(run["segment"], []).append(score)
         means.append({segment: float(np.mean(scores)) for segment, scores in by_segment.items()})
     both = sorted(set(means[0]) & set(means[1]))
     of = {run["segment"]: run["group"] or run["segment"] for run in one["per_run"]}

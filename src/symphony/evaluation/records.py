@@ -72,9 +72,9 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         rollouts or branches in it; ``run``: ``method``, ``seed``, ``interactive``,
         ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether that is ``named``,
         not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the store; ``config``:
-        the settings of the evaluation, with what was left to the agent filled in; ``horizon``: seconds
-        of the longest rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy``
-        and ``log``, and ``parts``, pseudo-values of the divergence by recording (see
+        the settings of the evaluation, with what was left to the agent filled in; ``horizon``: seconds of the longest
+        rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and
+        ``parts``, pseudo-values of the divergence by recording (see
         :func:`symphony.metrics.sampled_divergence`); ``per_segment``: a row for each run segment. `symphony evaluate
         --metrics wosac` adds ``wosac`` and numbers whose names begin so (see
         :func:`symphony.evaluation.wosac.wosac_parts`).

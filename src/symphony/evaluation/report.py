@@ -178,6 +178,7 @@ _NUMBERS = (
     "progress",
     "progress_ratio",
     "beyond_route",
+    "no_route",
     "max_acceleration",
     "max_braking",
     "max_jerk",
@@ -245,6 +246,7 @@ def _numbers(saved: SavedRollouts, who: NDArray[np.int64], graph: LaneGraph) -> 
                 if logged_progress > 1
                 else None,
                 "beyond_route": int((~known).sum()),
+                "no_route": int((saved.goal[k, who] < 0).sum()),
                 "max_acceleration": _peak(motion.acceleration[k]),
                 "max_braking": _peak(-motion.acceleration[k]),
                 "max_jerk": _peak(np.abs(motion.jerk[k])),

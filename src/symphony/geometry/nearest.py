@@ -25,11 +25,6 @@ def on_host(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling() and not transformed()
 
 
-def mere_numbers(*values: Tensor) -> bool:
-    """Whether NumPy may compute with tensors: on the CPU, and without a gradient."""
-    return all(on_host(value) and not value.requires_grad for value in values)
-
-
 SHARE = 4
 """One in so many elements gives a bound of what is looked for, in rows that are long."""
 LONG = 1024

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from symphony.geometry import box_gap, contact_share, pose_at, rotate, wrap
+from symphony.geometry import box_gap, contact_share, levels_apart, pose_at, rotate, wrap
 
 SAME_WAY = math.radians(45)
 """Largest angle between the headings of two agents that go the same way."""
@@ -115,6 +115,7 @@ def collision_kinds(
     log_valid: Bool[Tensor, "*#lead A T+1"],
     size: Float[Tensor, "*#lead A 2"],
     agent_type: Int[Tensor, "*#lead A"] | None = None,
+    height: tuple[Float[Tensor, "*#lead N T+1 2"], Float[Tensor, "*#lead A T+1 2"]] | None = None,
 ) -> CollisionKinds:
     """With whom, when and how each interactive agent collides first. Leading dimensions broadcast.
 
@@ -134,6 +135,8 @@ def collision_kinds(
         size: [..., A, 2] length and width.
         agent_type: [..., A] ``AgentType`` numbers; without them all count as vehicles, and a pedestrian who is run
             over as crossing, say.
+        height: and level, of the interactive agents and of all as logged; nobody meets another on another level, as
+            :func:`symphony.metrics.collisions` has it.
 
     Raises:
         ValueError: for shapes that do not fit together, or a flagged agent that touches nobody.
@@ -161,8 +164,13 @@ def collision_kinds(
         logged, valid = _placed(logged, driven, rows), _placed(valid, there, rows)
         return _Poses(logged[..., :2], logged[..., 2], logged[..., 3:], valid)
 
+    def levels(driven: Float[Tensor, "*_"], logged: Float[Tensor, "*_"]) -> list[Float[Tensor, "M A 2"]]:
+        driven, logged = (part.expand(*lead, *part.shape[-3:]).transpose(-3, -2) for part in (driven, logged))
+        return [_placed(logged[at], driven[at], rows) for at in ((*where, step), (*where, step + 1))]
+
     boxes = size.expand(*lead, *size.shape[-2:])[tuple(where)]
-    other, share, before, after = _first_met(poses(step), poses(step + 1), boxes, agent)
+    heights = [] if height is None else levels(*height)
+    other, share, before, after = _first_met(poses(step), poses(step + 1), boxes, agent, heights)
     ours, theirs = (boxes[torch.arange(len(row), device=row.device), row] for row in (agent, other))
     ends = [(before.of(row), after.of(row)) for row in (agent, other)]
     one_hit, two_hit = (_at_contact(*end, share) for end in ends)
@@ -193,10 +201,14 @@ def _placed(
 
 
 def _first_met(
-    before: _Poses, after: _Poses, boxes: Float[Tensor, "M A 2"], agent: Int[Tensor, " M"]
+    before: _Poses,
+    after: _Poses,
+    boxes: Float[Tensor, "M A 2"],
+    agent: Int[Tensor, " M"],
+    height: list[Float[Tensor, "M A 2"]],
 ) -> tuple[Int[Tensor, " M"], Float[Tensor, " M"], _Poses, _Poses]:
     """Whom each agent [M] meets first in a step, after which share of it, and the poses of everyone: before the step,
-    or after it of those that were not both there before.
+    or after it of those that were not both there before. Heights are those before and after, or none.
     """
     me = torch.arange(len(agent), device=agent.device), agent
     seen = before.valid & before.valid[me][:, None]
@@ -208,6 +220,9 @@ def _first_met(
         )
     )
     others = after.valid & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
+    if height:
+        apart, apart_after = (levels_apart(level, level[me][:, None]) for level in height)
+        others &= ~(apart_after & (apart | ~seen))
     share = contact_share(
         torch.stack([mine.position, after.position[me][:, None].expand_as(mine.position)], -2),
         torch.stack([mine.heading, after.heading[me][:, None].expand_as(mine.heading)], -1),

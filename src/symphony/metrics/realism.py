@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.geometry import box_corners, contact_share, signed_distance
+from symphony.geometry import box_corners, contact_share, levels_apart, signed_distance
 
 _SLACK = 1e-3
 _PAIRS = 1 << 22
@@ -44,6 +44,7 @@ def meetings(
     size: Float[Tensor, "R A 2"],
     valid: Bool[Tensor, "R A U"],
     subject: Int[Tensor, "R N"],
+    height: Float[Tensor, "R A U 2"] | None = None,
     *,
     at_states: bool = False,
 ) -> Meetings:
@@ -58,6 +59,8 @@ def meetings(
         size: length and width.
         valid: an agent that is not valid meets nobody, whatever its other numbers are.
         subject: rows of A; a negative one stands for no agent.
+        height: and level; those on two levels both before and after a step do not meet
+            (:func:`symphony.geometry.levels_apart`).
         at_states: look at states only, not at what is between them.
     """
     last = slice(None) if at_states else slice(1, None)
@@ -96,6 +99,8 @@ def meetings(
             position[at[0]], heading[at[0]], size[row, one], position[at[1]], heading[at[1]], size[row, other]
         )
         hit = share < math.inf
+        if height is not None:
+            hit &= ~levels_apart(height[at[0]], height[at[1]]).all(-1)
         found.append(tuple(value[hit] for value in (row, who, other, step, share)))
     if not found:
         none = torch.zeros(0, dtype=torch.int64, device=valid.device)
@@ -109,6 +114,7 @@ def collisions(
     size: Float[Tensor, "*#lead A 2"],
     valid: Bool[Tensor, "*#lead A U"],
     subject: Int[Tensor, "*#lead N"],
+    height: Float[Tensor, "*#lead A U 2"] | None = None,
     *,
     at_states: bool = False,
 ) -> Bool[Tensor, "*lead N T"]:
@@ -122,14 +128,17 @@ def collisions(
         size: [..., A, 2] length and width.
         valid: [..., A, U].
         subject: [..., N] indices into A; a negative one stands for no agent.
+        height: [..., A, U, 2] height and level; those on two levels do not meet.
         at_states: look at states only.
     """
     lead = torch.broadcast_shapes(
         position.shape[:-3], heading.shape[:-2], size.shape[:-2], valid.shape[:-2], subject.shape[:-1]
     )
+    parts = [(position, 3), (heading, 2), (size, 2), (valid, 2), (subject, 1)]
+    parts += [] if height is None else [(height, 3)]
     flat = [
         value.expand(*lead, *value.shape[-inner:]).reshape(-1, *value.shape[-inner:])
-        for value, inner in ((position, 3), (heading, 2), (size, 2), (valid, 2), (subject, 1))
+        for value, inner in parts
     ]
     found = meetings(*flat, at_states=at_states)
     steps = valid.shape[-1] - (not at_states)

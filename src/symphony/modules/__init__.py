@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram
-from symphony.modules.discriminator import FORESIGHT, Discriminator, discriminator
-from symphony.modules.displacement import displacement_policy
-from symphony.modules.encoder import ElementGroup, SceneEncoder, SceneNetwork, scene_module
-from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
-from symphony.modules.noise import SeededNoise
-from symphony.modules.policy import NoiseSampler, discrete_policy
-from symphony.modules.pooling import pool_elements
-from symphony.modules.rows import in_blocks, mlp
-from symphony.modules.sampling import inverse_cdf
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+from symphony.modules.discriminator import Discriminator, discriminator
+
+if TYPE_CHECKING:
+    from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram
+    from symphony.modules.displacement import displacement_policy
+    from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder, SceneNetwork, scene_module
+    from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
+    from symphony.modules.noise import SeededNoise
+    from symphony.modules.policy import NoiseSampler, discrete_policy
+    from symphony.modules.pooling import pool_elements
+    from symphony.modules.rows import in_blocks, mlp
+    from symphony.modules.sampling import inverse_cdf
 
 __all__ = [
     "FORESIGHT",
@@ -35,3 +40,5 @@ __all__ = [
     "pool_elements",
     "scene_module",
 ]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from symphony.keys import GAP, GAP_AHEAD, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
 from symphony.modules.encoder import (
+    FORESIGHT,
     ElementGroup,
     SceneEncoder,
     SceneNetwork,
@@ -23,8 +24,6 @@ from symphony.modules.encoder import (
 from symphony.modules.pooling import PoolMode
 
 Features = Literal["paper", "clearance", "foresight"]
-FORESIGHT = (0.5, 1.0, 2.0)
-"""Seconds ahead at which ``foresight`` looks."""
 _GAP, _ROAD = 3, 2 * 5
 
 

@@ -17,6 +17,9 @@ from symphony.modules.pooling import PoolMode, pool_elements
 from symphony.modules.rows import in_blocks, mlp
 from symphony.modules.tensors import TensorModule
 
+FORESIGHT = (0.5, 1.0, 2.0)
+"""Seconds ahead at which gaps and distances to the edge of the road are observed, too."""
+
 
 @dataclass(frozen=True)
 class ElementGroup:

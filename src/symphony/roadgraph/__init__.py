@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from symphony.roadgraph.assign import lane_of, starting_lanes
-from symphony.roadgraph.branches import visited_curvatures, visited_regions
-from symphony.roadgraph.graph import LaneGraph, Regions
-from symphony.roadgraph.paths import blend, centre_line
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
 from symphony.roadgraph.routes import (
     Route,
     feasible_routes,
@@ -15,6 +14,12 @@ from symphony.roadgraph.routes import (
     route_lines,
     routes,
 )
+
+if TYPE_CHECKING:
+    from symphony.roadgraph.assign import lane_of, starting_lanes
+    from symphony.roadgraph.branches import visited_curvatures, visited_regions
+    from symphony.roadgraph.graph import LaneGraph, Regions
+    from symphony.roadgraph.paths import blend, centre_line
 
 __all__ = [
     "LaneGraph",
@@ -33,3 +38,5 @@ __all__ = [
     "visited_curvatures",
     "visited_regions",
 ]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.replay import SearchReplay, with_survivors
-from symphony.simulation.rollouts import Rollouts, simulate
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.simulation.demonstrations import SceneDataset
+    from symphony.simulation.replay import SearchReplay, with_survivors
+    from symphony.simulation.rollouts import Rollouts, simulate
 
 __all__ = ["Rollouts", "SceneDataset", "SearchReplay", "simulate", "with_survivors"]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -201,7 +201,7 @@ class _Lines(NamedTuple):
 
 def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
     """The routes of the log of all agents [B, N]; without one, straight on."""
-    row = torch.arange(len(scenes), device=scenes.route_logged.device)
+    row = torch.arange(len(scenes), device=scenes.route_point.device)
     points, exist = scenes.routes.of(row, scenes.route_logged).lines()
     # Of an agent without a route: two points from where it enters.
     enters = scenes.log_state[row[:, None], scenes.enter, scenes.interactive]

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -28,8 +29,9 @@ from symphony.simulation.experts import Experts, fit_experts
 from symphony.simulation.kept import KeptExperts
 from symphony.simulation.logged import expert_batch, logged, logged_routes
 from symphony.simulation.memory import ItemCache
-from symphony.simulation.personas import PersonaScale, styles
-from symphony.simulation.perturbation import AHEAD, AHEAD_IN_STYLE, perturbed
+
+if TYPE_CHECKING:
+    from symphony.simulation.personas import PersonaScale
 
 GRAPHS = 64
 """Lane graphs held in memory."""
@@ -156,13 +158,20 @@ class SceneDataset:
     def _scene(self, i: int) -> SceneBatch:
         """Item ``i`` as a batch of one scene."""
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
-        persona = self.personas.personas(styles(segment, self.graph(i))) if self.persona else None
+        persona = self.personas.personas(self._styles(i)) if self.persona else None
         return scene(segment, self.interactive, graph, number=i, persona=persona)
 
     @cached_property
     def personas(self) -> PersonaScale:
         """The driving styles of all items, measured when first asked for."""
-        return PersonaScale.of(styles(self.segment(i), self.graph(i)) for i in range(len(self)))
+        from symphony.simulation.personas import PersonaScale  # noqa: PLC0415 - few learn with them
+
+        return PersonaScale.of(map(self._styles, range(len(self))))
+
+    def _styles(self, i: int) -> NDArray[np.float64]:
+        from symphony.simulation.personas import styles  # noqa: PLC0415
+
+        return styles(self.segment(i), self.graph(i))
 
     def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
         return [self._scene(i) for i in items]
@@ -220,6 +229,12 @@ class SceneDataset:
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
         if perturb is not None:
+            from symphony.simulation.perturbation import (  # noqa: PLC0415 - few learn from displaced states
+                AHEAD,
+                AHEAD_IN_STYLE,
+                perturbed,
+            )
+
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
             size, ahead = scenes.box_size[item, agent], AHEAD_IN_STYLE if self.persona else AHEAD
             state, action = perturbed(

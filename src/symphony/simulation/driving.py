@@ -17,16 +17,16 @@ from symphony.agents import Agent
 from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.envs.baselines import ConstantVelocity
-from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import Bicycle
+from symphony.envs.flags import offroad_flags
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.metrics import collisions, offroad
+from symphony.metrics import collisions
 from symphony.modules import SeededNoise
 from symphony.simulation.background import CarFollower, ConstantSpeed
 from symphony.simulation.control import Tempered, given_personas
 from symphony.simulation.finite import FiniteWatch
-from symphony.simulation.logged import logged
+from symphony.simulation.logged import logged, logged_heights
 from symphony.simulation.planned import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.simulation.rollouts import (
     Rollouts,
@@ -118,6 +118,7 @@ def simulation(
     watch = FiniteWatch(env)
     goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
     actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
+    fix = _fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None)
     start = start_states(
         env,
         goals,
@@ -127,22 +128,21 @@ def simulation(
         logged_goals=config.logged_goals,
         goals_per=settings.goals,
         personas=given_personas(agent.personas, config.persona),
+        fix=fix,
     )
-    along_log = config.others == "idm"
-    start = _with_fixed_goals(env, start, given, along_log=along_log)
     planned, kind = None, search_kind(agent, config)
 
     def begin(state: TensorDictBase) -> TensorDictBase:
         if goals is None or config.logged_goals:
             return state
         goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
-        return _with_fixed_goals(env, env.with_goals(state, goal), given, along_log=along_log)
+        return env.with_goals(state, fix(state.get(keys.SCENE).squeeze(-1), goal))
 
     if egos is not None:
         if kind == "backtrack":
             raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
         forked = kind not in ("none", "log")
-        start, planned = egos.begin(env, start, seed=config.seed, forked=forked)
+        planned = egos.begin(env, start, seed=config.seed, forked=forked)
         actor = TensorDictSequential(actor, planned)
     result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
     drawn, steps = goal, start.numel() * env.decisions
@@ -236,17 +236,31 @@ def _check_given(
         raise ConfigError(f"{agent.name} follows no goals, so a given one means nothing to it")
 
 
-def _with_fixed_goals(
-    env: DrivingEnv, start: TensorDictBase, given: Tensor | None, *, along_log: bool
-) -> TensorDictBase:
-    """A start state in which goals are as given, and with ``along_log`` those of background agents the log's."""
-    scene, goal = start.get(keys.SCENE).squeeze(-1), start.get(keys.GOAL)
-    if along_log:
-        goal = torch.where(env.scenes.background[scene], env.scenes.route_logged[scene], goal)
-    if given is not None:
-        chosen = given.to(goal.device)[scene]
-        goal = torch.where(chosen >= 0, chosen, goal)
-    return start if goal is start.get(keys.GOAL) else env.with_goals(start, goal)
+def _fixed_goals(
+    scenes: SceneBatch, given: Int[Tensor, "B N"] | None, *, along_log: bool, ego: bool
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """From rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
+
+    Args:
+        scenes: B scenes.
+        given: routes of agents, -1 where that is left open.
+        along_log: whether background agents follow the log's routes.
+        ego: whether the first agent of each scene does.
+    """
+
+    def fixed(scene: Tensor, goal: Tensor) -> Tensor:
+        logged = scenes.route_logged[scene]
+        if along_log:
+            goal = torch.where(scenes.background[scene], logged, goal)
+        if given is not None:
+            chosen = given.to(goal.device)[scene]
+            goal = torch.where(chosen >= 0, chosen, goal)
+        # Scenes without routes have no number of one either.
+        if ego and scenes.route_point.shape[1]:
+            goal = torch.cat([logged[..., :1], goal[..., 1:]], -1)
+        return goal
+
+    return fixed
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
@@ -347,14 +361,9 @@ def driven_by(
 def playback(scenes: SceneBatch) -> Rollouts:
     """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
     log, valid = logged(scenes)
-    edges = (
-        scenes.edge_start,
-        scenes.edge_end,
-        scenes.edge_valid,
-        scenes.edge_previous,
-        scenes.edge_following,
-    )
-    off = offroad(log[..., :2], *edges) & valid
+    row, height = torch.arange(len(scenes), device=log.device), logged_heights(scenes)
+    height = None if height is None else height.flatten(1, 2)
+    off = offroad_flags(scenes, row, log[..., :2].flatten(1, 2), height=height).view(valid.shape) & valid
     hit = _logged_collisions(scenes)
     return Rollouts(log[:, None], hit[:, None], off[:, None, 1:], valid[:, None, 1:])
 
@@ -363,5 +372,8 @@ def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[T
     """See :func:`symphony.metrics.collisions`; what an agent does that is not there is no collision."""
     moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
-    hit = collisions(moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, at_states=at_states)
+    height = scenes.agent_height.transpose(1, 2) if scenes.agent_height.shape[1] else None
+    hit = collisions(
+        moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, height, at_states=at_states
+    )
     return hit.transpose(1, 2)

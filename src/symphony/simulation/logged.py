@@ -36,6 +36,13 @@ def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "
     return with_speed(log), valid
 
 
+def logged_heights(scenes: SceneBatch) -> Float[Tensor, "B T N 2"] | None:
+    """Height and level of the interactive agents in the log; None where no scene has levels."""
+    if not scenes.agent_height.shape[1]:
+        return None
+    return scenes.agent_height.take_along_dim(scenes.interactive[:, None, :, None], 2)
+
+
 def expert_batch(
     scenes: SceneBatch,
     scene_of: Int[Tensor, " M"],

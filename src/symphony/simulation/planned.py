@@ -79,30 +79,24 @@ class EgoPlanners:
         *,
         seed: int,
         forked: bool = False,
-    ) -> tuple[TensorDictBase, EgoPolicy]:
-        """A planner for every start state, and what asks them.
+    ) -> EgoPolicy:
+        """A planner for every start state, which gets its number, and what asks them.
 
         Args:
             env: the environment.
-            start: [...] of it; the egos get the routes of the log.
+            start: [...] of it, the egos on the routes of the log.
             seed: of all rollouts.
             forked: a search will copy planners with its branches.
 
         Raises:
             ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
         """
-        if env.scenes.route_point.shape[1] == 0:
-            goal = start.get(keys.GOAL)
-        else:
-            logged = env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)][..., :1]
-            goal = torch.cat([logged, start.get(keys.GOAL)[..., 1:]], -1)
-        start = env.with_goals(start, goal)
         number = torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
         start.set(keys.PLANNER, number)
         policy = EgoPolicy(env, self, start, seed)
         if forked:
             policy.check_copies()
-        return start, policy
+        return policy
 
 
 class EgoPolicy(TensorDictModuleBase):

@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
 from symphony.envs.driving import DrivingEnv
+from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
 from symphony.metrics import collisions
 from symphony.modules import drawn_goals
@@ -82,7 +83,7 @@ def simulate(
 @torch.no_grad()
 def draw_goals(
     env: DrivingEnv,
-    goals: TensorDictModuleBase | None,
+    goals: TensorDictModuleBase,
     start: TensorDictBase,
     seed: int,
     tree: Int[Tensor, "*b"],
@@ -93,13 +94,11 @@ def draw_goals(
 
     Args:
         env: the environment.
-        goals: the goal policy; None takes the routes nearest to the log.
+        goals: the goal policy.
         start: [...], one entry per draw.
         seed: of the draw.
         tree: [...] number of the draw within its scene, so that it is the same whatever the batch.
     """
-    if goals is None:
-        return env.scenes.route_logged[start.get(keys.SCENE).squeeze(-1)]
     stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], Stream.GOALS), tree[..., None])
     noise = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
 
@@ -119,7 +118,7 @@ def draw_goals(
 def draw_personas(
     env: DrivingEnv,
     personas: Float[Tensor, "M 2"],
-    start: TensorDictBase,
+    scene: Int[Tensor, "*b"],
     seed: int,
     number: Int[Tensor, "*b"],
 ) -> Float[Tensor, "*b N 2"]:
@@ -128,12 +127,12 @@ def draw_personas(
     Args:
         env: the environment.
         personas: to draw from, equally likely.
-        start: [...], one entry per draw.
+        scene: rows of the scene batch, one per draw.
         seed: of the draw.
         number: [...] of the draw within its scene.
     """
-    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], Stream.PERSONAS), number[..., None])
-    share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
+    stream = fold_in(fold_in(env.scenes.stream[scene], Stream.PERSONAS), number)[..., None]
+    share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=scene.device)), 0)
     return personas[(share * len(personas)).long()]
 
 
@@ -147,8 +146,9 @@ def start_states(
     logged_goals: bool = False,
     goals_per: Literal["tree", "branch"] = "tree",
     personas: Float[Tensor, "M 2"] | None = None,
+    fix: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> TensorDictBase:
-    """First states [B, trees, branches] of all scenes.
+    """First states [B, trees, branches] of all scenes, observed once they have their goals and personas.
 
     Args:
         env: the environment.
@@ -160,24 +160,28 @@ def start_states(
         goals_per: who draws goals, and personas, together: all branches of a tree (paper, section IV-B), or each
             branch alone.
         personas: that agents drive in, to draw from; None for agents without.
+        fix: from rows of the scenes [*b] and goals [*b, N] to the goals that agents follow.
     """
-    device, scenes = env.scenes.device, len(env.scenes)
-    number = torch.arange(trees * branches, device=device).reshape(trees, branches)
-    scene = torch.arange(scenes, device=device)[:, None, None]
-    start = env.start(scene.expand(-1, trees, branches), number.expand(scenes, -1, -1))
+    device, shape = env.scenes.device, (len(env.scenes), trees, branches)
+    scene = torch.arange(len(env.scenes), device=device)[:, None, None].expand(shape)
+    number = torch.arange(trees * branches, device=device).reshape(trees, branches).expand(shape)
+    goal, persona = torch.full((*shape, env.num_agents), -1, device=device), None
     if personas is not None:
-        first = number if goals_per == "branch" else number[:, :1]
-        start.set(
-            keys.PERSONA, draw_personas(env, personas, start, seed, first.expand(scenes, trees, branches))
-        )
-    if goals is None:
-        return start
-    chosen = None if logged_goals else goals
-    if goals_per == "branch":
-        return env.with_goals(start, draw_goals(env, chosen, start, seed, number.expand(scenes, -1, -1)))
-    tree = torch.arange(trees, device=device).expand(scenes, trees)
-    goal = draw_goals(env, chosen, start[..., 0], seed, tree)
-    return env.with_goals(start, goal[..., None, :].expand(*start.shape, -1))
+        first = number if goals_per == "branch" else number[..., :1].expand(shape)
+        persona = draw_personas(env, personas, scene, seed, first)
+    if goals is not None and logged_goals:
+        goal = env.scenes.route_logged[scene]
+    elif goals is not None and goals_per == "branch":
+        goal = draw_goals(env, goals, env.start(scene, number, persona=persona), seed, number)
+    elif goals is not None:
+        # Chosen once, by what the first branch of each tree observes.
+        styles = None if persona is None else persona[:, :, 0]
+        tree = torch.arange(trees, device=device).expand(shape[:2])
+        drawn = draw_goals(env, goals, env.start(scene[..., 0], number[..., 0], persona=styles), seed, tree)
+        goal = drawn[:, :, None].expand(*shape, -1)
+    if fix is not None:
+        goal = fix(scene, goal)
+    return env.start(scene, number, goal, persona)
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
@@ -208,7 +212,7 @@ def existing(scenes: SceneBatch, rollouts: Rollouts) -> Bool[Tensor, "B K T+1 N"
 def between_states(
     scenes: SceneBatch, state: Float[Tensor, "B K T+1 N 4"], there: Bool[Tensor, "B K T+1 N"]
 ) -> Bool[Tensor, "B K T N"]:
-    """Whether the box of each driven agent overlaps another's at some time of each step (see
+    """Whether the box of each driven agent overlaps another's on its level at some time of each step (see
     :func:`symphony.metrics.collisions`), among all others of its scene as they were driven or logged.
 
     Args:
@@ -224,12 +228,18 @@ def between_states(
     found = []
     for part in torch.arange(len(scenes), device=state.device).split(each):
         rollouts = (len(part), state.shape[1])
-        pose = pad(scenes.log_state[part, None, :steps, :, :3].expand(*rollouts, -1, -1, -1), (0, 0, 0, 1))
+        moved, logged = state[part, ..., :3], scenes.log_state[part, :steps, :, :3]
+        level = rollout_heights(scenes, state[part], part)
+        if level is not None:
+            moved = torch.cat([moved, level], -1)
+            logged = torch.cat([logged, scenes.agent_height[part, :steps]], -1)
+        pose = pad(logged[:, None].expand(*rollouts, -1, -1, -1), (0, 0, 0, 1))
         seen = pad(scenes.log_valid[part, None, :steps].expand(*rollouts, -1, -1), (0, 1))
         index = column[part, None, None].expand(*rollouts, steps, -1)
-        pose = pose.scatter(-2, index[..., None].expand(*index.shape, 3), state[part, ..., :3].to(pose.dtype))
+        pose = pose.scatter(-2, index[..., None].expand_as(moved), moved.to(pose.dtype))
         seen = seen.scatter(-1, index, there[part])
         pose, seen = pose[..., :count, :].transpose(2, 3), seen[..., :count].transpose(2, 3)
         size = scenes.box_size[part, None]
-        found.append(collisions(pose[..., :2], pose[..., 2], size, seen, subject[part, None]))
+        at = None if level is None else pose[..., 3:]
+        found.append(collisions(pose[..., :2], pose[..., 2], size, seen, subject[part, None], at))
     return torch.cat(found).transpose(2, 3) & there[:, :, 1:]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from symphony import keys
 from symphony.collectors import BeamSearchResult
+from symphony.data.levels import agent_heights
 from symphony.data.segment import Polylines, RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import DataError
@@ -106,6 +108,11 @@ class SavedRollouts:
         """
         first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
         return np.concatenate([first, self.counted], 1)
+
+    @cached_property
+    def log_height(self) -> NDArray[np.float32]:
+        """See :func:`symphony.data.levels.agent_heights`."""
+        return agent_heights(self.segment)
 
     @property
     def evaluated(self) -> NDArray[np.int64]:

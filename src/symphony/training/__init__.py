@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from symphony.training.phases import Phase, Updates, cosine
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
 from symphony.training.processes import Processes, processes
-from symphony.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from symphony.training.phases import Phase, Updates, cosine
+    from symphony.training.trainer import Trainer
 
 __all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine", "processes"]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -26,14 +26,16 @@ from symphony.agents.choice import Best
 from symphony.config import RunConfig, to_json
 from symphony.errors import ConfigError, DataError
 from symphony.files import Lock, write_file
-from symphony.simulation import SceneDataset, SearchReplay
 from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
 from symphony.training.logging import Tracker
 from symphony.training.phases import Phase
-from symphony.training.previews import Previewer
 from symphony.training.processes import Processes
 from symphony.training.resume import checkpoint_to_resume, warm_start
-from symphony.training.validation import Validator
+
+if TYPE_CHECKING:
+    from symphony.simulation import SceneDataset, SearchReplay
+    from symphony.training.previews import Previewer
+    from symphony.training.validation import Validator
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""
@@ -98,9 +100,14 @@ class Trainer:
             agent.personas.copy_(data.personas.table())
         self.validator: Validator | None = None
         self.previewer: Previewer | None = None
+        # Only a run that simulates its agent loads what simulates, judges and draws.
         if self.world.leads and config.validation.data is not None:
+            from symphony.training.validation import Validator  # noqa: PLC0415
+
             self.validator = Validator(config.validation, agent, processes.device)
         if self.world.leads and 0 < config.preview.every <= config.steps:
+            from symphony.training.previews import Previewer  # noqa: PLC0415
+
             shown = data if self.validator is None else self.validator.dataset
             self.previewer = Previewer(config, agent, shown, processes.device, replay)
 

@@ -106,8 +106,9 @@ function legend(r) {
   if (kinds.includes(MARKS.crosswalk)) entries.push(sign("▭", "#9a958c", "crosswalk"));
   if (r.lines("routes")) entries.push(sign("◎", INK, "end of a route, the goal"));
   if (r.events.some(e => e.kind === "collision")) entries.push(sign("×", STOP, "collision"));
-  if (r.events.some(e => e.kind === "offroad")) entries.push(sign("△", "#e69f00", "off the road"));
+  if (r.events.some(e => e.kind === "offroad")) entries.push(sign("△", EVENT_COLORS.offroad, "off the road"));
   if (r.events.some(e => e.kind === "redlight")) entries.push(sign("△", STOP, "red light run"));
+  if (r.events.some(e => e.kind === "blocking")) entries.push(sign("△", EVENT_COLORS.blocking, "blocks traffic"));
   $("legend").innerHTML = entries.join("");
 }
 

@@ -1,5 +1,6 @@
 // The static map: paths in metres made once for a segment, drawn to a canvas of its own once for a zoom.
 const LAND = "#f3f1ec", ROAD = "#ffffff", LANE = "#c9cdd3", EDGE = "#6f6a62", MARK = "#dad6ce", STOP = "#b3122b";
+const EVENT_COLORS = { offroad: "#e69f00", blocking: "#7b3294" };
 const MARKS = { road: 1, crosswalk: 2, bump: 3, driveway: 4, sign: 5 };
 const MARGIN = 0.35;
 

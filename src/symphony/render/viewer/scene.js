@@ -205,7 +205,7 @@ class Scene {
       const fresh = view.t - event.step < 1.5 / this.replay.dt;
       context.globalAlpha = fresh ? 1 : 0.55;
       context.lineCap = "round";
-      for (const [color, width] of [["white", 5], [event.kind === "offroad" ? "#e69f00" : STOP, 2.6]]) {
+      for (const [color, width] of [["white", 5], [EVENT_COLORS[event.kind] || STOP, 2.6]]) {
         context.strokeStyle = color; context.lineWidth = width * this.px; context.beginPath();
         if (event.kind === "collision") {
           context.moveTo(state.x - s, state.y - s); context.lineTo(state.x + s, state.y + s);

@@ -1,0 +1,46 @@
+"""One recipe for each row of the paper's tables: networks, environment, collector, losses, the order of updates.
+
+A recipe is a function from a configuration to a trainer that is ready to run, meant to be read from top to bottom.
+Recipes repeat one another on purpose; nothing below this package knows which methods there are. In a checkout the
+files lie at the top, in ``recipes``, and each is a script, too.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+
+from symphony.agents.agent import usable_device
+from symphony.config.training import Method, TrainConfig
+from symphony.training.processes import Processes, processes
+from symphony.training.trainer import Trainer
+
+__all__ = ["Recipe", "recipe_of", "train"]
+
+Recipe = Callable[[TrainConfig, Processes], Trainer]
+"""What builds the trainer of a run."""
+
+
+def recipe_of(method: Method) -> Recipe:
+    """The recipe of a method: the function of its name, in the file of its name."""
+    return getattr(importlib.import_module(f"symphony.recipes.{method}"), method)
+
+
+def train(config: TrainConfig, recipe: Recipe | None = None) -> Path:
+    """Train an agent; with ``torchrun`` by all its processes.
+
+    Args:
+        config: of the run.
+        recipe: builds the trainer; by default that of the configured method.
+
+    Returns:
+        The run's folder (see :meth:`symphony.training.Trainer.run`).
+
+    Raises:
+        ConfigError: if the folder holds another run, or settings can't be used.
+        DataError: if a store can't be read or holds nothing to learn from, or the disk refuses.
+        TrainingError: if gradients stay infinite or undefined.
+    """
+    with processes(usable_device(config.device)) as world:
+        return (recipe or recipe_of(config.method))(config, world).run()

@@ -1,0 +1,69 @@
+"""What ``import symphony`` names, and how much of the package a training needs."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import symphony
+from helpers_segments import crossing, straight_road
+from helpers_store import fill
+
+ROOT = Path(__file__).resolve().parents[1]
+MOST = 85
+"""Modules of the package that plain behavioural cloning reaches, at most."""
+NOT_NEEDED = (
+    "symphony.cli",
+    "symphony.collectors",
+    "symphony.envs.driving",
+    "symphony.evaluation",
+    "symphony.metrics",
+    "symphony.render",
+    "symphony.simulation.planner",
+    "symphony.simulation.rollouts",
+    "symphony.simulation.search",
+    "matplotlib.pyplot",
+    "wandb",
+)
+TRAIN = """
+import sys
+from pathlib import Path
+from symphony import TrainConfig, train
+data, out = map(Path, sys.argv[1:])
+train(TrainConfig(method="bc", data=data, out=out, steps=1, states=8, segments=2, wandb="disabled"))
+print(*sys.modules, sep="\\n")
+"""
+
+
+def test_public_names_are_there_and_documented() -> None:
+    names = {name for name in symphony.__all__ if not name.startswith("_")}
+    page = (ROOT / "docs" / "reference" / "symphony.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| \[`(\w+)`\]", page, re.M)) == names
+    for name in names:
+        found = getattr(symphony, name)
+        assert inspect.getdoc(found), name
+        assert found.__name__ == name
+    assert names <= set(dir(symphony))
+
+
+def test_names_of_packages_are_theirs() -> None:
+    """Each is imported when it is asked for, from where the package says."""
+    for room in ("agents", "config", "envs", "modules", "objectives", "roadgraph", "simulation", "training"):
+        package = importlib.import_module(f"symphony.{room}")
+        for name in package.__all__:
+            assert not inspect.ismodule(getattr(package, name)), f"{package.__name__}.{name}"
+
+
+def test_cloning_loads_nothing_that_it_does_not_use(tmp_path: Path) -> None:
+    fill(tmp_path / "data", [straight_road(3, steps=8), crossing(4, steps=8)])
+    command = [sys.executable, "-c", TRAIN, str(tmp_path / "data"), str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    reached = set(done.stdout.split())
+    assert "symphony.recipes.bc" in reached
+    assert [name for name in NOT_NEEDED if name in reached] == []
+    own = sorted(name for name in reached if name.startswith("symphony."))
+    assert len(own) <= MOST, own
