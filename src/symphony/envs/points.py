@@ -12,7 +12,6 @@ from torch import Tensor
 
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
 from symphony.geometry.cells import REPAID
-from symphony.geometry.frames import rotate
 from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import nearest, on_host, smallest
 
@@ -160,26 +159,32 @@ def _features(
     speed: Float[Tensor, "M N"],
 ) -> Float[Tensor, "M N K F"]:
     """Features of the points ``flat``, for agents at a position, with a heading and a speed."""
-    config, angle, index = tables.config, -heading[..., None], flat.flatten()
-    static = tables.points.index_select(0, index).unflatten(0, flat.shape)
-    parts = [
-        rotate(static[..., :2] - origin[..., None, :], angle) / config.distance_scale,
-        rotate(static[..., 2:4], angle),
-        static[..., 4:5],
-        (speed / config.speed_scale)[..., None, None].expand(*flat.shape, 1),
+    config, index = tables.config, flat.flatten()
+    cos, sin = (f(-heading)[..., None] for f in (torch.cos, torch.sin))
+    # A copy of the rows, which nobody else has yet: what depends on the agent is written over it. That takes half of
+    # the time of putting columns together.
+    seen = tables.points.index_select(0, index).unflatten(0, flat.shape)
+    x, y = seen[..., 0] - origin[..., :1], seen[..., 1] - origin[..., 1:]
+    # Kept apart, as a gradient may still ask for it.
+    ahead_x, ahead_y = seen[..., 2:4].clone().unbind(-1)
+    written = [
+        (cos * x - sin * y) / config.distance_scale,
+        (sin * x + cos * y) / config.distance_scale,
+        cos * ahead_x - sin * ahead_y,
+        sin * ahead_x + cos * ahead_y,
     ]
-    if tables.light is None:
-        parts.append(static[..., 6:])
-    else:
+    for column, values in enumerate(written):
+        seen[..., column] = values
+    seen[..., 5] = (speed / config.speed_scale)[..., None]
+    if tables.light is not None:
         light = tables.light.index_select(0, index).unflatten(0, flat.shape).long()
         now = _light_now(tables, scene, step)
         state = now.gather(1, light.clamp_min(0).flatten(1)).unflatten(1, light.shape[1:])
-        shown = (light >= 0).to(static.dtype)[..., None]
-        dark = torch.zeros_like(static[..., LIGHT_COLUMN:])
-        parts += [static[..., 6:LIGHT_COLUMN], dark.scatter(-1, state[..., None], shown)]
-    features = torch.cat(parts, -1)
+        shown = (light >= 0).to(seen.dtype)[..., None]
+        dark = torch.zeros_like(seen[..., LIGHT_COLUMN:])
+        seen[..., LIGHT_COLUMN:] = dark.scatter(-1, state[..., None], shown)
     # Most maps have enough points, and then there is nothing to mask.
-    return features if on_host(mask) and bool(mask.all()) else features * mask[..., None]
+    return seen if on_host(mask) and bool(mask.all()) else seen * mask[..., None]
 
 
 def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:
