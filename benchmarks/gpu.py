@@ -24,9 +24,9 @@ from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv
+from symphony.learning import SceneDataset
 from symphony.objectives import BCLoss
-from symphony.simulation import SceneDataset
-from symphony.simulation.search import search
+from symphony.rollouts.search import search
 
 PAPER = 16  # branches of a search when it is evaluated (paper, section V-A)
 

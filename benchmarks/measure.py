@@ -50,16 +50,16 @@ SEARCH = {
     "symphony.collectors:KeyScore.__call__": "discriminator",
 }
 UPDATE = SEARCH | {
-    "symphony.simulation:SceneDataset.sample_states": "logged states",
-    "symphony.simulation:SceneDataset.sample_goals": "logged goals",
-    "symphony.simulation:SearchReplay.survivors": "searched states",
-    "symphony.simulation:SearchReplay.both_kinds": "discriminator's states",
+    "symphony.learning:SceneDataset.sample_states": "logged states",
+    "symphony.learning:SceneDataset.sample_goals": "logged goals",
+    "symphony.learning:SearchReplay.survivors": "searched states",
+    "symphony.learning:SearchReplay.both_kinds": "discriminator's states",
     "symphony.training:Trainer._descend": "backward and optimizer",
 }
 PREPARATION = {
-    "symphony.simulation.demonstrations:fit_experts": "experts",
-    "symphony.simulation.demonstrations:scene": "scenes and routes",
-    "symphony.simulation.demonstrations:LaneGraph": "lane graphs",
+    "symphony.learning.demonstrations:fit_experts": "experts",
+    "symphony.learning.demonstrations:scene": "scenes and routes",
+    "symphony.learning.demonstrations:LaneGraph": "lane graphs",
 }
 
 

@@ -21,8 +21,8 @@ from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.search import search
+from symphony.learning.demonstrations import SceneDataset
+from symphony.rollouts.search import search
 
 
 def main() -> None:

@@ -38,9 +38,9 @@ from symphony.envs import Bicycle, DrivingEnv, ObservationConfig, SceneBatch, co
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES
 from symphony.evaluation import evaluate
 from symphony.geometry import boxes_overlap
+from symphony.learning import SceneDataset
 from symphony.modules import ElementGroup, discrete_policy, discriminator
 from symphony.recipes import recipe_of
-from symphony.simulation import SceneDataset
 from symphony.training import Processes
 
 Work = tuple[Callable[[], Any], int]

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from symphony.data.rollouts import read_rollouts
-from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, scenario_arrays
 from symphony.files import write_json
-from symphony.metrics.wosac import (
+from symphony.wosac.records import parse_scenario, read_scenario_payloads, scenario_arrays
+from symphony.wosac.rollouts import read_rollouts
+from symphony.wosac.scorer import (
     CHALLENGES,
     SimulatedRollouts,
     WosacFeatures,

@@ -24,8 +24,8 @@ from typing import Any
 
 import torch
 
-from symphony.cli.wosac_files import score_files
 from symphony.files import write_json
+from symphony.wosac.files import score_files
 
 UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes that the system counts peak memory in."""

@@ -3,7 +3,7 @@
 symphony simulate pretrained:bc_ts_h --planner examples/coast.py:plan --data STORE --out sim
 """
 
-from symphony.simulation.planner_view import Observation
+from symphony.planners.view import Observation
 
 
 def plan(observation: Observation) -> tuple[float, float]:

@@ -24,9 +24,9 @@ from symphony.collectors import BeamSearchCollector, KeepBest, with_rows
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv
+from symphony.learning import SceneDataset
 from symphony.modules import SeededNoise
-from symphony.simulation import SceneDataset
-from symphony.simulation.search import branched_streams, realism_score
+from symphony.rollouts.search import branched_streams, realism_score
 
 AGENT = "pretrained:bc_ts_h"
 

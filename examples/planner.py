@@ -18,9 +18,9 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import SignalState
 from symphony.data.store import SegmentStore
 from symphony.evaluation.report import report
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.planner import Pose, Scenario, Traffic
-from symphony.simulation.saving import save_simulation
+from symphony.learning.demonstrations import SceneDataset
+from symphony.planners.interface import Pose, Scenario, Traffic
+from symphony.saved.saving import save_simulation
 
 STOP = (SignalState.STOP, SignalState.ARROW_STOP)
 

@@ -18,8 +18,8 @@ from symphony.collectors import with_rows
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, DrivingEnv, ObservationConfig
+from symphony.learning import SceneDataset
 from symphony.modules import ElementGroup, discrete_policy, discriminator
-from symphony.simulation import SceneDataset
 
 VALUE, DONE, TERMINATED = (("agents", name) for name in ("state_value", "done", "terminated"))
 

@@ -6,7 +6,7 @@ import torch
 
 from symphony import BCLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, observation_of, policy_network
-from symphony.simulation import SceneDataset
+from symphony.learning import SceneDataset
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 

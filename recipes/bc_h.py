@@ -7,7 +7,7 @@ import torch
 from symphony import BCLoss, GoalLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, goal_network, observation_of, policy_network
 from symphony.config.training import GOALS
-from symphony.simulation import SceneDataset
+from symphony.learning import SceneDataset
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 

@@ -8,9 +8,9 @@ from tensordict.nn import TensorDictSequential
 from symphony import DiscriminatorLoss, DistillationLoss, DrivingEnv, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, discriminator_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, with_rows
+from symphony.learning import SceneDataset, SearchReplay, with_survivors
 from symphony.modules import SeededNoise
-from symphony.simulation import SceneDataset, SearchReplay, with_survivors
-from symphony.simulation.search import branched_streams, collector_settings, pruning_rule, realism_score
+from symphony.rollouts.search import branched_streams, collector_settings, pruning_rule, realism_score
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 

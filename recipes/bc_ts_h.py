@@ -16,9 +16,9 @@ from symphony.agents import (
 )
 from symphony.collectors import BeamSearchCollector, with_rows
 from symphony.config.training import GOALS
+from symphony.learning import SceneDataset, SearchReplay, with_survivors
 from symphony.modules import SeededNoise
-from symphony.simulation import SceneDataset, SearchReplay, with_survivors
-from symphony.simulation.search import branched_streams, collector_settings, pruning_rule, realism_score
+from symphony.rollouts.search import branched_streams, collector_settings, pruning_rule, realism_score
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 

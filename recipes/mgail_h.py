@@ -10,9 +10,9 @@ from symphony.agents import Agent, discriminator_network, goal_network, observat
 from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
 from symphony.config.training import GOALS
 from symphony.envs import Displacement, DrivingEnv
+from symphony.learning import SceneDataset, SearchReplay
 from symphony.modules import SeededNoise
-from symphony.simulation import SceneDataset, SearchReplay
-from symphony.simulation.search import branched_streams, collector_settings, realism_score
+from symphony.rollouts.search import branched_streams, collector_settings, realism_score
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 

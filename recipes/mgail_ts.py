@@ -9,9 +9,9 @@ from symphony import BCLoss, DiscriminatorLoss, MGAILLoss, SegmentStore, TrainCo
 from symphony.agents import Agent, discriminator_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, with_rows
 from symphony.envs import Displacement, DrivingEnv
+from symphony.learning import SceneDataset, SearchReplay
 from symphony.modules import SeededNoise
-from symphony.simulation import SceneDataset, SearchReplay
-from symphony.simulation.search import branched_streams, collector_settings, pruning_rule, realism_score
+from symphony.rollouts.search import branched_streams, collector_settings, pruning_rule, realism_score
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 

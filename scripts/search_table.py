@@ -20,8 +20,8 @@ from torch import Tensor
 from symphony import EvaluateConfig, SegmentStore, builtin_store, evaluate, load_agent
 from symphony.envs.scene import SceneBatch
 from symphony.files import write_json
-from symphony.simulation.logged import logged
-from symphony.simulation.rollouts import Rollouts
+from symphony.learning.logged import logged
+from symphony.rollouts.unroll import Rollouts
 
 ROOT = Path(__file__).resolve().parents[1]
 AGENT, ROLLOUTS, NEAR, MOVES = "pretrained:bc_ts_h", 16, 3.0, 5.0

@@ -17,7 +17,7 @@ from hypothesis import settings
 
 from helpers_processes import serve_from_here
 from helpers_skips import LIMITS, by_kind, grown
-from symphony.data import engine
+from symphony import parallel as engine
 
 # A busy machine must not fail a test; other examples are tried each time.
 settings.register_profile("symphony", deadline=None, max_examples=30)

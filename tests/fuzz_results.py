@@ -41,8 +41,8 @@ def submission(records: Callable[[Rng, bytes], bytes]) -> Target:
 def _submission() -> Files:
     from helpers_wosac import record_rollouts, womd_record
     from symphony.data.sources.tfrecord import write_records
-    from symphony.data.submission import write_submission
-    from symphony.data.submission_meta import SubmissionMeta
+    from symphony.wosac.submission import write_submission
+    from symphony.wosac.submission_meta import SubmissionMeta
 
     meta = SubmissionMeta(
         account_name="somebody@example.org",
@@ -68,7 +68,7 @@ def _submission() -> Files:
 
 def _change_archive(rng: Rng, data: bytes) -> bytes:
     """Fields of a shard's message, its bytes, the members' names, the archive's bytes, or those of all of it."""
-    from symphony.data.sources import wosac_pb2 as pb
+    from symphony.wosac import wosac_pb2 as pb
 
     way = rng.random()
     if way < 0.1:
@@ -116,8 +116,8 @@ def _packed(data: bytes) -> bytes:
 
 
 def _check_submission(folder: Path, file: str) -> tuple[str, str]:
-    from symphony.data.submission_check import check_submission, required_agents
     from symphony.errors import DataError
+    from symphony.wosac.submission_check import check_submission, required_agents
 
     try:
         required = required_agents(folder / "a.tfrecord")
@@ -134,7 +134,7 @@ def _check_submission(folder: Path, file: str) -> tuple[str, str]:
 
 def _unfit(file: Path, required: dict[str, set[int]]) -> str:
     """What a server would refuse in a submission, said independently of the check."""
-    from symphony.data.sources import wosac_pb2 as pb
+    from symphony.wosac import wosac_pb2 as pb
 
     found: dict[str, Any] = {}
     with tarfile.open(file) as archive:
@@ -168,7 +168,7 @@ def saved_rollouts() -> Target:
 def _save(folder: Path) -> Path:
     from helpers_saved import played, random_trees
     from helpers_segments import crossing, straight_road
-    from symphony.simulation.saved_files import MANIFEST, About, RolloutWriter
+    from symphony.saved.folder import MANIFEST, About, RolloutWriter
 
     writer = RolloutWriter(
         folder / "saved", About("made", 3, {"interactive": "a"}, {"rollouts": 2}, {"checksum": "ab"})
@@ -237,7 +237,7 @@ def _read_saved(folder: Path, file: str) -> tuple[str, str]:
     from symphony.cli.view import write_view
     from symphony.errors import DataError
     from symphony.evaluation.report import report
-    from symphony.simulation.saved_files import RolloutWriter, load_rollouts
+    from symphony.saved.folder import RolloutWriter, load_rollouts
 
     place = (folder / file).parent
     try:

@@ -96,7 +96,7 @@ def _use(segment: RunSegment, folder: Path) -> None:
     from symphony.data.store import SegmentStore
     from symphony.data.store_writer import StoreWriter
     from symphony.errors import DataError
-    from symphony.simulation.demonstrations import SceneDataset
+    from symphony.learning.demonstrations import SceneDataset
 
     recipe = Preparation(get_reader("commonroad"), 0.2, 0.3, 1)
     prepared = recipe._prepared(segment, "a")

@@ -22,8 +22,8 @@ from symphony import keys
 from symphony.agents.choice import choose
 from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError
+from symphony.learning import SceneDataset
 from symphony.recipes import recipe_of, train
-from symphony.simulation import SceneDataset
 from symphony.training import Processes, Trainer, processes
 
 WORLD = 2

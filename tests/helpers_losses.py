@@ -23,8 +23,8 @@ from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.rollouts import start_states
-from symphony.simulation.search import search
+from symphony.rollouts.search import search
+from symphony.rollouts.unroll import start_states
 
 LOGGED = 3  # a search of them prunes once
 SCENES = collate(

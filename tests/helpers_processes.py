@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from symphony.data import engine
+from symphony import parallel as engine
 
 
 def serve_from_here() -> None:

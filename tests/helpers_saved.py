@@ -12,10 +12,10 @@ from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import Polylines, RunSegment
 from symphony.data.store import SegmentStore
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import driven_by
-from symphony.simulation.saved import SavedRollouts, SavedTrees, saved_rollouts
-from symphony.simulation.saved_files import About
+from symphony.learning.demonstrations import SceneDataset
+from symphony.rollouts.driving import driven_by
+from symphony.saved.folder import About
+from symphony.saved.rollouts import SavedRollouts, SavedTrees, saved_rollouts
 
 AGENT = "pretrained:bc_ts_h"
 

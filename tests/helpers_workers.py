@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from symphony.envs.scene import SceneBatch
-from symphony.simulation.rollouts import Rollouts
+from symphony.rollouts.unroll import Rollouts
 
 
 def travelled(scenes: SceneBatch, rollouts: Rollouts) -> Tensor:

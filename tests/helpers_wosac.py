@@ -10,9 +10,9 @@ import shapely
 from numpy.typing import NDArray
 
 from helpers_sources import womd_scenario
-from symphony.data.rollouts import RolloutArrays
 from symphony.data.sources import womd_pb2 as pb
-from symphony.metrics.wosac import SimulatedRollouts, WosacScenario
+from symphony.wosac.rollouts import RolloutArrays
+from symphony.wosac.scorer import SimulatedRollouts, WosacScenario
 
 Reals = NDArray[np.floating[Any]]
 ROAD = [(-200.0, -8.0, 0.0), (0.0, -8.0, 0.0), (200.0, -8.0, 0.0)]

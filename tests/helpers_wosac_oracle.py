@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from helpers_wosac import Reals, box
-from symphony.data.rollouts import RolloutArrays
 from symphony.data.sources import womd_pb2 as pb
+from symphony.wosac.rollouts import RolloutArrays
 
 Bools = NDArray[np.bool_]
 BINS = {

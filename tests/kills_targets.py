@@ -30,10 +30,10 @@ from symphony.evaluation import evaluate
 from symphony.evaluation.pictures import RolloutKeeper
 from symphony.evaluation.records import evaluation_record
 from symphony.files import write_json
+from symphony.learning import SceneDataset
 from symphony.recipes import train
-from symphony.simulation import SceneDataset
-from symphony.simulation.saved_files import About, RolloutWriter
-from symphony.simulation.saving import save_simulation
+from symphony.saved.folder import About, RolloutWriter
+from symphony.saved.saving import save_simulation
 
 AGENT = "pretrained:bc_ts_h"
 TIMES = ("seconds", "updates_per_second", "cost", "out", "path")

@@ -21,10 +21,10 @@ from symphony.envs import DrivingEnv, ObservationConfig, scene
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.records import evaluation_record, simulation_way
-from symphony.simulation.crowd import crowd_dataset
-from symphony.simulation.driving import Simulation, search_kind, simulation
-from symphony.simulation.rollouts import Rollouts
-from symphony.simulation.search import rule_score
+from symphony.rollouts.crowd import crowd_dataset
+from symphony.rollouts.driving import Simulation, search_kind, simulation
+from symphony.rollouts.search import rule_score
+from symphony.rollouts.unroll import Rollouts
 from test_search import SEGMENTS, blocked, make_agent
 
 LINES = EvaluateConfig(search="backtrack", score="rule", rollouts=4)
@@ -70,7 +70,7 @@ def test_the_batch_changes_nothing(
     whole = driven(store, [0, 1, 2, 3, 4], config)
     assert whole.steps > 1.1 * 5 * 4 * (whole.rollouts.state.shape[2] - 1)
     few = driven(store, [0, 1, 2, 3, 4], replace(config, rollouts=3))
-    monkeypatch.setattr(sys.modules["symphony.simulation.search"], "FEW", 3)
+    monkeypatch.setattr(sys.modules["symphony.rollouts.search"], "FEW", 3)
     waiting = driven(store, [0, 1, 2, 3, 4], config)
     part = driven(store, [4, 1], config)
     agents, steps = part.rollouts.state.shape[3], part.rollouts.counted.shape[2]
@@ -98,7 +98,7 @@ def test_lines_avoid_what_they_are_judged_by(store: SegmentStore) -> None:
 
 
 def test_who_begins_again_draws_goals_anew(store: SegmentStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = sys.modules["symphony.simulation.search"]
+    module = sys.modules["symphony.rollouts.search"]
     monkeypatch.setattr(module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0)))
     config = replace(LINES, score="flags", threshold=-1.0, rollouts=16)  # bad whatever happens
     none, lines, logged = (

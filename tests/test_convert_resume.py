@@ -20,9 +20,10 @@ import pytest
 
 from helpers_convert import FakeReader
 from helpers_processes import apart
+from symphony import parallel as engine
 from symphony.cli import main
 from symphony.data import convert as converting
-from symphony.data import engine, parts, store_format, unfinished
+from symphony.data import parts, store_format, unfinished
 from symphony.data.convert import convert
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError

@@ -29,14 +29,14 @@ from symphony.envs.scene import SceneBatch, collate
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.pictures import search_tree
+from symphony.learning.demonstrations import SceneDataset
 from symphony.render import plot_search
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.control import given_goals
-from symphony.simulation.crowd import Crowd, CrowdDataset, crowd_dataset
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import simulation
-from symphony.simulation.saving import save_simulation
-from symphony.simulation.world import world_of
+from symphony.rollouts.control import given_goals
+from symphony.rollouts.crowd import Crowd, CrowdDataset, crowd_dataset
+from symphony.rollouts.driving import simulation
+from symphony.saved.saving import save_simulation
+from symphony.saved.world import world_of
 
 DT = 0.2
 END = 200.0
@@ -387,8 +387,8 @@ def test_a_saved_tree_shows_who_is_there(store: SegmentStore, tmp_path: Path) ->
     "segment", [straight_road(6, seed=2), crossing(4, seed=1), crossing(4, seed=5), row(cars(2)), ring()]
 )
 def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
-    from symphony.simulation.planned import EgoPlanners
-    from symphony.simulation.planner import planner_maker
+    from symphony.planners.driver import EgoPlanners
+    from symphony.planners.interface import planner_maker
 
     graph, quiet = LaneGraph(segment.road), load_agent("constant_velocity")
     alone = scene(segment, [segment.ego], graph)

@@ -30,7 +30,7 @@ from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.evaluation import evaluate
 from symphony.modules import SeededNoise
 from symphony.recipes import train
-from symphony.simulation.rollouts import simulate, start_states
+from symphony.rollouts.unroll import simulate, start_states
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 CUDA = "cuda"

@@ -27,8 +27,8 @@ from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING
 from symphony.envs.scene import collate
 from symphony.envs.tables import Tables
 from symphony.geometry.frames import rotate
+from symphony.learning import SceneDataset
 from symphony.recipes import train
-from symphony.simulation import SceneDataset
 
 
 def scene(seed: int, others: int = 6) -> tuple[Any, ...]:

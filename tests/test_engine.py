@@ -17,11 +17,12 @@ from typing import Any
 import pytest
 
 from helpers_convert import FakeReader
-from symphony.data import engine, parts
+from symphony import parallel as engine
+from symphony.data import parts
 from symphony.data.convert import convert
-from symphony.data.engine import WorkerError, ordered_map
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
+from symphony.parallel import WorkerError, ordered_map
 
 
 def slow_square(number: int) -> int:
@@ -118,7 +119,7 @@ def test_a_worker_that_is_killed_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 
 PRELOADED = """
 import json, os, sys
-from symphony.data.engine import ordered_map
+from symphony.parallel import ordered_map
 from preloaded import what
 names = ["symphony.data.store", "numpy", "symphony.no_such_module"]
 if __name__ == "__main__":  # else workers would import it, too
@@ -193,7 +194,7 @@ def test_a_task_that_ignores_the_interrupt_ends_with_its_process(
 SCRIPT = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from symphony.data.engine import WorkerError, ordered_map
+from symphony.parallel import WorkerError, ordered_map
 from helpers_tasks import sleep_or_return
 if __name__ == "__main__":
     for pid in ordered_map(sleep_or_return, [0.0, 0.0, 30.0, 30.0, 30.0, 30.0], workers=2):

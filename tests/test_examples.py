@@ -21,9 +21,9 @@ from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.errors import DataWarning
+from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.saving import save_simulation
+from symphony.saved.saving import save_simulation
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

@@ -16,10 +16,10 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement, ObservationConfig
 from symphony.geometry import forward_speed
-from symphony.simulation import experts as module
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.experts import Experts, experts, fit_experts
-from symphony.simulation.memory import ItemCache
+from symphony.learning import experts as module
+from symphony.learning.demonstrations import SceneDataset
+from symphony.learning.experts import Experts, experts, fit_experts
+from symphony.learning.memory import ItemCache
 
 DYNAMICS = pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 

@@ -16,10 +16,10 @@ from helpers_segments import crossing, hide, straight_road
 from symphony.cli import main
 from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.data.sources.commonroad import CommonRoadReader
-from symphony.simulation.export import commonroad, to_dict
-from symphony.simulation.saved import SavedRollouts
-from symphony.simulation.saved_files import About, save_rollouts
-from symphony.simulation.world import World, world_of
+from symphony.saved.export import commonroad, to_dict
+from symphony.saved.folder import About, save_rollouts
+from symphony.saved.rollouts import SavedRollouts
+from symphony.saved.world import World, world_of
 
 
 def read_back(saved: SavedRollouts, rollout: int, path: Path) -> RunSegment:

@@ -25,8 +25,8 @@ from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Syst
 from symphony.collectors.rules import group_members, prune
 from symphony.envs import DrivingEnv, ObservationConfig
 from symphony.modules import SeededNoise
-from symphony.simulation.background import CarFollower
-from symphony.simulation.rollouts import simulate, start_states
+from symphony.rollouts.background import CarFollower
+from symphony.rollouts.unroll import simulate, start_states
 
 FEW = 7  # constants that are made once, in however many steps
 

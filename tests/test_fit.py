@@ -13,7 +13,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.sources import get_reader
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle
-from symphony.simulation.experts import experts
+from symphony.learning.experts import experts
 
 
 def final_errors(segments: list[RunSegment]) -> torch.Tensor:

@@ -14,9 +14,9 @@ import torch
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement
-from symphony.simulation import SceneDataset
-from symphony.simulation.experts import Experts
-from symphony.simulation.kept import VERSION
+from symphony.learning import SceneDataset
+from symphony.learning.experts import Experts
+from symphony.learning.kept import VERSION
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_what_was_kept_is_what_was_fitted(
 ) -> None:
     first = SceneDataset(SegmentStore(store), 2, dynamics, routes=routes).experts.many([0, 1, 2])
     assert len(files(store)) == 3
-    monkeypatch.setattr("symphony.simulation.demonstrations.fit_experts", None)  # nothing is fitted again
+    monkeypatch.setattr("symphony.learning.demonstrations.fit_experts", None)  # nothing is fitted again
     again = SceneDataset(SegmentStore(store), 2, dynamics, routes=routes).experts.many([2, 0, 1])
     for a, b in zip(first, [again[1], again[2], again[0]], strict=True):
         same(a, b)

@@ -26,11 +26,11 @@ from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError
+from symphony.learning import SearchReplay
+from symphony.learning.demonstrations import SceneDataset
+from symphony.learning.logged import logged
 from symphony.recipes import train
 from symphony.render import curves
-from symphony.simulation import SearchReplay
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.logged import logged
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 

@@ -23,9 +23,9 @@ from symphony.data.store_writer import StoreWriter
 from symphony.envs import Displacement
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate
+from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import curves
-from symphony.simulation.demonstrations import SceneDataset
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 

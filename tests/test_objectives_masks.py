@@ -22,8 +22,8 @@ from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import DrivingEnv, collate, scene
+from symphony.learning.demonstrations import SceneDataset
 from symphony.objectives import BCLoss, DiscriminatorLoss, DistillationLoss, GoalLoss, MGAILLoss
-from symphony.simulation.demonstrations import SceneDataset
 
 BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.NOISE_PLAN}
 """What depends on how batches are put together; the first three must be there, the last is optional."""

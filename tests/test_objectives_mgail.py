@@ -26,7 +26,7 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.keys import ACTION, NOISE, OBJECTS, OWN, POINTS, SCORE, STATE, VALID
 from symphony.modules import NoiseSampler, discriminator, displacement_policy
 from symphony.objectives import MGAILLoss
-from symphony.simulation.search import ENDED, search
+from symphony.rollouts.search import ENDED, search
 from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]

@@ -24,12 +24,12 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
+from symphony.learning.demonstrations import SceneDataset
+from symphony.learning.personas import PersonaScale, styles
 from symphony.recipes import train
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.control import given_personas
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import simulated
-from symphony.simulation.personas import PersonaScale, styles
+from symphony.rollouts.control import given_personas
+from symphony.rollouts.driving import simulated
 
 OWN = AgentConfig(num_points=12, hidden=8, persona=True)
 

@@ -17,8 +17,8 @@ from symphony.envs import Bicycle, Displacement
 from symphony.envs.dynamics import bicycle_step
 from symphony.envs.observation import ObservationConfig
 from symphony.geometry.frames import rotate, wrap
-from symphony.simulation import SceneDataset, perturbation
-from symphony.simulation.perturbation import displaced, perturbed, way_back
+from symphony.learning import SceneDataset, perturbation
+from symphony.learning.perturbation import displaced, perturbed, way_back
 
 DT, LENGTH = 0.2, torch.tensor([4.5], dtype=torch.float64)
 

@@ -27,10 +27,9 @@ from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import WHEELBASE
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import planned_trees, simulation, spread_runs
-from symphony.simulation.planned import EgoPlanners
-from symphony.simulation.planner import (
+from symphony.learning.demonstrations import SceneDataset
+from symphony.planners.driver import EgoPlanners
+from symphony.planners.interface import (
     MAX_ACCELERATION,
     MAX_BRAKING,
     Control,
@@ -39,8 +38,9 @@ from symphony.simulation.planner import (
     Traffic,
     planner_maker,
 )
-from symphony.simulation.saved_files import RolloutFolder, load_rollouts
-from symphony.simulation.saving import save_simulation
+from symphony.rollouts.driving import planned_trees, simulation, spread_runs
+from symphony.saved.folder import RolloutFolder, load_rollouts
+from symphony.saved.saving import save_simulation
 
 AGENT = "pretrained:bc_ts_h"
 

@@ -31,12 +31,12 @@ from symphony.evaluation.planners import (
     winners,
     without_score,
 )
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.planner import Control, Pose, Scenario, Traffic, checked_plan, planner_maker
-from symphony.simulation.planner_calls import answer
-from symphony.simulation.planner_view import Observation
-from symphony.simulation.saved_files import RolloutFolder, load_rollouts
-from symphony.simulation.saving import save_simulation
+from symphony.learning.demonstrations import SceneDataset
+from symphony.planners.calls import answer
+from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan, planner_maker
+from symphony.planners.view import Observation
+from symphony.saved.folder import RolloutFolder, load_rollouts
+from symphony.saved.saving import save_simulation
 
 AGENT = "pretrained:bc_ts_h"
 

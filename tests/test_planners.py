@@ -15,11 +15,11 @@ from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment, SignalState
 from symphony.envs.scene import scene
+from symphony.planners.driver import EgoPlanners
+from symphony.planners.included import RouteLine
+from symphony.planners.interface import planner_maker
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.driving import Simulation, simulation
-from symphony.simulation.planned import EgoPlanners
-from symphony.simulation.planner import planner_maker
-from symphony.simulation.planners import RouteLine
+from symphony.rollouts.driving import Simulation, simulation
 
 LENGTH = CAR[0]
 LIMIT = 14.0

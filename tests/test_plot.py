@@ -26,13 +26,13 @@ from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, Se
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
+from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import SearchTree, plot_genealogy, plot_search, plot_tree
 from symphony.render.genealogy import rows
 from symphony.render.style import AGENT_COLORS, new_figure
 from symphony.render.tree import FATES, STROKES, score_colors
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import simulated
+from symphony.rollouts.driving import simulated
 
 EVERY, BRANCHES, STEPS = 2, 4, 5
 PARENTS = np.array([[0, 1, 0, 1], [2, 0, 2, 3], [3, 3, 2, 2]])

@@ -26,11 +26,11 @@ from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.evaluation.pictures import clip_of
+from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import Clip, curves
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import playback, simulated
-from symphony.simulation.rollouts import Rollouts
+from symphony.rollouts.driving import playback, simulated
+from symphony.rollouts.unroll import Rollouts
 from symphony.training.logging import read_metrics
 from symphony.training.previews import QUANTILES, ROLLOUTS, Preview, samples_of
 

@@ -23,9 +23,9 @@ NOT_NEEDED = (
     "symphony.evaluation",
     "symphony.metrics",
     "symphony.render",
-    "symphony.simulation.planner",
-    "symphony.simulation.rollouts",
-    "symphony.simulation.search",
+    "symphony.planners.interface",
+    "symphony.rollouts.unroll",
+    "symphony.rollouts.search",
     "matplotlib.pyplot",
     "wandb",
 )
@@ -52,7 +52,17 @@ def test_public_names_are_there_and_documented() -> None:
 
 def test_names_of_packages_are_theirs() -> None:
     """Each is imported when it is asked for, from where the package says."""
-    for room in ("agents", "config", "envs", "modules", "objectives", "roadgraph", "simulation", "training"):
+    for room in (
+        "agents",
+        "config",
+        "envs",
+        "modules",
+        "learning",
+        "objectives",
+        "roadgraph",
+        "rollouts",
+        "training",
+    ):
         package = importlib.import_module(f"symphony.{room}")
         for name in package.__all__:
             assert not inspect.ismodule(getattr(package, name)), f"{package.__name__}.{name}"

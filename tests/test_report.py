@@ -34,10 +34,10 @@ from symphony.evaluation.report import Report, add_segment, report, total_number
 from symphony.geometry import box_gap
 from symphony.metrics import CollisionKind
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.driving import playback
-from symphony.simulation.saved import SavedRollouts, saved_rollouts
-from symphony.simulation.saved_files import About, RolloutWriter, save_rollouts
-from symphony.simulation.world import World, world_of
+from symphony.rollouts.driving import playback
+from symphony.saved.folder import About, RolloutWriter, save_rollouts
+from symphony.saved.rollouts import SavedRollouts, saved_rollouts
+from symphony.saved.world import World, world_of
 
 ABOUT = About("made")
 DT = 0.2

@@ -21,17 +21,17 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import Polylines, RunSegment, content_hash
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.saved import SavedRollouts
-from symphony.simulation.saved_files import (
+from symphony.learning.demonstrations import SceneDataset
+from symphony.saved.folder import (
     About,
     RolloutFolder,
     RolloutWriter,
     load_rollouts,
     save_rollouts,
 )
-from symphony.simulation.saved_tensors import KEY, read_tensors, tensors_of
-from symphony.simulation.saving import save_simulation
+from symphony.saved.rollouts import SavedRollouts
+from symphony.saved.saving import save_simulation
+from symphony.saved.tensors import KEY, read_tensors, tensors_of
 
 ABOUT = About("made", 3, {"interactive": "made", "others": "playback"}, {"rollouts": 2}, {"checksum": "ab"})
 

@@ -28,12 +28,12 @@ from symphony.envs import Bicycle, DrivingEnv, scene
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
+from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
-from symphony.simulation import simulate
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import simulated, simulation
-from symphony.simulation.rollouts import Rollouts, draw_goals, rollouts_of
-from symphony.simulation.search import ENDED, flag_score, search
+from symphony.rollouts import simulate
+from symphony.rollouts.driving import simulated, simulation
+from symphony.rollouts.search import ENDED, flag_score, search
+from symphony.rollouts.unroll import Rollouts, draw_goals, rollouts_of
 
 EVERY = 2
 SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=EVERY)
@@ -300,7 +300,7 @@ def test_leaves_are_chosen_in_the_period_in_which_a_scene_ends(
         seen.append(named["last_period"])
         return beam_search(*given, **named)
 
-    monkeypatch.setattr("symphony.simulation.search.beam_search", spy)
+    monkeypatch.setattr("symphony.rollouts.search.beam_search", spy)
     scenes = dataset.scenes(range(4))
     simulation(searching(agent, prune_every=every), scenes, EvaluateConfig(rollouts=4, trees=2))
     assert len(scenes.last_step.unique()) > 1
@@ -383,7 +383,7 @@ def goals_of(
         return found[-1]
 
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["symphony.simulation.rollouts"], "draw_goals", noted)
+        patch.setattr(sys.modules["symphony.rollouts.unroll"], "draw_goals", noted)
         state = simulated(agent, scenes, config).state
     assert len(found) == 1
     return found[0], state

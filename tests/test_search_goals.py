@@ -18,8 +18,8 @@ from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, Evaluat
 from symphony.envs import DrivingEnv, collate, driving, scene
 from symphony.envs.scene import SceneBatch
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.driving import Simulation, simulation
-from symphony.simulation.rollouts import start_states
+from symphony.rollouts.driving import Simulation, simulation
+from symphony.rollouts.unroll import start_states
 
 BRANCHES = 8
 

@@ -15,9 +15,9 @@ from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
+from symphony.learning import SceneDataset
 from symphony.recipes import train
-from symphony.simulation import SceneDataset
-from symphony.simulation.driving import simulated
+from symphony.rollouts.driving import simulated
 
 
 @contextmanager

@@ -17,8 +17,8 @@ from symphony.data.store_writer import StoreWriter
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
+from symphony.learning import SceneDataset
 from symphony.recipes import train
-from symphony.simulation import SceneDataset
 
 
 def store_at(folder: Path, dt: float) -> Path:

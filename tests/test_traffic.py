@@ -13,7 +13,7 @@ from symphony.envs.edge import leaving
 from symphony.envs.objects import Objects
 from symphony.envs.traffic import entering
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.background import CarFollower
+from symphony.rollouts.background import CarFollower
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_on_a_device_the_same_are_moved(monkeypatch: pytest.MonkeyPatch) -> None
     start = env.start(torch.tensor([[0, 1], [1, 0], [0, 0]]))
     follow = CarFollower(env)
     found = follow(start.clone())[keys.BACKGROUND]
-    monkeypatch.setattr("symphony.simulation.background.on_host", lambda _: False)
+    monkeypatch.setattr("symphony.rollouts.background.on_host", lambda _: False)
     there = follow(start.clone())[keys.BACKGROUND]
     torch.testing.assert_close(there, found, rtol=0, atol=1e-5)
     still = (there == start[keys.STATE]).all(-1)

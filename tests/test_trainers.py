@@ -33,12 +33,12 @@ from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
+from symphony.learning.demonstrations import SceneDataset
+from symphony.learning.experts import experts
 from symphony.metrics import collisions, offroad
 from symphony.objectives import GoalLoss
 from symphony.recipes import train
-from symphony.simulation import simulate
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.experts import experts
+from symphony.rollouts import simulate
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 from symphony.training.logging import read_metrics
 

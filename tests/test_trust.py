@@ -23,9 +23,9 @@ from symphony.agents.included import pretrained_folder
 from symphony.cli import main
 from symphony.data.builtin import builtin_store
 from symphony.data.npz import read_npz
-from symphony.data.rollouts import read_rollouts
-from symphony.data.submission_check import _encoded, check_submission
 from symphony.errors import ConfigError, DataError, DataWarning, SymphonyError
+from symphony.wosac.rollouts import read_rollouts
+from symphony.wosac.submission_check import _encoded, check_submission
 
 NOTES = """
 from pathlib import Path

@@ -23,12 +23,12 @@ from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.pictures import search_tree
 from symphony.evaluation.planners import check_crowds, winners
+from symphony.planners.calls import answer, plans_of
 from symphony.recipes import train
-from symphony.simulation.crowd import crowd_dataset
-from symphony.simulation.identity import source_of
-from symphony.simulation.planner_calls import answer, plans_of
-from symphony.simulation.saved_files import load_rollouts
-from symphony.simulation.saving import save_simulation
+from symphony.rollouts.crowd import crowd_dataset
+from symphony.saved.folder import load_rollouts
+from symphony.saved.identity import source_of
+from symphony.saved.saving import save_simulation
 
 PLAN = "def plan(seen):\n    return {}\n"
 

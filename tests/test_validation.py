@@ -26,8 +26,8 @@ from symphony.envs import Bicycle
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.evaluation.evaluator import evaluate_dataset
+from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
-from symphony.simulation.demonstrations import SceneDataset
 from symphony.training.logging import read_metrics
 from symphony.training.validation import METRICS
 

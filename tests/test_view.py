@@ -20,8 +20,8 @@ from symphony.cli import main
 from symphony.errors import DataError
 from symphony.evaluation.report import Report, add_segment
 from symphony.render.viewer import Event, packed, unpacked, view_page
-from symphony.simulation.saved import SavedRollouts
-from symphony.simulation.saved_files import About, save_rollouts
+from symphony.saved.folder import About, save_rollouts
+from symphony.saved.rollouts import SavedRollouts
 
 ABOUT = About("made", settings={"note": "</script><b>"})
 

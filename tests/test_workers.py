@@ -30,12 +30,12 @@ from symphony.envs import Bicycle
 from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import EvaluatedBatch, Evaluation, evaluate
 from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
-from symphony.simulation import saving
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.finite import NotFiniteError
-from symphony.simulation.saved_files import About, RolloutWriter
-from symphony.simulation.saving import save_simulation
-from symphony.simulation.workers import _done, batches, naming, segments_together, shared
+from symphony.learning.demonstrations import SceneDataset
+from symphony.rollouts.finite import NotFiniteError
+from symphony.rollouts.workers import _done, batches, naming, segments_together, shared
+from symphony.saved import saving
+from symphony.saved.folder import About, RolloutWriter
+from symphony.saved.saving import save_simulation
 from test_engine import gone
 from test_finite import Spoiled
 

@@ -17,10 +17,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from helpers_wosac import made_rollouts, made_scenario
-from symphony.data.submission import FIELDS
-from symphony.data.submission_check import check_submission
 from symphony.errors import DataError
-from symphony.metrics.wosac import SimulatedRollouts, score
+from symphony.wosac.scorer import SimulatedRollouts, score
+from symphony.wosac.submission import FIELDS
+from symphony.wosac.submission_check import check_submission
 from test_wosac_submission import AGENTS, NAMES, Shard, good_shards, named, pack, problems
 
 ROLLOUT, AGENT, STATE = st.integers(0, 31), st.integers(0, 2), st.sampled_from(sorted(FIELDS.values()))

@@ -9,7 +9,7 @@ import torch
 
 from helpers_device_numbers import host, numbered
 from helpers_wosac import made_rollouts, made_scenario
-from symphony.metrics.wosac import CHALLENGES, compute_features, score
+from symphony.wosac.scorer import CHALLENGES, compute_features, score
 
 
 def test_the_device_refuses_what_a_card_refuses() -> None:

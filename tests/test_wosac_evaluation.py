@@ -17,19 +17,19 @@ from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig, WosacSettings
 from symphony.data.resample import resample
-from symphony.data.rollouts import STATES, RolloutArrays
 from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import WOSAC, compare
 from symphony.evaluation.entries import Entry
 from symphony.evaluation.formats import as_markdown
-from symphony.evaluation.passing import order_of, passing_gaps, passing_pairs
-from symphony.evaluation.wosac import THINNED, _thinned, evaluate_wosac, simulated_how
-from symphony.evaluation.wosac_segments import log_playback, wosac_window
-from symphony.evaluation.wosac_table import COLUMNS, how_in_words, read_wosac, wosac_grid
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.wosac import _driven, constant_velocity, future_log, history_only, wosac_rollouts
+from symphony.wosac.evaluate import THINNED, _thinned, evaluate_wosac, simulated_how
+from symphony.wosac.passing import order_of, passing_gaps, passing_pairs
+from symphony.wosac.rollouts import STATES, RolloutArrays
+from symphony.wosac.segments import log_playback, wosac_window
+from symphony.wosac.simulate import _driven, constant_velocity, future_log, history_only, wosac_rollouts
+from symphony.wosac.table import COLUMNS, how_in_words, read_wosac, wosac_grid
 from test_context import CASES, scene
 
 AGENT = "pretrained:bc_ts_h"
@@ -65,7 +65,7 @@ def test_goals_of_the_log_are_those_that_were_taken(monkeypatch: pytest.MonkeyPa
         seen.append((scenes, config))
         raise DataError("enough")
 
-    monkeypatch.setattr("symphony.simulation.wosac.simulation", stop)
+    monkeypatch.setattr("symphony.wosac.simulate.simulation", stop)
     agent = load_agent(AGENT)
     for one in (None, log):
         with pytest.raises(DataError, match="enough"):

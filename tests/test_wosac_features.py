@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from helpers_wosac import ROAD, edge_distance, made_rollouts, made_scenario, rounded_gap
 from symphony.errors import DataError
-from symphony.metrics.wosac import (
+from symphony.wosac.scorer import (
     Lines,
     SimulatedRollouts,
     WosacFeatures,
@@ -23,9 +23,9 @@ from symphony.metrics.wosac import (
     compute_features,
     kinematics,
 )
-from symphony.metrics.wosac.interaction import distance_to_nearest, time_to_collision
-from symphony.metrics.wosac.lights import Lanes, Signals, red_light_violations
-from symphony.metrics.wosac.road import Edges, distance_to_road_edge, signed_distance_to_edges
+from symphony.wosac.scorer.interaction import distance_to_nearest, time_to_collision
+from symphony.wosac.scorer.lights import Lanes, Signals, red_light_violations
+from symphony.wosac.scorer.road import Edges, distance_to_road_edge, signed_distance_to_edges
 
 
 def every(features: WosacFeatures) -> dict[str, NDArray[Any]]:

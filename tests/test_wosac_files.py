@@ -12,13 +12,13 @@ import pytest
 
 from helpers_wosac import record_rollouts, womd_record
 from symphony.cli import main
-from symphony.cli.wosac_files import score_files
-from symphony.data.rollouts import RolloutArrays, read_rollouts, write_rollouts
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.sources.wosac import read_scenario_payloads, scenario_arrays, simulated_ids
 from symphony.errors import DataError
-from symphony.metrics.wosac import CHALLENGE_2024, SimulatedRollouts, WosacScenario, score
+from symphony.wosac.files import score_files
+from symphony.wosac.records import read_scenario_payloads, scenario_arrays, simulated_ids
+from symphony.wosac.rollouts import RolloutArrays, read_rollouts, write_rollouts
+from symphony.wosac.scorer import CHALLENGE_2024, SimulatedRollouts, WosacScenario, score
 
 NAMES = ("aaaa", "bbbb", "cccc")
 
@@ -159,7 +159,7 @@ def test_scenarios_are_read_as_they_are_scored(tmp_path: Path, monkeypatch: pyte
             drawn += 1
             yield packed
 
-    monkeypatch.setattr("symphony.data.sources.wosac.read_scenario_payloads", counted)
+    monkeypatch.setattr("symphony.wosac.files.read_scenario_payloads", counted)
     ahead = []
     found, left_out = score_files(
         tmp_path / "all.tfrecord",

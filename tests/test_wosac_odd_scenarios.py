@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from helpers_wosac_oracle import BINS, FLAGS, oracle_features, oracle_scores
-from symphony.data.rollouts import RolloutArrays
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.wosac import parse_scenario, scenario_arrays
-from symphony.metrics.wosac import (
+from symphony.wosac.records import parse_scenario, scenario_arrays
+from symphony.wosac.rollouts import RolloutArrays
+from symphony.wosac.scorer import (
     CHALLENGES,
     SimulatedRollouts,
     WosacFeatures,

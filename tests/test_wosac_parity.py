@@ -11,9 +11,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from symphony.data.rollouts import read_rollouts
-from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, scenario_arrays
-from symphony.metrics.wosac import (
+from symphony.wosac.records import parse_scenario, read_scenario_payloads, scenario_arrays
+from symphony.wosac.rollouts import read_rollouts
+from symphony.wosac.scorer import (
     CHALLENGES,
     Lines,
     SimulatedRollouts,
@@ -24,18 +24,18 @@ from symphony.metrics.wosac import (
     kinematics,
     score_features,
 )
-from symphony.metrics.wosac.boxes import corners, rectangle_gap
-from symphony.metrics.wosac.config import Bernoulli, FlagComponent, Histogram, NumberComponent
-from symphony.metrics.wosac.estimators import (
+from symphony.wosac.scorer.boxes import corners, rectangle_gap
+from symphony.wosac.scorer.config import Bernoulli, FlagComponent, Histogram, NumberComponent
+from symphony.wosac.scorer.estimators import (
     bernoulli_log_likelihood,
     bin_edges,
     histogram_log_likelihood,
     kernel_log_likelihood,
 )
-from symphony.metrics.wosac.interaction import distance_to_nearest, time_to_collision
-from symphony.metrics.wosac.lights import Lanes, Signals, red_light_violations
-from symphony.metrics.wosac.road import Edges, distance_to_road_edge, signed_distance_to_edges
-from symphony.metrics.wosac.scoring import log_likelihoods
+from symphony.wosac.scorer.interaction import distance_to_nearest, time_to_collision
+from symphony.wosac.scorer.lights import Lanes, Signals, red_light_violations
+from symphony.wosac.scorer.road import Edges, distance_to_road_edge, signed_distance_to_edges
+from symphony.wosac.scorer.scoring import log_likelihoods
 
 pytestmark = pytest.mark.samples
 

@@ -22,20 +22,20 @@ from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import WosacSettings
 from symphony.data.resample import resample, wrap
-from symphony.data.rollouts import STATES, RolloutArrays
 from symphony.data.segment import AgentType, RunSegment, SignalState, validate
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
 from symphony.data.sources.womd import scenario_to_segment
-from symphony.data.sources.wosac import parse_scenario, read_scenario_payloads, scenario_arrays
 from symphony.data.store import SegmentStore
-from symphony.data.submission_check import check_submission, required_agents
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.wosac import evaluate_wosac
-from symphony.evaluation.wosac_segments import log_playback, wosac_scenario, wosac_window
-from symphony.evaluation.wosac_table import read_wosac, wosac_grid
-from symphony.metrics.wosac import SimulatedRollouts, StepFeatures, WosacScenario, compute_features, score
-from symphony.simulation.wosac import between_decisions, constant_velocity, history_only, wosac_rollouts
+from symphony.wosac.evaluate import evaluate_wosac
+from symphony.wosac.records import parse_scenario, read_scenario_payloads, scenario_arrays
+from symphony.wosac.rollouts import STATES, RolloutArrays
+from symphony.wosac.scorer import SimulatedRollouts, StepFeatures, WosacScenario, compute_features, score
+from symphony.wosac.segments import log_playback, wosac_scenario, wosac_window
+from symphony.wosac.simulate import between_decisions, constant_velocity, history_only, wosac_rollouts
+from symphony.wosac.submission_check import check_submission, required_agents
+from symphony.wosac.table import read_wosac, wosac_grid
 
 AGENT = "pretrained:bc_ts_h"
 PLAIN = WosacSettings(search="none")
@@ -140,7 +140,7 @@ def test_vehicles_are_driven_and_others_keep_their_velocity(settings: WosacSetti
 
 
 def test_trees_are_independent_however_many_are_searched_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("symphony.simulation.wosac.AT_ONCE", 12 * 2 * 3)
+    monkeypatch.setattr("symphony.wosac.simulate.AT_ONCE", 12 * 2 * 3)
     found = wosac_rollouts(small(), mixed_segment(), replace(SEARCH, horizon=2.0))
     assert found.x.shape == (32, 4, 20)
     assert len(np.unique(found.x[:, 1:, -1], axis=0)) == 32

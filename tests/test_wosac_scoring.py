@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from helpers_wosac import made_rollouts, made_scenario
 from symphony.errors import ConfigError, DataError
-from symphony.metrics.wosac import (
+from symphony.wosac.scorer import (
     CHALLENGE_2024,
     CHALLENGE_2025,
     CHALLENGES,
@@ -25,8 +25,8 @@ from symphony.metrics.wosac import (
     score,
     score_features,
 )
-from symphony.metrics.wosac.config import BUCKETS, Bernoulli, Histogram
-from symphony.metrics.wosac.estimators import (
+from symphony.wosac.scorer.config import BUCKETS, Bernoulli, Histogram
+from symphony.wosac.scorer.estimators import (
     bernoulli_log_likelihood,
     bin_of,
     histogram_log_likelihood,

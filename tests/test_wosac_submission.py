@@ -18,13 +18,13 @@ from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.cli.wosac_submit import simulated_scenarios
 from symphony.config import WosacSettings
-from symphony.data.rollouts import RolloutArrays, read_rollouts
-from symphony.data.sources import wosac_pb2 as pb
 from symphony.data.sources.tfrecord import write_records
-from symphony.data.submission import meta_message, scenario_message, shard_name, write_submission
-from symphony.data.submission_check import check_submission, required_agents
-from symphony.data.submission_meta import SubmissionMeta
 from symphony.errors import ConfigError, DataError
+from symphony.wosac import wosac_pb2 as pb
+from symphony.wosac.rollouts import RolloutArrays, read_rollouts
+from symphony.wosac.submission import meta_message, scenario_message, shard_name, write_submission
+from symphony.wosac.submission_check import check_submission, required_agents
+from symphony.wosac.submission_meta import SubmissionMeta
 
 META = SubmissionMeta(
     account_name="somebody@example.org",

@@ -19,7 +19,7 @@ from symphony.data.builtin import builtin_store
 from symphony.errors import DataError
 from symphony.files import Lock, lock_file
 from symphony.recipes import train
-from symphony.simulation.saved_files import RolloutWriter, load_rollouts, save_rollouts
+from symphony.saved.folder import RolloutWriter, load_rollouts, save_rollouts
 
 STORE = ["--data", str(builtin_store("test"))]
 SHORT = ["--segments", "0", "--duration", "1"]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from symphony.objectives.goal import GoalLoss
     from symphony.objectives.mgail import MGAILLoss
     from symphony.recipes import train
-    from symphony.simulation.rollouts import simulate
+    from symphony.rollouts.unroll import simulate
 
 __all__ = [
     "BCLoss",

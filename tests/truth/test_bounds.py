@@ -26,7 +26,7 @@ from symphony.evaluation.planners import winners
 from symphony.evaluation.report import Report, add_segment, total_numbers
 from symphony.metrics import RolloutMetrics
 from symphony.metrics.intervals import beta_quantile, binomial_interval, t_quantile, zero_bound
-from symphony.simulation.saved_files import About, save_rollouts
+from symphony.saved.folder import About, save_rollouts
 
 
 @given(st.integers(1, 5000), st.floats(0, 1), st.sampled_from([0.5, 0.9, 0.95, 0.999]))

@@ -44,7 +44,7 @@ class Agent:
         goals: draws routes from first states; None for agents that follow none.
         discriminator: scores states; None for agents trained without.
         rule: name of what drives in place of the policy, along the routes of the log (see
-            ``symphony.simulation.driving.RULES``); None for none.
+            ``symphony.rollouts.driving.RULES``); None for none.
     """
 
     name: str

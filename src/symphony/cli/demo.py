@@ -47,8 +47,8 @@ class Demo:
         from symphony.data.builtin import builtin_store
         from symphony.data.store import SegmentStore
         from symphony.evaluation.pictures import ClipKeeper, draw_clips
+        from symphony.learning.demonstrations import evenly_spaced
         from symphony.recipes import train
-        from symphony.simulation.demonstrations import evenly_spaced
 
         console, began = Console(), time.perf_counter()
         run, numbers = self.out / "bc_h", self.out / "metrics.json"

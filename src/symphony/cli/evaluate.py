@@ -78,17 +78,17 @@ class Evaluate:
             self._evaluate_planner()
             return
         if self.config.workers > 1 and self.config.engine == "local":
-            from symphony.data.engine import get_ready
+            from symphony.parallel import get_ready
 
-            get_ready(["symphony.simulation.workers", "symphony.evaluation.evaluator"])
+            get_ready(["symphony.rollouts.workers", "symphony.evaluation.evaluator"])
         from symphony.agents import load_agent
         from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
         from symphony.evaluation.records import evaluation_record, keep_evaluation
-        from symphony.simulation.demonstrations import evenly_spaced
-        from symphony.simulation.identity import identity_of
-        from symphony.simulation.saved_files import About, RolloutWriter
-        from symphony.simulation.saving import plain_settings
+        from symphony.learning.demonstrations import evenly_spaced
+        from symphony.saved.folder import About, RolloutWriter
+        from symphony.saved.identity import identity_of
+        from symphony.saved.saving import plain_settings
 
         if self.figure is not None:
             from symphony.evaluation.pictures import check_picture  # with matplotlib, which takes a while
@@ -98,7 +98,7 @@ class Evaluate:
         store, config = SegmentStore(self.data), self.config
         chosen = segment_indices(store, self.segments)
         if self.metrics:
-            from symphony.evaluation.wosac import scorable
+            from symphony.wosac.evaluate import scorable
 
             future = WosacSettings.of(config).future
             scorable(store, chosen or range(len(store)), future)  # or complain now, not after the work
@@ -153,7 +153,7 @@ class Evaluate:
     ) -> dict[str, Any]:
         """Parts of the record with the WOSAC score."""
         from symphony.cli.wosac_evaluate import print_wosac
-        from symphony.evaluation.wosac import evaluate_wosac, wosac_parts
+        from symphony.wosac.evaluate import evaluate_wosac, wosac_parts
 
         with segments_bar(f"WOSAC score of {agent.name}") as advance:
             found = evaluate_wosac(agent, store, items, settings, self.wosac_config, advance)

@@ -32,8 +32,8 @@ class Export:
 
         from symphony.errors import ConfigError
         from symphony.files import Lock, naming, write_file
-        from symphony.simulation.export import commonroad, to_dict
-        from symphony.simulation.saved_files import file_stem, load_rollouts
+        from symphony.saved.export import commonroad, to_dict
+        from symphony.saved.folder import file_stem, load_rollouts
 
         folder = load_rollouts(self.folder)
         out = self.folder / "export" if self.out is None else self.out

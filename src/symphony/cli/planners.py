@@ -43,7 +43,7 @@ class Planners:
         """Evaluate what is not evaluated yet, and write the table."""
         from symphony.evaluation.planners import check_crowds, planner_record, read_planner_record
         from symphony.files import write_file
-        from symphony.simulation.saved_files import load_rollouts
+        from symphony.saved.folder import load_rollouts
 
         records = [
             planner_record(load_rollouts(path)) if path.is_dir() else read_planner_record(path)

@@ -47,7 +47,7 @@ class Tree:
         from symphony.evaluation.pictures import search_tree
         from symphony.render import plot_search
         from symphony.render.style import picture_path
-        from symphony.simulation.crowd import crowd_dataset
+        from symphony.rollouts.crowd import crowd_dataset
 
         picture_path(self.out)
         agent, config = load_agent(self.agent, self.config.device, trust_code=self.trust_code), self.config
@@ -91,8 +91,8 @@ class Rollouts:
         from symphony.data.store import SegmentStore
         from symphony.evaluation.evaluator import evaluate_dataset
         from symphony.evaluation.pictures import ClipKeeper, check_picture, draw_clips
-        from symphony.simulation.crowd import crowd_dataset
-        from symphony.simulation.demonstrations import evenly_spaced
+        from symphony.learning.demonstrations import evenly_spaced
+        from symphony.rollouts.crowd import crowd_dataset
 
         check_picture(self.out)
         agent, store, config = (
@@ -215,9 +215,9 @@ class Routes:
         from symphony.data.selection import interactive_choice
         from symphony.data.store import SegmentStore
         from symphony.envs.routes import route_table
+        from symphony.learning.demonstrations import evenly_spaced
         from symphony.render import plot_grid, plot_routes
         from symphony.roadgraph import LaneGraph
-        from symphony.simulation.demonstrations import evenly_spaced
 
         store = SegmentStore(self.data)
         if len(store) == 0:

@@ -13,7 +13,7 @@ from symphony.errors import AllFailedError
 
 if TYPE_CHECKING:
     from symphony.evaluation.report import Report as Found
-    from symphony.simulation.saved_files import RolloutFolder
+    from symphony.saved.folder import RolloutFolder
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Report:
         from rich.table import Table
 
         from symphony.files import Lock, naming
-        from symphony.simulation.saved_files import load_rollouts
+        from symphony.saved.folder import load_rollouts
 
         folder, out = load_rollouts(self.folder), self.folder if self.out is None else self.out
         with naming(out):

@@ -15,7 +15,7 @@ from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import AllFailedError, ConfigError
 
 if TYPE_CHECKING:
-    from symphony.simulation.saved_files import RolloutFolder
+    from symphony.saved.folder import RolloutFolder
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Simulate:
         from symphony.cli.evaluate import segments_bar
         from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
-        from symphony.simulation.crowd import crowd_dataset
-        from symphony.simulation.demonstrations import evenly_spaced
-        from symphony.simulation.driving import spread_runs
-        from symphony.simulation.saving import save_simulation
+        from symphony.learning.demonstrations import evenly_spaced
+        from symphony.rollouts.crowd import crowd_dataset
+        from symphony.rollouts.driving import spread_runs
+        from symphony.saved.saving import save_simulation
 
         agent, store, config = (
             load_agent(self.agent or self.agents, self.config.device, trust_code=self.trust_code),

@@ -13,7 +13,7 @@ from symphony.cli.tables import short_name
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.simulation.saved_files import RolloutFolder
+    from symphony.saved.folder import RolloutFolder
 
 PANELS = 6
 """Run segments in a picture or an animation, where none are named."""
@@ -46,7 +46,7 @@ class View:
         from rich.console import Console
 
         from symphony.files import lock_file
-        from symphony.simulation.saved_files import load_rollouts
+        from symphony.saved.folder import load_rollouts
 
         folder = load_rollouts(self.folder)
         out = self.folder / "view.html" if self.out is None else self.out

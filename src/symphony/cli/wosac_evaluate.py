@@ -15,7 +15,7 @@ from symphony.cli.wosac_score import print_left_out
 from symphony.config import WosacSettings
 
 if TYPE_CHECKING:
-    from symphony.evaluation.wosac import WosacEvaluation
+    from symphony.wosac.evaluate import WosacEvaluation
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Evaluate:
         from symphony.cli.evaluate import segments_bar
         from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
-        from symphony.evaluation.wosac import evaluate_wosac
+        from symphony.wosac.evaluate import evaluate_wosac
 
         agent = load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
         store = SegmentStore(self.data)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from symphony.cli.tables import write_numbers
-from symphony.cli.wosac_files import ScenarioScore, score_files, summary
 from symphony.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     from symphony.data.report import Skip
+    from symphony.wosac.files import ScenarioScore
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,8 @@ class Score:
 
     def run(self) -> None:
         """Score, showing how far it is, and report."""
+        from symphony.wosac.files import summary
+
         results, skipped = self._score()
         found = summary(results, skipped, self.config)
         _print(found, aside=str(self.json) == "-")
@@ -64,6 +66,8 @@ class Score:
     def _score(self) -> tuple[list[ScenarioScore], list[Skip]]:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from symphony.wosac.files import score_files
 
         columns = (TextColumn("Scoring"), BarColumn(), MofNCompleteColumn(), TextColumn("scenarios"))
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:

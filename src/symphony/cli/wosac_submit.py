@@ -13,12 +13,12 @@ import tyro
 from symphony.cli.helps import TrustCode
 from symphony.config import WosacSettings
 from symphony.config.wosac import FUTURE
-from symphony.data.submission_meta import SubmissionMeta
 from symphony.errors import ConfigError, DataError
+from symphony.wosac.submission_meta import SubmissionMeta
 
 if TYPE_CHECKING:
     from symphony.agents import Agent
-    from symphony.data.rollouts import RolloutArrays
+    from symphony.wosac.rollouts import RolloutArrays
 
 SHARDS = 150
 """Files of an archive that the challenge's own example has."""
@@ -60,8 +60,8 @@ class Submit:
 
         from symphony.agents import load_agent
         from symphony.cli.evaluate import segments_bar
-        from symphony.data.submission import write_submission
-        from symphony.data.submission_check import required_agents
+        from symphony.wosac.submission import write_submission
+        from symphony.wosac.submission_check import required_agents
 
         agent = load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
         # Before hours of simulation: that all can be read, and no scenario comes twice.
@@ -85,8 +85,8 @@ def simulated_scenarios(
     Raises:
         DataError: a record can't be used; names file, scenario and field.
     """
-    from symphony.data.sources.wosac import read_scenario_payloads, scenario_files
-    from symphony.simulation.workers import shared
+    from symphony.rollouts.workers import shared
+    from symphony.wosac.records import read_scenario_payloads, scenario_files
 
     packed = read_scenario_payloads(scenario_files(data))
     with closing(shared(_Simulation(agent, settings), packed, settings.config(1, 0))) as results:
@@ -107,8 +107,8 @@ class _Simulation:
         from symphony.data.odd import mended
         from symphony.data.segment import validate
         from symphony.data.sources.womd import scenario_to_segment
-        from symphony.data.sources.wosac import parse_scenario
-        from symphony.simulation.wosac import with_the_rest, wosac_rollouts
+        from symphony.wosac.records import parse_scenario
+        from symphony.wosac.simulate import with_the_rest, wosac_rollouts
 
         file, record, payload = packed
         scenario = parse_scenario(payload, file, record)

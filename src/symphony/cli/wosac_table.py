@@ -28,7 +28,7 @@ class Table:
 
     def run(self) -> None:
         """Read, compare and write."""
-        from symphony.evaluation.wosac_table import grid_note, markdown_table, read_wosac, wosac_grid
+        from symphony.wosac.table import grid_note, markdown_table, read_wosac, wosac_grid
 
         records = [read_wosac(file) for file in self.records]
         text = f"{markdown_table(wosac_grid(records, self.names))}\n{grid_note(records)}.\n"

@@ -30,7 +30,7 @@ class Validate:
 
     def run(self) -> None:
         """Check and report."""
-        from symphony.data.submission_check import check_submission, required_agents
+        from symphony.wosac.submission_check import check_submission, required_agents
 
         required = None if self.scenario is None else required_agents(self.scenario)
         report = check_submission(self.submission, required)

@@ -15,7 +15,6 @@ from typing import Any
 
 from symphony.data import joins, overlaps, store_format
 from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
-from symphony.data.engine import Engine
 from symphony.data.parts import (
     ODD,
     Outcome,
@@ -34,6 +33,7 @@ from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.data.unfinished import STORE, Draft, Job, folder_of, read_journal
 from symphony.errors import ConfigError, DataError
+from symphony.parallel import Engine
 
 __all__ = ["Progress", "Report", "Skip", "convert", "expand", "info"]
 
@@ -92,7 +92,7 @@ def convert(
         strict: skip a record of which something odd would be left out, such as an agent without a size (see
             :mod:`symphony.data.odd`).
         reader_options: arguments of the reader.
-        workers: processes that convert files (see :func:`symphony.data.engine.ordered_map`); the result does not
+        workers: processes that convert files (see :func:`symphony.parallel.ordered_map`); the result does not
             depend on it.
         engine: where they are; with Ray on several machines, ``files`` and ``out`` must be on a file system that
             all of them share.

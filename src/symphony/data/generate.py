@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from symphony.data import store_format
-from symphony.data.engine import Engine, ordered_map
 from symphony.data.plans import Plan, Task
 from symphony.data.segment import RunSegment
 from symphony.data.selection import usable
@@ -27,6 +26,7 @@ from symphony.data.sources.sumo import crop_rule, generate_run
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
+from symphony.parallel import Engine, ordered_map
 
 _BEFORE = {"parked": 0.0, "pedestrians": 0}
 """What settings that are gone must have been in a store that is continued."""
@@ -158,7 +158,7 @@ def generate(
         plan: what to make.
         out: directory of the store.
         workers: processes; their number changes nothing in the store.
-        engine: where they are, see :func:`symphony.data.engine.ordered_map`.
+        engine: where they are, see :func:`symphony.parallel.ordered_map`.
         progress: told how far it is.
 
     Returns:

@@ -19,7 +19,6 @@ from symphony.data import joins, overlaps
 from symphony.data import resample as resampling
 from symphony.data.bounds import oddities
 from symphony.data.crop import crop
-from symphony.data.engine import Engine, ordered_map
 from symphony.data.odd import from_ego
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
@@ -29,6 +28,7 @@ from symphony.data.sources.base import unexpected
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
+from symphony.parallel import Engine, ordered_map
 
 PART_BYTES, PART_FILES = 8 << 20, 64
 """Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""

@@ -16,7 +16,7 @@ from symphony.evaluation.contacts import Bools, Indices, Reals
 from symphony.geometry import levels_apart
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph, lane_of
-from symphony.simulation.world import World
+from symphony.saved.world import World
 
 SECONDS = 3.0
 """For which an agent must stand on a free road to block it."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from symphony.geometry import boxes_overlap, levels_apart, meeting_time, pose_at
 from symphony.metrics import collision_kinds, meetings
-from symphony.simulation.world import World
+from symphony.saved.world import World
 
 Reals = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -18,8 +18,8 @@ from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph
 from symphony.roadgraph.routes import ends_inside
-from symphony.simulation.saved import SavedRollouts
-from symphony.simulation.world import World
+from symphony.saved.rollouts import SavedRollouts
+from symphony.saved.world import World
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 SAME_WAY = math.pi / 2

@@ -24,6 +24,8 @@ from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
+from symphony.learning.demonstrations import SceneDataset
+from symphony.learning.logged import logged, logged_heights
 from symphony.metrics import (
     AgentSteps,
     Choice,
@@ -36,13 +38,11 @@ from symphony.metrics import (
     standing_at_end,
 )
 from symphony.roadgraph import LaneGraph, visited_curvatures
-from symphony.simulation.crowd import crowd_dataset
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import Simulation, driven_by, search_kind
-from symphony.simulation.finite import NotFiniteError
-from symphony.simulation.logged import logged, logged_heights
-from symphony.simulation.rollouts import Rollouts, existing
-from symphony.simulation.workers import batches, naming, segments_together, shared
+from symphony.rollouts.crowd import crowd_dataset
+from symphony.rollouts.driving import Simulation, driven_by, search_kind
+from symphony.rollouts.finite import NotFiniteError
+from symphony.rollouts.unroll import Rollouts, existing
+from symphony.rollouts.workers import batches, naming, segments_together, shared
 
 BASELINES = ("playback", "constant_velocity")
 """Evaluated beside every agent, on the agents it drives and for as long."""

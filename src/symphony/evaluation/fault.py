@@ -23,7 +23,7 @@ from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph, lane_of
-from symphony.simulation.world import World
+from symphony.saved.world import World
 
 NOMINAL_WIDTH = 3.6
 """Metres, of lanes whose width is not known."""

@@ -21,7 +21,7 @@ from symphony.envs.scene import scene
 from symphony.errors import DataError
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, visited_regions
-from symphony.simulation.driving import playback
+from symphony.rollouts.driving import playback
 
 PERCENTILES = (1, 5, 50, 95, 99)
 STRAIGHT = 0.5

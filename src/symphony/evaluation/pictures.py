@@ -19,13 +19,13 @@ from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.evaluation.evaluator import EvaluatedBatch
+from symphony.learning.demonstrations import SceneDataset
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
-from symphony.simulation.demonstrations import SceneDataset
-from symphony.simulation.driving import driven_by, search_kind
-from symphony.simulation.rollouts import Rollouts
-from symphony.simulation.saved import SavedRollouts, saved_rollouts
-from symphony.simulation.saved_files import RolloutWriter
+from symphony.rollouts.driving import driven_by, search_kind
+from symphony.rollouts.unroll import Rollouts
+from symphony.saved.folder import RolloutWriter
+from symphony.saved.rollouts import SavedRollouts, saved_rollouts
 
 PANELS = 6
 """Run segments in one picture."""

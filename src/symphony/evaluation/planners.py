@@ -14,8 +14,8 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import grouped_mean, report, total_numbers
 from symphony.files import locating
 from symphony.metrics.intervals import t_quantile
-from symphony.simulation.saved import PLAYBACK, SavedRollouts
-from symphony.simulation.saved_files import LATER, RolloutFolder
+from symphony.saved.folder import LATER, RolloutFolder
+from symphony.saved.rollouts import PLAYBACK, SavedRollouts
 
 FORMAT = 1
 """Version of a record."""

@@ -77,7 +77,7 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         ``parts``, pseudo-values of the divergence by recording (see
         :func:`symphony.metrics.sampled_divergence`); ``per_segment``: a row for each run segment. `symphony evaluate
         --metrics wosac` adds ``wosac`` and numbers whose names begin so (see
-        :func:`symphony.evaluation.wosac.wosac_parts`).
+        :func:`symphony.wosac.evaluate.wosac_parts`).
     """
     visited, visited_log = result.metrics.curvature_histograms()
     divergence, names = result.metrics.curvature_divergence()

@@ -26,9 +26,9 @@ from symphony.metrics import CollisionKind
 from symphony.metrics.intervals import zero_bound
 from symphony.render.viewer import Event
 from symphony.roadgraph import LaneGraph
-from symphony.simulation.saved import SavedRollouts
-from symphony.simulation.saved_files import RolloutFolder
-from symphony.simulation.world import world_of
+from symphony.saved.folder import RolloutFolder
+from symphony.saved.rollouts import SavedRollouts
+from symphony.saved.world import world_of
 
 Evaluated = Literal["interactive", "ego"]
 Row = dict[str, Any]

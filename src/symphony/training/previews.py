@@ -19,12 +19,12 @@ from symphony.envs.scene import SceneBatch
 from symphony.evaluation.pictures import clip_of
 from symphony.files import naming
 from symphony.geometry.frames import wrap
+from symphony.learning import SearchReplay
+from symphony.learning.demonstrations import SceneDataset, evenly_spaced
+from symphony.learning.logged import logged
 from symphony.render import animate_rollouts
-from symphony.simulation import SearchReplay
-from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
-from symphony.simulation.driving import simulated
-from symphony.simulation.logged import logged
-from symphony.simulation.rollouts import Rollouts
+from symphony.rollouts.driving import simulated
+from symphony.rollouts.unroll import Rollouts
 from symphony.training.validation import undisturbed
 
 PANELS = 2

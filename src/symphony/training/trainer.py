@@ -33,7 +33,7 @@ from symphony.training.processes import Processes
 from symphony.training.resume import checkpoint_to_resume, warm_start
 
 if TYPE_CHECKING:
-    from symphony.simulation import SceneDataset, SearchReplay
+    from symphony.learning import SceneDataset, SearchReplay
     from symphony.training.previews import Previewer
     from symphony.training.validation import Validator
 

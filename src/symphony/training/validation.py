@@ -14,7 +14,7 @@ from symphony.config import EvaluateConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import evaluate_dataset
-from symphony.simulation.demonstrations import SceneDataset, evenly_spaced
+from symphony.learning.demonstrations import SceneDataset, evenly_spaced
 
 METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
 

@@ -25,7 +25,7 @@ from symphony.errors import DataError
 from symphony.render.roads import BIKE_WIDTH, DEFAULT_WIDTH
 
 if TYPE_CHECKING:
-    from symphony.simulation.saved import SavedRollouts, SavedTrees
+    from symphony.saved.rollouts import SavedRollouts, SavedTrees
 
 _TYPES = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
 MILLIMETRE = 1e-3

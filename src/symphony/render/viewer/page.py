@@ -12,7 +12,7 @@ from symphony.files import finite
 from symphony.render.viewer.pack import Event, packed
 
 if TYPE_CHECKING:
-    from symphony.simulation.saved import SavedRollouts
+    from symphony.saved.rollouts import SavedRollouts
 
 SCRIPTS = ("data.js", "map.js", "scene.js", "search.js", "panels.js", "main.js")
 

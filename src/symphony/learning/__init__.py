@@ -1,0 +1,15 @@
+"""What is learned from: demonstrations prepared from logs, and the rollouts of a search."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.learning.demonstrations import SceneDataset
+    from symphony.learning.replay import SearchReplay, with_survivors
+
+__all__ = ["SceneDataset", "SearchReplay", "with_survivors"]
+
+__getattr__, __dir__ = lazily(__name__)

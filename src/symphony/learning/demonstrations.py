@@ -1,0 +1,350 @@
+"""Scenes and expert states of a store, prepared once per segment and kept in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, lru_cache, partial
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from symphony import keys
+from symphony.config import PerturbConfig
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.observation import ObservationConfig
+from symphony.envs.routes import RouteWindow, route_choices
+from symphony.envs.scene import SceneBatch, collate, scene
+from symphony.errors import DataError
+from symphony.geometry.frames import with_speed
+from symphony.learning.experts import Experts, fit_experts
+from symphony.learning.kept import KeptExperts
+from symphony.learning.logged import expert_batch, logged, logged_routes
+from symphony.learning.memory import ItemCache
+from symphony.roadgraph import LaneGraph
+
+if TYPE_CHECKING:
+    from symphony.learning.personas import PersonaScale
+
+GRAPHS = 64
+"""Lane graphs held in memory."""
+DISPLACED = 2.0
+"""Metres that a state to learn from may lie from the log, for which its place along the route is looked for."""
+
+
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
+    count = min(count, total)
+    return [k * total // count for k in range(count)]
+
+
+class SceneDataset:
+    """Random access to the scenes and experts of a store. Pickles without what it keeps in memory.
+
+    Args:
+        store: the run segments.
+        interactive: agents per segment that act.
+        dynamics: action space the experts are fitted to.
+        indices: rows of the store to use; all by default.
+        routes: whether scenes and experts come with their routes.
+        duration: seconds of each segment that are used; 0 for all.
+        keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
+            machine's memory; 170 kB each in the built-in data, with routes).
+        persona: whether the driving style of all agents is measured.
+
+    Raises:
+        DataError: on access, for a segment shorter than the duration.
+    """
+
+    def __init__(
+        self,
+        store: SegmentStore,
+        interactive: int = 2,
+        dynamics: Bicycle | Displacement | None = None,
+        indices: Sequence[int] | None = None,
+        *,
+        routes: bool = False,
+        duration: float = 0,
+        keep: int | None = None,
+        persona: bool = False,
+    ) -> None:
+        self.store = store
+        self.interactive = interactive
+        self.dynamics = Bicycle() if dynamics is None else dynamics
+        self.indices = list(range(len(store))) if indices is None else list(indices)
+        self.routes, self.duration, self.keep, self.persona = routes, duration, keep, persona
+        self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
+        self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
+        self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
+        self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
+        # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
+        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        build = partial(
+            SceneDataset,
+            routes=self.routes,
+            duration=self.duration,
+            keep=self.keep,
+            persona=self.persona,
+        )
+        return build, (self.store, self.interactive, self.dynamics, self.indices)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def dt(self) -> float:
+        """Seconds per step.
+
+        Raises:
+            DataError: if there is no segment, or segments differ in it; names one that does.
+        """
+        if not self.indices:
+            raise DataError("the store holds no run segments", file=self.store.path)
+        steps = self.store.time_steps[self.indices]
+        other = np.flatnonzero(steps != steps[0])
+        if len(other):
+            raise DataError(
+                f"has steps of {steps[other[0]]:g} s, others of {steps[0]:g} s",
+                file=self.store.path,
+                segment=self.store.ids[self.indices[other[0]]],
+                field="dt",
+            )
+        return float(steps[0])
+
+    @property
+    def open_traffic(self) -> bool:
+        """Whether agents enter and leave: here the same ones are there from the first step to the last."""
+        return False
+
+    @property
+    def decisions(self) -> int:
+        """Actions until the last logged step of the longest segment, or up to the duration."""
+        longest = int(self.store.num_steps[self.indices].max()) - 1
+        return min(longest, round(self.duration / self.dt)) if self.duration else longest
+
+    def checksum(self) -> str:
+        """The store's."""
+        return self.store.checksum()
+
+    def segment(self, i: int) -> RunSegment:
+        """The run segment behind item ``i``, up to the duration."""
+        segment = self.store[self.indices[i]]
+        if not self.duration:
+            return segment
+        steps = round(self.duration / segment.dt) + 1
+        if segment.num_steps < steps:
+            has = (segment.num_steps - 1) * segment.dt
+            raise DataError(
+                f"has {has:g} s, {self.duration:g} are asked for",
+                file=self.store.path,
+                segment=segment.segment_id,
+            )
+        timed = ("position", "heading", "velocity", "valid", "signal_state")
+        return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
+
+    def graph(self, i: int) -> LaneGraph:
+        """The lane graph of item ``i``; segments on one map share it."""
+        return self._graph(int(self.store.map_index[self.indices[i]]))
+
+    def _scene(self, i: int) -> SceneBatch:
+        """Item ``i`` as a batch of one scene."""
+        graph, segment = self.graph(i) if self.routes else None, self.segment(i)
+        persona = self.personas.personas(self._styles(i)) if self.persona else None
+        return scene(segment, self.interactive, graph, number=i, persona=persona)
+
+    @cached_property
+    def personas(self) -> PersonaScale:
+        """The driving styles of all items, measured when first asked for."""
+        from symphony.learning.personas import PersonaScale  # noqa: PLC0415 - few learn with them
+
+        return PersonaScale.of(map(self._styles, range(len(self))))
+
+    def _styles(self, i: int) -> NDArray[np.float64]:
+        from symphony.learning.personas import styles  # noqa: PLC0415
+
+        return styles(self.segment(i), self.graph(i))
+
+    def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
+        return [self._scene(i) for i in items]
+
+    def scenes(self, items: Sequence[int]) -> SceneBatch:
+        """Several items as one padded batch."""
+        found: SceneBatch = self._batch(tuple(items))
+        return found
+
+    def _experts(self, items: Sequence[int]) -> list[Experts]:
+        """The demonstrations of several items: those kept with the store, the others fitted together and kept."""
+        contents = [self.store.content(self.indices[i]) for i in items]
+        known = [self.kept.load(content) for content in contents]
+        missing = [k for k, experts in enumerate(known) if experts is None]
+        segments, graphs = [self.segment(items[k]) for k in missing], [self.graph(items[k]) for k in missing]
+        made = fit_experts(segments, self.dynamics, graphs, routes=self.routes) if missing else []
+        for k, experts in zip(missing, made, strict=True):
+            self.kept.save(contents[k], experts)
+            known[k] = experts
+        return [experts for experts in known if experts is not None]
+
+    def draw(self, count: int, rng: torch.Generator) -> list[int]:
+        """Different items at random (all, if there are fewer)."""
+        return torch.randperm(len(self), generator=rng)[:count].tolist()
+
+    def sample_states(
+        self,
+        items: Sequence[int],
+        states: int,
+        observation: ObservationConfig,
+        rng: torch.Generator,
+        device: torch.device | str = "cpu",
+        perturb: PerturbConfig | None = None,
+    ) -> TensorDict:
+        """A training batch: expert states drawn from some segments, some of them displaced.
+
+        Returns:
+            TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
+        """
+        found = self.experts.many(items)
+        places = [expert.valid.nonzero(as_tuple=True) for expert in found]
+        sizes = torch.tensor([len(which) for which, _ in places])
+        scenes = self.scenes(items)
+        pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
+        item = torch.repeat_interleave(torch.arange(len(items)), sizes)[pick]
+        which, when = (torch.cat(parts)[pick] for parts in zip(*places, strict=True))
+        ends = torch.tensor([len(expert.agent) for expert in found]).cumsum(0)
+        row = which + torch.cat([ends.new_zeros(1), ends[:-1]])[item]
+        # Segments may differ in length, so rows of states are looked up by their place in one flat list.
+        lengths = torch.cat([torch.full((len(e.agent),), e.states.shape[1]) for e in found])
+        begin = lengths.cumsum(0) - lengths
+        state = torch.cat([e.states.flatten(0, 1) for e in found])[begin[row] + when]
+        ordinal = torch.arange(len(lengths))
+        action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
+        action = action.long() if self.dynamics.discrete else action
+        agent = torch.cat([e.agent for e in found])[row]
+        if perturb is not None:
+            from symphony.learning.perturbation import (  # noqa: PLC0415 - few learn from displaced states
+                AHEAD,
+                AHEAD_IN_STYLE,
+                perturbed,
+            )
+
+            now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
+            size, ahead = scenes.box_size[item, agent], AHEAD_IN_STYLE if self.persona else AHEAD
+            state, action = perturbed(
+                state, action, now, later, size, self.dynamics, self.dt, perturb.share, rng, ahead
+            )
+        seen = None
+        if observation.route:
+            progress = torch.cat([e.progress.flatten() for e in found])[begin[row] + when]
+            seen = _seen_routes(found, row, progress, state)
+        return expert_batch(
+            scenes.to(device),
+            item.to(device),
+            when.to(device),
+            agent.to(device),
+            state.to(device),
+            observation,
+            action=action.to(device),
+            routes=None if seen is None else RouteWindow(*(part.to(device) for part in seen)),
+        )
+
+    def sample_goals(
+        self,
+        items: Sequence[int],
+        count: int,
+        observation: ObservationConfig,
+        rng: torch.Generator,
+        device: torch.device | str = "cpu",
+    ) -> TensorDict:
+        """A training batch for the goal policy: experts at their first state, their routes and the one they took.
+
+        Returns:
+            TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK``, ``GOAL``
+            (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally right.
+        """
+        each = self.experts.many(items)
+        found = [(i, expert, k) for i, expert in enumerate(each) for k in range(len(expert.agent))]
+        pick = torch.randint(len(found), (count,), generator=rng).tolist()
+        chosen = [found[k] for k in pick]
+        when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
+        tables = [e.routes[k] for _, e, k in chosen]
+        most = max(1, *(len(table.count) for table in tables))
+        firsts, counts = np.zeros((2, count, most), np.int64)
+        right, begin = np.zeros((count, most), np.bool_), 0
+        for row, table in enumerate(tables):
+            counts[row, : len(table.count)] = table.count
+            firsts[row, : len(table.count)] = begin + np.cumsum(table.count) - table.count
+            right[row, : len(table.count)] = table.right
+            begin += len(table.points)
+        points = np.concatenate([table.points for table in tables])
+        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
+            device
+        )
+        batch = expert_batch(
+            self.scenes(items).to(device),
+            torch.tensor([i for i, _, _ in chosen], device=device),
+            when.to(device),
+            torch.stack([e.agent[k] for _, e, k in chosen]).to(device),
+            state,
+            observation,
+        )
+        features, mask = route_choices(
+            state[:, None],
+            torch.from_numpy(points).to(device),
+            torch.from_numpy(firsts)[:, None].to(device),
+            torch.from_numpy(counts)[:, None].to(device),
+            observation.distance_scale,
+            turns=observation.turns,
+        )
+        batch.set(keys.ROUTES, features)
+        batch.set(keys.ROUTES_MASK, mask)
+        batch.set(keys.GOAL, torch.tensor([[table.logged] for table in tables], device=device))
+        # A route of one point is no choice (see `route_choices`).
+        batch.set(keys.GOAL_SET, torch.from_numpy(right)[:, None].to(device) & mask)
+        return batch
+
+    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """What the interactive agents of some segments did, as the fit to the action space has it.
+
+        Args:
+            items: the segments.
+            scenes: their scenes.
+
+        Returns:
+            States [B, T, N, 4], where the log is valid [B, T, N], and metres along the routes that were taken
+            [B, T, N], 0 without routes; agents that are no experts as logged.
+        """
+        state, valid = logged(scenes)
+        state, valid, progress = state.clone(), valid.clone(), torch.zeros_like(state[..., 0])
+        for b, expert in enumerate(self.experts.many(items)):
+            steps = expert.states.shape[1]
+            hit = expert.agent[:, None].to(scenes.device) == scenes.interactive[b]
+            which, place = hit.nonzero(as_tuple=True)
+            state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
+            if self.routes:
+                progress[b, :steps, place] = expert.progress.to(scenes.device)[which].T
+        return state, valid, progress
+
+
+def _seen_routes(
+    experts: Sequence[Experts],
+    row: Int[Tensor, " M"],
+    progress: Float[Tensor, " M"],
+    state: Float[Tensor, "M 4"],
+) -> RouteWindow:
+    """What experts see of the routes they took from states that may lie beside where they were."""
+    taken = logged_routes([table for expert in experts for table in expert.routes], row)
+    # Whoever is displaced along the route by up to some metres has come as far as where it is now.
+    near = torch.full_like(progress, DISPLACED)[:, None]
+    return taken.window(taken.progress(state[:, None, :2], progress[:, None], near))
+
+
+def _nbytes(scene: SceneBatch) -> int:
+    return sum(getattr(scene, name).nbytes for name in SceneBatch.__annotations__)

@@ -1,0 +1,187 @@
+"""What the losses learn from after a search: its survivors, simulated and logged states, rollouts to repeat.
+
+Legend: B scenes, S branches, T steps, N agents, K states drawn.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from symphony import keys
+from symphony.collectors import BeamSearchCollector
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.observation import ObservationConfig
+from symphony.learning.demonstrations import SceneDataset
+from symphony.objectives import auc
+
+_LEARNED = (
+    *keys.SEEN,
+    keys.OBJECTS_MASK,
+    keys.POINTS_MASK,
+    keys.LIGHTS_MASK,
+    keys.VALID,
+    keys.PERSONA,
+    keys.ACTION,
+    keys.ROLLOUT,
+)
+
+
+class SearchReplay:
+    """The last search and what is drawn from it, until the next.
+
+    Not one of TorchRL's replay buffers: a state names a row of the scenes that its search drew, so it ends with them,
+    and what networks observe is made only for the states drawn.
+
+    Args:
+        collector: keeps the whole tree.
+        env: it searches in.
+        data: that the environment draws its scenes from.
+        every: updates made from one search.
+        states: K, simulated and logged ones each, drawn for the discriminator.
+    """
+
+    def __init__(
+        self, collector: BeamSearchCollector, env: DrivingEnv, data: SceneDataset, every: int, states: int
+    ) -> None:
+        self.collector, self.env, self.data, self.every, self.states = collector, env, data, every, states
+        self._leaves: TensorDictBase | None = None
+
+    def refresh(self, step: int) -> TensorDict:
+        """Search if it is due at an update, or was never done; what the last search found out about itself:
+        see :func:`search_statistics`.
+        """
+        if self._leaves is None or step % self.every == 0:
+            self._leaves = self.collector.rollout()
+            self._statistics = search_statistics(self.env, self._leaves)
+        return self._statistics
+
+    @property
+    def leaves(self) -> TensorDictBase:
+        """Leaves [B, S, T] of the last search, the tree in their entry ``tree``."""
+        if self._leaves is None:
+            raise RuntimeError("nothing was searched yet")
+        return self._leaves
+
+    def survivors(
+        self,
+        count: int,
+        rng: torch.Generator,
+        observation: ObservationConfig,
+    ) -> TensorDict:
+        """States of surviving rollouts and what was done in them, drawn uniformly from all before the scenes' ends.
+
+        Args:
+            count: K.
+            rng: of the draw.
+            observation: what the policy observes.
+
+        Returns:
+            TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True).
+        """
+        chosen = _drawn(self.env, self.leaves, count, rng)
+        batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
+        valid = batch.get(keys.VALID)
+        batch.set(keys.ACTION, chosen.get(keys.ACTION))
+        return batch.set(keys.ROLLOUT, torch.ones_like(valid))
+
+    def both_kinds(self, rng: torch.Generator) -> TensorDict:
+        """Simulated states, pruned ones included, and logged states of the same scenes.
+
+        The log is taken as fitted to the action space, so that it can't be told by its noise; its agents follow the
+        routes they took.
+
+        Args:
+            rng: of the draw.
+
+        Returns:
+            TensorDict [2 K, N]: observation and ``SIMULATED``.
+        """
+        fake = _after(_drawn(self.env, self.leaves.get("tree"), self.states, rng))
+        real = self._logged(self.states, rng)
+        batch = self.env.at(torch.cat([fake.select(*real.keys(True, True)), real]))
+        simulated = torch.zeros_like(batch.get(keys.VALID))
+        simulated[: self.states] = True
+        return batch.set(keys.SIMULATED, simulated)
+
+    @property
+    def searched(self) -> bool:
+        """Whether there was a search yet."""
+        return self._leaves is not None
+
+    def repeatable(self, count: int, rng: torch.Generator) -> TensorDictBase:
+        """First states [K] of survivors, with the random numbers that lead along their histories (``noise_plan``)."""
+        first = self.leaves[..., 0].flatten()
+        pick = torch.randperm(len(first), generator=rng)[:count]
+        return self.env.at(first[pick]).set(keys.NOISE_PLAN, self.leaves.get(keys.NOISE).flatten(0, 1)[pick])
+
+    def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
+        scenes = self.env.scenes
+        state, logged, progress = self.data.fitted(scenes.segment.tolist(), scenes)
+        rows = logged[:, 1:].any(-1).nonzero()
+        scene, step = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)].unbind(-1)
+        step = step + 1
+        valid = logged[scene, step]
+        # Agents that see no routes follow none.
+        route = scenes.route_logged if self.env.observation.route else torch.full_like(scenes.interactive, -1)
+        return TensorDict(
+            {
+                keys.SCENE: scene[:, None],
+                keys.STEP: step[:, None],
+                keys.STREAM: torch.zeros_like(scene)[:, None],
+                keys.VALID: valid,
+                keys.STATE: state[scene, step],
+                keys.GOAL: route[scene],
+                keys.PROGRESS: progress[scene, step],
+            },
+            batch_size=[count],
+        )
+
+
+def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
+    """One batch [M, 1] of expert states [K, 1] and rollout states [L, N], told apart by ``ROLLOUT``."""
+    valid = experts.get(keys.VALID)
+    experts.set(keys.ROLLOUT, torch.zeros_like(valid))
+    present = [key for key in _LEARNED if experts.get(key, None) is not None]
+    flat = TensorDict(
+        {key: rollouts.get(key).flatten(0, 1)[:, None] for key in present},
+        batch_size=[rollouts.get(keys.VALID).numel()],
+    )
+    return torch.cat([experts.select(*present), flat])
+
+
+def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:
+    """What matters to a search: whether scores rank colliding and off-road states last (AUC; NaN without any), and
+    the share of agent-steps that collide or are off the road before and after pruning.
+    """
+    tree, record = leaves.get("tree"), {}
+    going = leaves.get(keys.STEP) < env.scenes.last_step[leaves.get(keys.SCENE)]
+    valid = leaves.get(keys.VALID) & going
+    for name, key in (("collision", keys.COLLISION), ("offroad", keys.OFFROAD)):
+        bad = tree.get(("next", *key)).squeeze(-1) & valid
+        left = leaves.get(("next", *key)).squeeze(-1) & valid
+        record[f"search_auc_{name}"] = auc(tree.get(("collector", "beam_score")), bad, valid)
+        record[f"search_{name}_all"] = bad.sum() / valid.sum()
+        record[f"search_{name}_kept"] = left.sum() / valid.sum()
+    return TensorDict(record)
+
+
+def _after(steps: TensorDictBase) -> TensorDictBase:
+    """The states that steps led to."""
+    after = {keys.STEP: steps.get(keys.STEP) + 1}
+    after |= {key: steps.get(("next", *key)) for key in (keys.STATE, keys.PROGRESS)}
+    kept = steps.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL)
+    return kept.update(TensorDict(after, batch_size=kept.batch_size))
+
+
+def _drawn(
+    env: DrivingEnv,
+    steps: TensorDictBase,
+    count: int,
+    rng: torch.Generator,
+) -> TensorDictBase:
+    """Some [K] of the steps [*b] before their scenes' last, uniformly with replacement."""
+    counted = (steps.get(keys.STEP) < env.scenes.last_step[steps.get(keys.SCENE)]).squeeze(-1)
+    rows = counted.nonzero()
+    pick = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)]
+    return steps[tuple(pick.unbind(-1))]

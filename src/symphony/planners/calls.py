@@ -1,0 +1,99 @@
+"""Asking planners, whatever they do: exceptions are caught, and they have so many seconds for an answer."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from symphony.planners.interface import Planner, Traffic
+
+SECONDS = 60.0
+"""Of the clock that a planner has for one answer, unless it is told otherwise."""
+
+
+class _Overdue(BaseException):
+    """Raised in the planner's own code; no ``except Exception`` there stops it."""
+
+
+def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: float = SECONDS) -> list[Any]:
+    """What planners give back for what each of them sees, in their order: a plan, or the exception it ended with.
+
+    Those of one class that has ``plan_batch`` are asked together, and fail together.
+
+    Args:
+        planners: any number.
+        seen: as many.
+        seconds: for each call; in threads other than the first there is no limit.
+    """
+    found: list[Any] = [None] * len(planners)
+    together: dict[type, list[int]] = {}
+    for m, planner in enumerate(planners):
+        if callable(getattr(type(planner), "plan_batch", None)):
+            together.setdefault(type(planner), []).append(m)
+        else:
+            found[m] = answer(planner.plan, seen[m], seconds=seconds)
+    for kind, members in together.items():
+        given = answer(
+            kind.plan_batch,  # type: ignore[attr-defined]
+            [planners[m] for m in members],
+            [seen[m] for m in members],
+            seconds=seconds,
+        )
+        if not isinstance(given, Exception):
+            given = _as_many(given, len(members))
+        for k, m in enumerate(members):
+            found[m] = given if isinstance(given, Exception) else given[k]
+    return found
+
+
+def _as_many(given: Any, count: int) -> Any:
+    """The plans that ``plan_batch`` gave as a list, or an exception if they are something else."""
+    try:
+        plans = list(given)
+    except TypeError:
+        return TypeError(f"plan_batch gave no plans, but {type(given).__name__}")
+    if len(plans) != count:
+        return ValueError(f"plan_batch gave {len(plans)} plans for {count} planners")
+    return plans
+
+
+def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
+    """What a call gives back, or the exception it ended with: a TimeoutError if it took too long."""
+    try:
+        with _at_most(seconds):
+            return call(*args)
+    except _Overdue as late:
+        return TimeoutError(f"took more than {seconds:g} s{late}")
+    except SystemExit as ended:
+        return RuntimeError(f"called sys.exit({ended.code!r})")
+    except Exception as error:  # whatever a user's planner raises
+        return error
+
+
+@contextlib.contextmanager
+def _at_most(seconds: float) -> Iterator[None]:
+    """Inside, ``_Overdue`` is raised after so many seconds, where there are signals to be had."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        place = f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})" if frame is not None else ""
+        raise _Overdue(place)
+
+    before, began = signal.signal(signal.SIGALRM, ring), time.monotonic()
+    left, again = signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+        if left > 0:  # somebody else's alarm goes on
+            spent = time.monotonic() - began
+            signal.setitimer(signal.ITIMER_REAL, max(left - spent, 1e-3), again)

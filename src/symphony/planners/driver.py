@@ -1,0 +1,265 @@
+"""The ego by a planner: planners as a part of the policy, forked with the branches that they drive."""
+
+from __future__ import annotations
+
+import copy
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from symphony import keys
+from symphony.data.segment import RunSegment
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.dynamics import bicycle_step
+from symphony.envs.routes import ONWARD, SPACING
+from symphony.errors import ConfigError
+from symphony.planners.calls import SECONDS, answer, plans_of
+from symphony.planners.interface import Planner, Traffic, checked_plan, fixed, scenario_of
+from symphony.streams import Stream, fold_in
+
+
+class PlannedEnv(DrivingEnv):
+    """Driving in which actions are not all: background agents go where ``BACKGROUND`` says, and the first interactive
+    agent, the ego, where ``PLANNED`` does; where there is no such entry, they act like the others.
+    """
+
+    def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
+        after = super()._moved(tensordict, state, size)
+        ruled, planned = tensordict.get(keys.BACKGROUND, None), tensordict.get(keys.PLANNED, None)
+        if ruled is not None:
+            background = self.scenes.background[tensordict.get(keys.SCENE).squeeze(-1)]
+            after = torch.where(background[..., None], ruled, after)
+        return after if planned is None else torch.cat([planned[..., None, :], after[..., 1:, :]], -2)
+
+
+class Failure(NamedTuple):
+    """Why a planner drives no more.
+
+    Attributes:
+        step: from which on the rollout doesn't count.
+        reason: in words.
+    """
+
+    step: int
+    reason: str
+
+
+class EgoPlanners:
+    """How the egos of a batch are planned.
+
+    Args:
+        name: of the planner.
+        make: makes one.
+        segments: behind the scenes, in their order; the first interactive agent of each is its ego.
+        seconds: that a planner has for one answer.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        make: Callable[[], Planner],
+        segments: Sequence[RunSegment],
+        seconds: float = SECONDS,
+    ) -> None:
+        self.name, self.make, self.segments, self.seconds = name, make, segments, seconds
+
+    def begin(
+        self,
+        env: DrivingEnv,
+        start: TensorDictBase,
+        *,
+        seed: int,
+        forked: bool = False,
+    ) -> EgoPolicy:
+        """A planner for every start state, which gets its number, and what asks them.
+
+        Args:
+            env: the environment.
+            start: [...] of it, the egos on the routes of the log.
+            seed: of all rollouts.
+            forked: a search will copy planners with its branches.
+
+        Raises:
+            ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
+        """
+        number = torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
+        start.set(keys.PLANNER, number)
+        policy = EgoPolicy(env, self, start, seed)
+        if forked:
+            policy.check_copies()
+        return policy
+
+
+class EgoPolicy(TensorDictModuleBase):
+    """Asks the planners and writes the states they lead to as ``PLANNED``.
+
+    Rollouts name their planner by number (``PLANNER``). Copies of a branch share a number until they are driven on;
+    then each gets a planner of its own, copied before any of them plans.
+
+    Args:
+        env: the environment.
+        egos: how egos are planned.
+        start: [...] states at which planners begin, each with its number.
+        seed: of all rollouts.
+    """
+
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012 - the type declared
+    out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
+
+    def __init__(self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int) -> None:
+        super().__init__()
+        self.env, self.egos = env, egos
+        self._last = env.scenes.last_step.cpu().numpy()
+        self._held: dict[int, Planner | Failure] = {}
+        scene = start.get(keys.SCENE).flatten().tolist()
+        state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
+        stream = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed).flatten().tolist()
+        self._routes = routes = [self._route(row) for row in range(len(egos.segments))]
+        for number, row in enumerate(scene):
+            made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))
+            planner = answer(egos.make, seconds=egos.seconds)
+            error = planner if isinstance(planner, Exception) else None
+            error = error or answer(planner.reset, made, seconds=egos.seconds)
+            failed = isinstance(error, Exception)
+            self._held[number] = Failure(0, f"reset: {_words(error)}") if failed else planner
+        self._next = len(scene)
+
+    def _route(self, row: int) -> NDArray[np.float32]:
+        """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
+        scenes, which = self.env.scenes, int(self.env.scenes.route_logged[row, 0])
+        if which < 0:
+            return np.zeros((0, 2), np.float32)
+        return scenes.whole_route(row, 0, which).cpu().numpy()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write planned states [..., 4] and numbers of planners [..., 1]."""
+        scene, at, number = (tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP, keys.PLANNER))
+        state, valid, progress = (
+            tensordict.get(key).flatten(0, tensordict.ndim - 1)
+            for key in (keys.STATE, keys.VALID, keys.PROGRESS)
+        )
+        come = progress[:, 0].tolist()
+        everyone = self.env.objects(scene, at, state, valid)
+        rows, steps, driving = scene.tolist(), at.tolist(), valid[:, 0].tolist()
+        # An ego that has left the map is over, too.
+        going = [
+            step < self._last[row] and there for row, step, there in zip(rows, steps, driving, strict=True)
+        ]
+        numbers = self._own(number.tolist(), going)
+        own = state[:, 0].cpu().double()
+        moves, there = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
+        # One that is over, or has failed, keeps its speed.
+        control, target = np.zeros((len(rows), 2)), np.full((len(rows), 4), np.nan)
+        asked: list[tuple[int, Planner, Traffic]] = []
+        for m, row in enumerate(rows):
+            planner = self._held[numbers[m]]
+            if going[m] and not isinstance(planner, Failure):
+                ahead = route_from(self._routes[row], come[m])
+                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m], ahead)
+                asked.append((m, planner, seen))
+        plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
+        for (m, _, seen), given in zip(asked, plans, strict=True):
+            found = given
+            if not isinstance(given, Exception):
+                found = answer(checked_plan, given, seen.state, self.env.dt)
+            if isinstance(found, Exception):
+                self._held[numbers[m]] = Failure(steps[m], f"step {steps[m]}: {_words(found)}")
+            else:
+                (control if len(found) == 2 else target)[m] = found
+        length = [float(self.egos.segments[row].size[self.egos.segments[row].ego, 0]) for row in rows]
+        pulled, turned = torch.from_numpy(control).unbind(-1)
+        driven = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
+        wanted = torch.from_numpy(target)
+        after = torch.where(wanted.isnan(), driven, wanted).to(state)
+        tensordict.set(keys.PLANNED, after.reshape(*tensordict.shape, 4))
+        return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
+
+    def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
+        """Of the planners with these numbers, flattened."""
+        found = (self._held[n] for n in number.flatten().tolist())
+        return [planner if isinstance(planner, Failure) else None for planner in found]
+
+    def _own(self, numbers: list[int], going: list[bool]) -> list[int]:
+        """Numbers of planners that may be changed, one for each rollout that goes on."""
+        self._held = {n: self._held[n] for n in set(numbers)}
+        taken: set[int] = set()
+        out = []
+        for number, goes in zip(numbers, going, strict=True):
+            planner, chosen = self._held[number], number
+            if goes and not isinstance(planner, Failure):
+                if number in taken:
+                    chosen, self._next = self._next, self._next + 1
+                    self._held[chosen] = self._copy(planner)
+                taken.add(chosen)
+            out.append(chosen)
+        return out
+
+    def check_copies(self) -> None:
+        """ConfigError if the first planner that came up can't be copied."""
+        first = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
+        if first is not None:
+            self._copy(first)
+
+    def _copy(self, planner: Planner) -> Planner:
+        try:
+            return copy.deepcopy(planner)
+        except Exception as error:  # whatever a user's planner raises
+            raise ConfigError(
+                f"planner '{self.egos.name}' can't be copied ({_words(error)}), but a search forks it with its "
+                "branches: simulate with --search none"
+            ) from error
+
+    def _traffic(
+        self,
+        row: int,
+        step: int,
+        own: NDArray[np.float64],
+        moves: NDArray[np.float64],
+        there: NDArray[np.bool_],
+        route: NDArray[np.float64],
+    ) -> Traffic:
+        segment = self.egos.segments[row]
+        moves, there = moves[: segment.num_agents], there[: segment.num_agents]
+        moves = np.where(there[:, None], moves, 0.0)
+        return Traffic(
+            step=step,
+            time=step * self.env.dt,
+            ego=segment.ego,
+            state=fixed(own),
+            position=fixed(moves[:, :2]),
+            heading=fixed(moves[:, 2]),
+            velocity=fixed(moves[:, 3:]),
+            size=fixed(segment.size[:, :2].astype(np.float64)),
+            agent_type=fixed(segment.agent_type),
+            valid=fixed(there),
+            lights=fixed(segment.signal_state[:, step]),
+            route=fixed(route),
+        )
+
+
+def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float64]:
+    """Points [K, 2] of a route from so many metres along on, at least 200 m of it or all there is."""
+    if not len(route):
+        return route.astype(np.float64)
+    piece = min(int(progress // SPACING), len(route) - 2)
+    later = route[piece + 1 : piece + 3 + round(ONWARD / SPACING)].astype(np.float64)
+    way = route[piece + 1] - route[piece]
+    # The last piece may be shorter than the others.
+    share = min((progress - SPACING * piece) / max(float(np.hypot(*way)), 1e-6), 1.0)
+    return np.concatenate([(route[piece] + share * way)[None], later])
+
+
+def _words(error: Exception) -> str:
+    """An exception on one line, with the place that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}{place}"

@@ -1,0 +1,320 @@
+"""A planner of one's own as the ego: what it is told, what it observes and what it gives back.
+
+Plain Python and NumPy. World frame of the run segment, metres, seconds, m/s, radians counter-clockwise. Arrays are
+read-only. Legend: A agents of the segment, Q lights, P points, T logged steps.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import shlex
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import Polylines, RoadMap, RunSegment
+from symphony.errors import ConfigError
+from symphony.imports import load_object
+
+Reals = NDArray[np.float64]
+
+MAX_ACCELERATION = 5.0
+"""m/s^2 that a vehicle gains at most, whatever it is asked for."""
+MAX_BRAKING = 10.0
+"""m/s^2 that it loses at most."""
+MAX_STEERING = 0.6
+"""Radians of its front wheels either way."""
+MAX_SPEED = 80.0
+"""m/s that a pose may ask for, and by which it may lie away from where the vehicle is."""
+MAX_HEADING = 1e4
+"""Radians either way that a pose may have."""
+
+
+class Pose(NamedTuple):
+    """The state of the ego at the next step: box centre, heading, speed along it."""
+
+    x: float
+    y: float
+    heading: float
+    speed: float
+
+
+class Control(NamedTuple):
+    """What moves the ego to the next step, as :func:`symphony.envs.dynamics.bicycle_step` says.
+
+    A vehicle does what it can: the acceleration ends at :data:`MAX_ACCELERATION` and -:data:`MAX_BRAKING`, the
+    steering at :data:`MAX_STEERING` either way, the speed at 0.
+    """
+
+    acceleration: float
+    steering: float
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Everyone at one step, the ego included.
+
+    Attributes:
+        step: since the start; 0 at the first call.
+        time: seconds since the start.
+        ego: row of the ego.
+        state: [4] of the ego: x, y, heading, speed along it.
+        position: [A, 2] box centres; 0 where not valid.
+        heading: [A].
+        velocity: [A, 2].
+        size: [A, 2] length, width.
+        agent_type: [A] :class:`symphony.data.segment.AgentType`.
+        valid: [A] who is there.
+        lights: [Q] :class:`symphony.data.segment.SignalState` of each light of the scenario.
+        route: [K, 2] points to follow from where the ego has come to, 3 m apart: 200 m of the scenario's route, or
+            what there is of it up to the end of the map.
+    """
+
+    step: int
+    time: float
+    ego: int
+    state: Reals
+    position: Reals
+    heading: Reals
+    velocity: Reals
+    size: Reals
+    agent_type: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    lights: NDArray[np.uint8]
+    route: Reals
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """What a planner is told at the start. There is no history before it: simulations begin with the log.
+
+    A copy is the scenario itself, so that planners that keep it are cheap to fork.
+
+    Attributes:
+        segment_id: of the run segment.
+        dt: seconds per step.
+        steps: how often the planner will be asked.
+        ego: row of the ego in :class:`Traffic`.
+        size: [2] its length and width.
+        state: [4] its first x, y, heading and speed.
+        route: [P, 2] points to follow, 3 m apart, from beside the ego on: the feasible route nearest to the log. It
+            reaches 200 m beyond what can be driven in the segment, or to where the lanes end; empty where the ego is
+            on no lane. Each :class:`Traffic` has the part ahead.
+        goal: [2] where the ego's log ends.
+        road: lanes with their successors and speed limits, boundary and marks.
+        signal_lane: [Q] index of the lane each light controls.
+        signal_point: [Q, 2] its stop point.
+        agent_id: [A] the source's ids.
+        log: [T, 4] what the ego did, for planners that play it back.
+        log_valid: [T].
+        seed: for random numbers of the planner's own, which should come from nothing else; another for each rollout.
+    """
+
+    segment_id: str
+    dt: float
+    steps: int
+    ego: int
+    size: Reals
+    state: Reals
+    route: Reals
+    goal: Reals
+    road: RoadMap
+    signal_lane: NDArray[np.int32]
+    signal_point: Reals
+    agent_id: NDArray[np.int64]
+    log: Reals
+    log_valid: NDArray[np.bool_]
+    seed: int = 0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scenario:
+        return self
+
+
+class Planner(Protocol):
+    """Drives the ego of one rollout. It is made without arguments.
+
+    A class may also have ``plan_batch(planners, traffics)``, a class method: all its planners of a batch of rollouts
+    and what each of them sees, lists of one length; it gives back as many plans. Then ``plan`` is not called.
+
+    A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. A copy
+    draws the same random numbers as the one it was made of, if it draws them as :attr:`Scenario.seed` says. One that
+    raises an exception, or gives back what is not finite, of another length or a target farther away than
+    :data:`MAX_SPEED` allows, makes its run a failed one; the run's later steps don't count.
+    """
+
+    def reset(self, scenario: Scenario) -> None:
+        """Begin a rollout; called once, before the first plan."""
+        ...
+
+    def plan(self, traffic: Traffic) -> Pose | Control | Sequence[float] | Sequence[Pose] | NDArray[Any]:
+        """What the ego does until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
+
+        Of several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
+        """
+        ...
+
+
+NAMES = {"idm": "symphony.planners.included:IDMPlanner", "log": "symphony.planners.included:LogPlanner"}
+"""Planners with names of their own."""
+PIPE = "pipe:"
+"""Before the command of a planner in another process."""
+
+
+def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
+    """What makes planners, one for each rollout.
+
+    Args:
+        planner: a class with ``reset`` and ``plan``, a function that makes such objects, or a function from an
+            :class:`~symphony.planners.view.Observation` to a plan; or the name of one: ``idm``, ``log``, an
+            import path such as ``my.planner:Planner``, a file such as ``my.py:plan``, or ``pipe:COMMAND`` (see
+            :mod:`symphony.planners.process`).
+
+    Raises:
+        ConfigError: there is no such planner, or it has no ``reset`` and ``plan``.
+    """
+    name, given = planner_name(planner), planner
+    if isinstance(given, str):
+        if given.startswith(PIPE):
+            return _process_maker(given.removeprefix(PIPE))
+        path = NAMES.get(given, given)
+        if ":" not in path:
+            raise ConfigError(
+                f"planner is one of {', '.join(NAMES)}, an import path such as my.planner:Planner, a file such as "
+                f"my.py:plan, or {PIPE}COMMAND, not '{name}'"
+            )
+        given = load_object(path)
+    if not inspect.isclass(given) and len(_needed(given)) == 1:
+        from symphony.planners.view import FunctionPlanner  # noqa: PLC0415 - builds on this module
+
+        return partial(FunctionPlanner, given)
+    try:
+        made = given()
+    except (Exception, SystemExit) as error:  # whatever a user's planner raises
+        raise ConfigError(f"planner '{name}' can't be made: {type(error).__name__}: {error}") from error
+    missing = [part for part in ("reset", "plan") if not callable(getattr(made, part, None))]
+    if missing:
+        raise ConfigError(f"planner '{name}' has no {' and no '.join(missing)}")
+    return given
+
+
+def planner_name(planner: str | Callable[..., Any]) -> str:
+    """What a planner is called in records."""
+    if isinstance(planner, str):
+        return planner
+    if isinstance(planner, partial):
+        return planner_name(planner.func)
+    return f"{getattr(planner, '__module__', '')}:{getattr(planner, '__qualname__', type(planner).__name__)}"
+
+
+def _process_maker(command: str) -> Callable[[], Planner]:
+    from symphony.planners.process import ProcessPlanner  # noqa: PLC0415 - builds on this module
+
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ConfigError(f"planner '{PIPE}{command}': {error}") from error
+    if not words or shutil.which(words[0]) is None:
+        raise ConfigError(f"planner '{PIPE}{command}': there is no command '{words[0] if words else ''}'")
+    return partial(ProcessPlanner, command)
+
+
+def _needed(function: Callable[..., Any]) -> list[str]:
+    """Arguments by position that a function can't do without."""
+    by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    try:
+        found = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # not everything says
+        return []
+    return [one.name for one in found if one.kind in by_place and one.default is one.empty]
+
+
+def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
+    """What planners of a run segment are told.
+
+    Args:
+        segment: the segment.
+        route: [P, 2].
+        state: [4] first state of the ego.
+        seed: of the rollout.
+    """
+    ego, valid = segment.ego, segment.valid[segment.ego]
+    heading, velocity = segment.heading[ego].astype(np.float64), segment.velocity[ego].astype(np.float64)
+    speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
+    position = segment.position[ego, :, :2].astype(np.float64)
+    last = segment.num_steps - 1 - int(valid[::-1].argmax())
+    return Scenario(
+        segment_id=segment.segment_id,
+        dt=float(segment.dt),
+        steps=segment.num_steps - 1,
+        ego=int(ego),
+        size=fixed(segment.size[ego, :2].astype(np.float64)),
+        state=fixed(state.astype(np.float64)),
+        route=fixed(route.astype(np.float64)),
+        goal=fixed(position[last]),
+        road=_fixed_road(segment.road),
+        signal_lane=fixed(segment.signal_lane),
+        signal_point=fixed(segment.signal_point[:, :2].astype(np.float64)),
+        agent_id=fixed(segment.agent_id.astype(np.int64)),
+        log=fixed(np.concatenate([position, heading[:, None], speed[:, None]], -1)),
+        log_valid=fixed(valid),
+        seed=seed,
+    )
+
+
+def fixed(array: NDArray[Any]) -> NDArray[Any]:
+    """A view that can't be written to."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _fixed_road(road: RoadMap) -> RoadMap:
+    def of(value: Any) -> Any:
+        return (
+            Polylines(fixed(value.points), fixed(value.offsets))
+            if isinstance(value, Polylines)
+            else fixed(value)
+        )
+
+    return replace(road, **{item.name: of(getattr(road, item.name)) for item in fields(road)})
+
+
+def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
+    """What a planner gave back as 2 or 4 finite numbers: of a trajectory, its first state.
+
+    Args:
+        plan: as it came.
+        state: [4] of the ego.
+        dt: seconds.
+
+    Raises:
+        ValueError: it is something else, or a target out of reach.
+    """
+    numbers = np.asarray(plan, np.float64)
+    trajectory = numbers.ndim == 2 and numbers.shape[1] == 4 and len(numbers) > 0
+    if numbers.shape not in ((2,), (4,)) and not trajectory:
+        shape = "x".join(map(str, numbers.shape)) or "single"
+        raise ValueError(
+            "a plan is 4 numbers (a state), several such states, or 2 numbers (acceleration, steering), "
+            f"not a {shape} one"
+        )
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"a plan that is not finite: {numbers.tolist()}")
+    if trajectory:
+        numbers = numbers[0]
+    if len(numbers) == 4:
+        away = math.dist(numbers[:2], state[:2])
+        if max(away / dt, abs(numbers[3])) > MAX_SPEED:
+            raise ValueError(
+                f"a target {away:.1f} m away at {numbers[3]:.1f} m/s, at most {MAX_SPEED:g} m/s are possible"
+            )
+        if abs(numbers[2]) > MAX_HEADING:
+            raise ValueError(f"a heading of {numbers[2]:g} rad, at most {MAX_HEADING:g} are possible")
+        return numbers
+    return np.clip(numbers, [-MAX_BRAKING, -MAX_STEERING], [MAX_ACCELERATION, MAX_STEERING])

@@ -1,0 +1,180 @@
+"""A planner in another process, in any language: JSON over its standard input and output, a line each.
+
+A process is started for every rollout. The first line it reads is ``{"reset": SCENE}``, every further one ``{"plan":
+NOW}``. It answers each with one line: ``reset`` with ``{}``, ``plan`` with ``{"step": STEP, "plan": PLAN}``: the
+step it was asked about, and ``[acceleration, steering]``, ``[x, y, heading, speed]``, or a list of such states.
+``{"error": "why"}`` ends the run, and so does whatever else it writes to its standard output: a line more than it
+was asked for, one of another step, or one of more than :data:`LONGEST` bytes. Its input ends when the rollout does;
+then, after :data:`GRACE` seconds, whatever is left of its process group is killed. What it writes to its standard
+error is shown.
+
+Of the environment it gets ``PATH``, ``HOME``, ``LANG``, names that begin with ``PYTHON``, and those that
+``SYMPHONY_PLANNER_ENV`` names, separated by commas.
+
+SCENE has ``segment_id``, ``dt``, ``steps``, ``seed``, ``ego``, ``goal`` [2], ``route`` [[x, y], ...], ``lanes`` (each
+with ``id``, ``points``, ``speed_limit`` or null, ``successors``) and ``lights`` (``x``, ``y``, ``lane``). NOW has
+``time``, ``step``, ``ego`` (``x``, ``y``, ``heading``, ``speed``, ``length``, ``width``), ``agents`` (lists ``x``,
+``y``, ``heading``, ``vx``, ``vy``, ``length``, ``width``, ``type``, ``id``), ``route`` (what lies ahead) and
+``lights`` (their states). Units and words are those of :class:`symphony.planners.view.Observation`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import shlex
+import signal
+import subprocess
+import time
+import weakref
+from typing import Any
+
+from symphony.planners.interface import Scenario, Traffic
+from symphony.planners.view import Ego, lanes_of, observation_of
+
+LONGEST = 1 << 20
+"""Bytes of an answer."""
+GRACE = 0.2
+"""Seconds that a process has to end by itself."""
+NAMES = "SYMPHONY_PLANNER_ENV"
+"""Names the variables that planners get beside the usual ones."""
+
+
+class ProcessPlanner:
+    """Asks a process of its own.
+
+    Args:
+        command: that starts it, as in a shell without its special characters.
+    """
+
+    def __init__(self, command: str) -> None:
+        self.command = command
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def reset(self, scenario: Scenario) -> None:
+        """Start the process and tell it the scene."""
+        self.scenario = scenario
+        self._process = subprocess.Popen(  # noqa: S603 - the user's own command
+            shlex.split(self.command),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            env=environment(),
+            start_new_session=True,  # a group of its own, which can be ended with it
+        )
+        self._ended = weakref.finalize(self, _end, self._process)
+        lanes = [
+            {
+                "id": lane.id,
+                "points": lane.points.tolist(),
+                "speed_limit": None if lane.speed_limit != lane.speed_limit else lane.speed_limit,
+                "successors": list(lane.successors),
+            }
+            for lane in lanes_of(scenario)
+        ]
+        x, y = scenario.signal_point.T.tolist()
+        lane = scenario.road.lane_id[scenario.signal_lane].tolist()
+        given = self._ask(
+            "reset",
+            {
+                "segment_id": scenario.segment_id,
+                "dt": scenario.dt,
+                "steps": scenario.steps,
+                "seed": scenario.seed,
+                "ego": Ego(*scenario.state.tolist(), *scenario.size.tolist())._asdict(),
+                "goal": scenario.goal.tolist(),
+                "route": scenario.route.tolist(),
+                "lanes": lanes,
+                "lights": {"x": x, "y": y, "lane": lane},
+            },
+        )
+        if not isinstance(given, dict):
+            self._ended()
+            raise ValueError(f"answered reset with {str(given)[:80]}, not with {{}}")
+
+    def plan(self, traffic: Traffic) -> Any:
+        """What it answers."""
+        seen = observation_of(self.scenario, traffic, ())
+        now = {
+            "time": seen.time,
+            "step": seen.step,
+            "ego": seen.ego._asdict(),
+            "agents": {name: value.tolist() for name, value in seen.agents._asdict().items()},
+            "route": seen.route.tolist(),
+            "lights": seen.lights.state.tolist(),
+        }
+        given = self._ask("plan", now)
+        if not isinstance(given, dict) or "plan" not in given or given.get("step") != seen.step:
+            self._ended()
+            raise ValueError(
+                f'answered {json.dumps(given)[:80]}, not {{"step": {seen.step}, "plan": ...}}: a line too many, '
+                "or the answer to another step"
+            )
+        return given["plan"]
+
+    def _ask(self, what: str, told: dict[str, Any]) -> Any:
+        if self._process is None:
+            raise RuntimeError("the planner's process was not started")
+        try:
+            return self._answer(self._process, what, json.dumps({what: told}, allow_nan=False).encode())
+        except BaseException:
+            self._ended()
+            raise
+
+    def _answer(self, process: subprocess.Popen[bytes], what: str, told: bytes) -> Any:
+        pipe, waiting = process.stdout, select.poll()
+        if pipe is None or process.stdin is None:
+            raise RuntimeError("the planner's process has no pipes")
+        waiting.register(pipe, select.POLLIN)
+        if waiting.poll(0) and (more := os.read(pipe.fileno(), 80)):
+            raise ValueError(f"wrote more than one line for an answer: {more.decode(errors='replace')!r}")
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(told + b"\n")
+        line = b""
+        while b"\n" not in line:
+            part = os.read(pipe.fileno(), 1 << 16)
+            if not part:
+                raise RuntimeError(
+                    f"the planner's process ended (status {self._ended()}) without an answer to {what}"
+                )
+            line += part
+            if len(line) > LONGEST:
+                raise ValueError(f"an answer of more than {LONGEST} bytes")
+        line, _, more = line.partition(b"\n")
+        if more:
+            raise ValueError(
+                f"wrote more than one line for an answer: {more[:80].decode(errors='replace')!r}"
+            )
+        given = json.loads(line.decode())
+        if isinstance(given, dict) and "error" in given:
+            raise RuntimeError(str(given["error"]))
+        return given
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ProcessPlanner:
+        raise TypeError("a process can't be copied")
+
+
+def environment() -> dict[str, str]:
+    """What a planner's process gets of ours: secrets in it are none of its business."""
+    named = {"PATH", "HOME", "LANG", *os.environ.get(NAMES, "").replace(" ", "").split(",")}
+    return {name: value for name, value in os.environ.items() if name in named or name.startswith("PYTHON")}
+
+
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """The process is told that nothing more comes, and killed where it goes on, with all it started; its status."""
+    with contextlib.suppress(BrokenPipeError):
+        if process.stdin is not None:
+            process.stdin.close()
+    late = time.monotonic() + GRACE
+    # Left unreaped until its group is killed: as long as it is there, nobody else gets the number.
+    asked = os.WEXITED | os.WNOWAIT | os.WNOHANG
+    with contextlib.suppress(ChildProcessError):
+        while os.waitid(os.P_PID, process.pid, asked) is None and time.monotonic() < late:
+            time.sleep(0.002)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    if process.stdout is not None:
+        process.stdout.close()
+    return process.wait()

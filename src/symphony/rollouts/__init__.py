@@ -1,0 +1,14 @@
+"""Closed-loop simulation: who drives whom, with and without a search, on one process or several."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.rollouts.unroll import Rollouts, simulate
+
+__all__ = ["Rollouts", "simulate"]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -1,0 +1,356 @@
+"""Background traffic: vehicles that nobody evaluates, driven by a rule, all rollouts at a time.
+
+Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout; on a
+device all agents.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from symphony import keys
+from symphony.data.segment import SignalState
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.dynamics import WHEELBASE, bicycle_step
+from symphony.envs.objects import Objects
+from symphony.envs.routes import SPACING
+from symphony.envs.scene import PointType, SceneBatch
+from symphony.geometry.frames import wrap
+from symphony.geometry.nearest import nearest, on_host
+from symphony.geometry.stations import NEAR
+from symphony.planners.included import (
+    AMBER,
+    AT_STOP,
+    BACK,
+    BEFORE,
+    BEYOND,
+    RED,
+    STOP_CHORD,
+    VIEW,
+    IDMPlanner,
+)
+from symphony.planners.interface import MAX_BRAKING, MAX_STEERING
+
+_LEADERS = 16
+"""Nearest others ahead of which one is followed."""
+_WITH = 0.25
+"""Cosine of the largest angle between a vehicle and the part of its route that it is on."""
+
+
+class ConstantSpeed(TensorDictModuleBase):
+    """Background agents keep speed and heading."""
+
+    in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
+    out_keys = [keys.BACKGROUND]  # noqa: RUF012
+
+    def __init__(self, env: DrivingEnv) -> None:
+        super().__init__()
+        self.env = env
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the next states [..., N, 4]."""
+        state = tensordict.get(keys.STATE)
+        way = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
+        moved = state[..., :2] + state[..., 3:] * self.env.dt * way
+        return tensordict.set(keys.BACKGROUND, torch.cat([moved, state[..., 2:]], -1))
+
+
+class CarFollower(TensorDictModuleBase):
+    """Background agents follow the routes of the log at the speed of the intelligent driver model.
+
+    What :class:`symphony.planners.included.IDMPlanner` does for one vehicle, with its parameters, for many at a
+    time: boxes of others are taken by their extent along and across the route, and only the nearest ones ahead are
+    looked at. One without a route goes straight on.
+
+    Args:
+        env: whose scenes have routes.
+    """
+
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012
+    out_keys = [keys.BACKGROUND]  # noqa: RUF012
+
+    def __init__(self, env: DrivingEnv) -> None:
+        super().__init__()
+        self.env, self.driver = env, IDMPlanner()
+        self.routes = _routes(env.scenes, self.driver)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the next states [..., N, 4]; those of other agents stay."""
+        scenes, lead = self.env.scenes, tensordict.ndim
+        row, at = tensordict.get(keys.SCENE).flatten(), tensordict.get(keys.STEP).flatten()
+        state, valid = (tensordict.get(key).flatten(0, lead - 1) for key in (keys.STATE, keys.VALID))
+        drives = scenes.background[row] & valid
+        # A device would wait to tell whom to leave out: there all others are moved, too, and put back.
+        m, n = drives.nonzero(as_tuple=True) if on_host(drives) else _pairs(drives)
+        everyone = self.env.objects(row, at, state, valid)
+        size = scenes.box_size[row[m], scenes.interactive[row[m], n]]
+        own, line = state[m, n], _Lines(*(part[row[m], n] for part in self.routes))
+        station = _own_station(line, own, self._driven(row[m], at[m], n, own[:, 3]))
+        front = station + 0.5 * size[:, 0]
+        gap, speed = self._leader(line, everyone, m, scenes.interactive[row[m], n], own, size, station)
+        red = self._red(line, row[m], at[m], front, own[:, 3])
+        gap, speed = torch.minimum(gap, red), torch.where(red < gap, 0.0, speed)
+        pull = self._acceleration(own[:, 3], self._free_speed(line, station), gap, speed)
+        after = bicycle_step(
+            own, pull, self._steering(line, own, size[:, 0], station), size[:, 0], self.env.dt
+        )
+        moved = state.index_put((m, n), torch.where(drives[m, n, None], after, own))
+        return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
+
+    def _driven(self, row: Tensor, at: Tensor, n: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
+        """About how far agents have come since they entered: by the mean of their speeds then and now."""
+        scenes = self.env.scenes
+        enter = scenes.enter[row, n]
+        before = scenes.log_state[row, enter, scenes.interactive[row, n], 3:].norm(dim=-1)
+        return (at - enter).clamp_min(0) * self.env.dt * 0.5 * (before + speed)
+
+    def _acceleration(self, speed: Tensor, free: Tensor, gap: Tensor, other: Tensor) -> Float[Tensor, " P"]:
+        driver = self.driver
+        approach = speed * (speed - other) / (2.0 * math.sqrt(driver.acceleration * driver.braking))
+        wanted = driver.gap + (speed * driver.headway + approach).clamp_min(0.0)
+        found = 1.0 - (speed / free.clamp_min(0.1)) ** 4 - (wanted / gap.clamp_min(0.1)) ** 2
+        return (driver.acceleration * found).clamp_min(-MAX_BRAKING)
+
+    def _free_speed(self, line: _Lines, station: Tensor) -> Float[Tensor, " P"]:
+        away = line.arc - station[:, None]
+        ahead = (away > -SPACING) & (away < VIEW)
+        allowed = (line.limit.square() + 2.0 * self.driver.braking * away.clamp_min(0.0)).sqrt()
+        free = torch.where(ahead, allowed, torch.inf).amin(-1)
+        return torch.where(ahead.any(-1), free, self.driver.speed)
+
+    def _leader(
+        self,
+        line: _Lines,
+        everyone: Objects,
+        m: Int[Tensor, " P"],
+        agent: Int[Tensor, " P"],
+        own: Float[Tensor, "P 4"],
+        size: Float[Tensor, "P 2"],
+        station: Float[Tensor, " P"],
+    ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+        """Gap to what is next in front, infinite for nothing, and its speed along the route."""
+        delta = everyone.state[m, :, :2] - own[:, None, :2]
+        squared = delta.square().sum(-1)
+        forward = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
+        # Behind is what is behind on any bend that a vehicle can take within its own length.
+        behind = (delta * forward[:, None]).sum(-1) < -size[:, :1]
+        other = torch.arange(squared.shape[1], device=m.device) != agent[:, None]
+        hidden = ~everyone.valid[m] | ~other | behind | (squared > VIEW**2)
+        chosen, there = nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS)
+        chosen, there = chosen[:, 0], there[:, 0]
+        pick = (m[:, None], chosen)
+        pose, box = everyone.state[pick], everyone.size[pick]
+        along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], VIEW))
+        turn = pose[..., 2] - way
+        cos, sin = turn.cos().abs(), turn.sin().abs()
+        reach = 0.5 * (cos * box[..., 0] + sin * box[..., 1])
+        across = 0.5 * (sin * box[..., 0] + cos * box[..., 1])
+        corridor = 0.5 * size[:, 1:] + self.driver.margin
+        ahead = there & (along > station[:, None]) & (aside.abs() - across < corridor)
+        gaps = torch.where(ahead, along - reach - (station + 0.5 * size[:, 0])[:, None], torch.inf)
+        gap, which = gaps.min(-1)
+        speed = pose[..., 3] * way.cos() + pose[..., 4] * way.sin()
+        return gap, speed.gather(-1, which[:, None])[:, 0].clamp_min(0.0)
+
+    def _red(
+        self, line: _Lines, row: Tensor, at: Tensor, front: Tensor, speed: Tensor
+    ) -> Float[Tensor, " P"]:
+        """Gap to the next light of the route that is red, or amber with room to stop; infinite for none."""
+        scenes = self.env.scenes
+        shown = scenes.light[row, at.clamp(max=scenes.light.shape[1] - 1)]
+        gap = line.stop - front[:, None]
+        in_time = gap > (speed.square() / (2.0 * self.driver.braking))[:, None]
+        stops = _among(shown, RED) | (_among(shown, AMBER) & in_time)
+        gap = torch.where(stops & (gap > -2.0), gap, torch.inf)
+        return torch.cat([gap, torch.full_like(gap[:, :0].sum(-1, keepdim=True), torch.inf)], -1).amin(-1)
+
+    def _steering(self, line: _Lines, own: Tensor, length: Tensor, station: Tensor) -> Float[Tensor, " P"]:
+        base, (x, y, heading, speed) = WHEELBASE * length, own.unbind(-1)
+        rear = torch.stack([x - 0.5 * base * heading.cos(), y - 0.5 * base * heading.sin()], -1)
+        ahead = (3.0 + 0.5 * speed.abs()).clamp_max(20.0)
+        near = _within(line, station - base - BACK, base + 2 * BACK)
+        to = _at(line, _project(line, rear[:, None], near)[0][:, 0] + ahead) - rear
+        angle = torch.atan2(to[:, 1], to[:, 0]) - heading
+        found = torch.atan(2.0 * base * angle.sin() / to.norm(dim=-1).clamp_min(0.1))
+        return found.clamp(-MAX_STEERING, MAX_STEERING)
+
+
+class _Lines(NamedTuple):
+    """Routes, straight on past both of their ends; leading dimensions [B, N] or [P].
+
+    Attributes:
+        points: [..., K + 2, 2].
+        arc: [..., K + 2] metres, 0 at the first point of the route.
+        limit: [..., K + 2] m/s that its lanes and its bends allow.
+        stop: [..., Q] where the front stops at a light, infinite for those of other ways.
+    """
+
+    points: Tensor
+    arc: Tensor
+    limit: Tensor
+    stop: Tensor
+
+
+def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
+    """The routes of the log of all agents [B, N]; without one, straight on."""
+    row = torch.arange(len(scenes), device=scenes.route_point.device)
+    points, exist = scenes.routes.of(row, scenes.route_logged).lines()
+    # Of an agent without a route: two points from where it enters.
+    enters = scenes.log_state[row[:, None], scenes.enter, scenes.interactive]
+    place = torch.arange(points.shape[2], device=row.device)
+    way = torch.stack([enters[..., 2].cos(), enters[..., 2].sin()], -1)
+    straight = enters[..., None, :2] + SPACING * place[:, None] * way[..., None, :]
+    points = torch.where((exist > 1)[..., None, None], points, straight)
+    last = torch.where(exist > 1, exist, points.shape[2])[..., None] - 1
+    ends = [points.gather(2, k[..., None].expand(*k.shape, 2))[:, :, 0] for k in (last - 1, last)]
+    onward = _unit(ends[1] - ends[0])
+    past = (place - last).clamp_min(0)[..., None]
+    points = torch.where(past > 0, ends[1][:, :, None] + SPACING * past * onward[:, :, None], points)
+    first = _unit(points[:, :, 1] - points[:, :, 0])
+    points = torch.cat(
+        [
+            (points[:, :, 0] - BEFORE * first)[:, :, None],
+            points,
+            (points[:, :, -1] + BEYOND * onward)[:, :, None],
+        ],
+        2,
+    )
+    pieces = points.diff(dim=2)
+    length = pieces.norm(dim=-1)
+    arc = torch.cat([torch.zeros_like(length[..., :1]), length.cumsum(-1)], -1) - BEFORE
+    angle = torch.atan2(pieces[..., 1], pieces[..., 0])
+    near = length.clamp_max(SPACING)
+    bend = wrap(angle.diff(dim=-1)).abs() / (0.5 * (near[..., 1:] + near[..., :-1])).clamp_min(1e-3)
+    bend = torch.nn.functional.pad(bend, (1, 1))
+    limit = _limits(scenes, points, driver.speed)
+    limit = torch.minimum(limit, (driver.lateral / bend.clamp_min(1e-6)).sqrt())
+    lines = _Lines(points, arc, limit, arc[..., :0])
+    return lines._replace(stop=_stops(scenes, lines))
+
+
+def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor, "B N K"]:
+    """Speed limit of the lane nearest to each point."""
+    lane = scenes.point_valid & (scenes.point_type == PointType.LANE)
+    found = []
+    for b in range(len(scenes)):
+        lanes, speed = scenes.point[b, lane[b]], scenes.point_speed[b, lane[b]]
+        if not len(lanes):
+            found.append(torch.full_like(points[b, ..., 0], unknown))
+            continue
+        nearest_lane = torch.cdist(points[b].flatten(0, 1), lanes).argmin(-1)
+        limit = speed[nearest_lane].reshape(points.shape[1:3])
+        found.append(torch.where(limit > 0, limit, unknown))
+    return torch.stack(found)
+
+
+def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
+    """Metres along the routes at which lights stop them.
+
+    A light is on a route if its stop point is; of several with one stop point, that whose lane leads most nearly to
+    where the route goes.
+    """
+    lights = scenes.light.shape[2]
+    out = torch.full((*lines.arc.shape[:2], lights), torch.inf, device=lines.arc.device)
+    for b in range(len(scenes)):
+        which = (scenes.point_light[b] >= 0).nonzero()[:, 0]
+        if not len(which):
+            continue
+        point, way = scenes.point[b, which], scenes.point_direction[b, which]
+        line = _Lines(*(part[b] for part in lines))
+        station, aside, _ = _project(line, point.expand(len(line.arc), -1, -1))
+        beyond = torch.stack([_at(line, station[:, q] + STOP_CHORD) for q in range(len(which))], 1)
+        along = (_unit(beyond - point) * way).sum(-1)
+        along = along.masked_fill((aside.abs() > AT_STOP) | (station < -5.0), -torch.inf)
+        same = (point[:, None] - point[None]).norm(dim=-1) < 1.0
+        best = torch.where(same, along[:, None, :], -torch.inf).amax(-1)
+        mine = (along > 0.0) & (along >= best)
+        out[b][:, scenes.point_light[b, which].long()] = torch.where(mine, station, torch.inf)
+    return out
+
+
+def _own_station(line: _Lines, own: Float[Tensor, "P 4"], driven: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+    """Metres along of agents that follow the lines: of the places nearly nearest that lead their way the one that
+    fits the way driven best, as routes lead around blocks.
+    """
+    way = line.points.diff(dim=1)
+    heading = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
+    with_it = (way * heading[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
+    with_it = with_it | ~with_it.any(-1, keepdim=True)
+    return _project(line, own[:, None, :2], with_it, driven)[0][:, 0]
+
+
+def _within(line: _Lines, low: Float[Tensor, " P"], length: Tensor | float) -> Bool[Tensor, "P pieces"]:
+    """Pieces of the lines that reach into what lies from `low` metres along on for `length` metres."""
+    return (line.arc[:, 1:] >= low[:, None]) & (line.arc[:, :-1] <= (low + length)[:, None])
+
+
+def _project(
+    line: _Lines,
+    places: Float[Tensor, "P J 2"],
+    pieces: Bool[Tensor, "P pieces"] | None = None,
+    about: Float[Tensor, " P"] | None = None,
+) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J"]]:
+    """Metres along, metres to the left, and heading of the line, at its places nearest to some: of several passes of
+    the pieces that count the earliest (see :mod:`symphony.geometry.stations`), or the nearest to so many metres.
+    """
+    start, length = line.points[:, :-1], line.arc.diff(dim=-1)
+    ahead = line.points.diff(dim=1) / length.clamp_min(1e-6)[..., None]
+    x, y = (places[:, :, None, k] - start[:, None, :, k] for k in (0, 1))
+    cos, sin = ahead[:, None, :, 0], ahead[:, None, :, 1]
+    share = (x * cos + y * sin).clamp_min(0.0).minimum(length[:, None])
+    squared = (x - share * cos).square() + (y - share * sin).square()
+    if pieces is not None:
+        squared = squared.masked_fill(~pieces[:, None], torch.inf)
+    distance = squared.sqrt()
+    beside = torch.nn.functional.pad(distance, (1, 1), value=torch.inf)
+    lowest = (distance <= beside[..., :-2]) & (distance <= beside[..., 2:])
+    lowest &= distance <= distance.amin(-1, keepdim=True) + NEAR
+    which = lowest.to(torch.uint8).argmax(-1, keepdim=True)
+    if about is not None:
+        off = (line.arc[:, None, :-1] + share - about[:, None, None]).abs()
+        which = off.masked_fill(~lowest, torch.inf).argmin(-1, keepdim=True)
+
+    def of(values: Tensor) -> Tensor:
+        return values.expand_as(squared).gather(-1, which)[..., 0]
+
+    cos, sin = of(cos), of(sin)
+    left = cos * of(y) - sin * of(x)
+    away = of(squared).sqrt()
+    return of(line.arc[:, None, :-1]) + of(share), torch.where(left < 0, -away, away), torch.atan2(sin, cos)
+
+
+def _at(line: _Lines, station: Float[Tensor, " P"]) -> Float[Tensor, "P 2"]:
+    """The points so many metres along."""
+    piece = (torch.searchsorted(line.arc.contiguous(), station[:, None], right=True) - 1)[:, 0]
+    piece = piece.clamp(0, line.arc.shape[-1] - 2)
+    row = torch.arange(len(piece), device=piece.device)
+    start, end = line.points[row, piece], line.points[row, piece + 1]
+    share = (station - line.arc[row, piece]) / (line.arc[row, piece + 1] - line.arc[row, piece]).clamp_min(
+        1e-6
+    )
+    return start + share[:, None] * (end - start)
+
+
+def _pairs(values: Tensor) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """Row and column of every element of a matrix."""
+    row, column = (torch.arange(size, device=values.device) for size in values.shape)
+    return row.repeat_interleave(len(column)), column.repeat(len(row))
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+
+
+def _among(shown: Tensor, states: tuple[SignalState, ...]) -> Tensor:
+    found = torch.zeros_like(shown, dtype=torch.bool)
+    for state in states:
+        found |= shown == int(state)
+    return found

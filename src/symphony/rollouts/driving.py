@@ -1,0 +1,379 @@
+"""What an agent does on a batch of scenes, as it was trained or as a configuration says."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Int
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+
+from symphony import keys
+from symphony.agents import Agent
+from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
+from symphony.config import EvaluateConfig
+from symphony.envs.baselines import ConstantVelocity
+from symphony.envs.dynamics import Bicycle
+from symphony.envs.flags import offroad_flags
+from symphony.envs.scene import SceneBatch
+from symphony.errors import ConfigError
+from symphony.learning.logged import logged, logged_heights
+from symphony.metrics import collisions
+from symphony.modules import SeededNoise
+from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv
+from symphony.rollouts.background import CarFollower, ConstantSpeed
+from symphony.rollouts.control import Tempered, given_personas
+from symphony.rollouts.finite import FiniteWatch
+from symphony.rollouts.search import going_back, pruning_rule, search
+from symphony.rollouts.unroll import (
+    Rollouts,
+    between_states,
+    draw_goals,
+    existing,
+    rollouts_of,
+    simulate,
+    start_states,
+)
+
+RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
+    "constant_velocity": ConstantSpeed,
+    "idm": CarFollower,
+}
+"""What can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
+
+
+class Simulation(NamedTuple):
+    """What came of a simulation.
+
+    Attributes:
+        rollouts: [B, K, ...].
+        goal: [B, K, N] number of the route that each agent followed, -1 for none.
+        search: the trees of which the rollouts are the leaves, [B, trees]; None without any.
+        steps: that were simulated for them, each of a rollout or branch.
+        failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
+        at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
+        drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
+    """
+
+    rollouts: Rollouts
+    goal: Int[Tensor, "B K N"]
+    search: BeamSearchResult | None
+    at_states: Bool[Tensor, "B K T N"]
+    steps: int = 0
+    failed: tuple[dict[int, str], ...] = ()
+    drawn: Int[Tensor, "B trees S N"] | None = None
+
+
+def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
+    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
+
+    Raises:
+        ConfigError, NotFiniteError: as :func:`simulation`.
+    """
+    return driven_by(agent, scenes, config).rollouts
+
+
+def simulation(
+    agent: Agent,
+    scenes: SceneBatch,
+    config: EvaluateConfig,
+    *,
+    keep_tree: bool = False,
+    egos: EgoPlanners | None = None,
+    given: Int[Tensor, "B N"] | None = None,
+) -> Simulation:
+    """K rollouts of every scene, and how they came about.
+
+    Args:
+        agent: that drives.
+        scenes: B scenes.
+        config: how.
+        keep_tree: of a search keep the pruned branches, too.
+        egos: plan the first agent of every scene, which no search scores; the agent drives the others.
+        given: number of the route that an agent is to follow, -1 where that is left open.
+
+    Raises:
+        ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
+            step, a goal is given to an agent that follows none, a planner can't be copied for a search, or another
+            rule drives the others than the agent.
+        NotFiniteError: if one of its networks puts out a number that is not finite.
+    """
+    policy = agent.policy
+    _check_given(agent, scenes, config, given)
+    if agent.rule:
+        scenes, config = _ruled(agent, scenes, config, given)
+    if policy is None:
+        if egos is None:
+            raise ValueError("log playback has nothing to simulate")
+        if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
+            raise ConfigError("beside log playback the planner's ego is the only interactive agent")
+        policy = ConstantVelocity(Bicycle())
+    agent.check_step(float(scenes.dt[0]))
+    env = PlannedEnv(scenes, agent.dynamics, agent.observation)
+    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
+    watch = FiniteWatch(env)
+    goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
+    actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
+    fix = _fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None)
+    start = start_states(
+        env,
+        goals,
+        trees=trees,
+        branches=branches,
+        seed=config.seed,
+        logged_goals=config.logged_goals,
+        goals_per=settings.goals,
+        personas=given_personas(agent.personas, config.persona),
+        fix=fix,
+    )
+    planned, kind = None, search_kind(agent, config)
+
+    def begin(state: TensorDictBase) -> TensorDictBase:
+        if goals is None or config.logged_goals:
+            return state
+        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
+        return env.with_goals(state, fix(state.get(keys.SCENE).squeeze(-1), goal))
+
+    if egos is not None:
+        if kind == "backtrack":
+            raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
+        forked = kind not in ("none", "log")
+        planned = egos.begin(env, start, seed=config.seed, forked=forked)
+        actor = TensorDictSequential(actor, planned)
+    result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
+    drawn, steps = goal, start.numel() * env.decisions
+    if kind in ("none", "log"):
+        found = simulate(
+            env, TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor), start
+        )
+    else:
+        best, scorer = kind == "best", None
+        rules: dict[str, Callable[[], PruningRule | Backtrack]] = {
+            "best": KeepAll,
+            "backtrack": lambda: going_back(env, settings.threshold, start.numel(), begin),
+        }
+        if agent.discriminator is not None:
+            scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
+        with torch.no_grad():
+            result = search(
+                env,
+                actor,
+                scorer,
+                start,
+                seed=config.seed,
+                rule=rules.get(kind, lambda: pruning_rule(settings))(),
+                prune_every=settings.prune_every,
+                score=config.score,
+                leaves=None if best else taken,
+                keep_tree=keep_tree and kind == "tree",
+                ego=planned is None,
+                also=() if planned is None else (keys.PLANNER,),
+            )
+        found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
+        # A copy of a branch follows the goals of its parent.
+        goal = result.trajectories.get(keys.GOAL)[..., -1, :]
+        number = result.trajectories.get(keys.PLANNER, None)
+        number = None if number is None else number[..., -1, :]
+        if best:
+            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            found = Rollouts(*(_branches(part, order) for part in found))
+            goal = _branches(goal, order)
+            number = None if number is None else _branches(number, order)
+        result = result if kind == "tree" else None
+    watch.check()
+    rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
+    goal = goal[:, :, :taken].flatten(1, 2)
+    of_tree = None if result is None else drawn
+    whole = Simulation(rollouts, goal, result, at_states=rollouts.collision, steps=steps, drawn=of_tree)
+    if planned is None or number is None:
+        return whole
+    return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
+
+
+def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
+    """A policy with what a configuration changes in its draws, and with the rule that drives background agents.
+
+    Raises:
+        ConfigError: a temperature for a policy without discrete actions.
+    """
+    found = policy
+    if config.action_temperature != 1.0:
+        if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
+            raise ConfigError(
+                "this agent draws no discrete actions, so action-temperature means nothing to it"
+            )
+        found = TensorDictSequential(found, Tempered(config.action_temperature))
+    if config.others in RULES:
+        found = TensorDictSequential(found, RULES[config.others](env))
+    return found
+
+
+def _ruled(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
+) -> tuple[SceneBatch, EvaluateConfig]:
+    """Scenes and settings in which the agent's rule drives everyone, along the routes of the log unless given."""
+    if config.others not in ("log", "learned", agent.rule):
+        raise ConfigError(f"{agent.name} can't be simulated among others that '{config.others}' drives")
+    ruled = scenes.clone(recurse=False)
+    ruled.background = scenes.interactive_valid
+    if given is not None:
+        ruled.route_logged = torch.where(given >= 0, given, scenes.route_logged)
+    return ruled, dataclasses.replace(config, others=agent.rule or config.others)
+
+
+def _check_given(
+    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
+) -> None:
+    """Refuse goals for agents that follow none."""
+    if given is None or agent.goals is not None or agent.rule:
+        return
+    follows = scenes.background & (config.others == "idm")
+    if bool(((given.to(follows.device) >= 0) & ~follows).any()):
+        raise ConfigError(f"{agent.name} follows no goals, so a given one means nothing to it")
+
+
+def _fixed_goals(
+    scenes: SceneBatch, given: Int[Tensor, "B N"] | None, *, along_log: bool, ego: bool
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """From rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
+
+    Args:
+        scenes: B scenes.
+        given: routes of agents, -1 where that is left open.
+        along_log: whether background agents follow the log's routes.
+        ego: whether the first agent of each scene does.
+    """
+
+    def fixed(scene: Tensor, goal: Tensor) -> Tensor:
+        logged = scenes.route_logged[scene]
+        if along_log:
+            goal = torch.where(scenes.background[scene], logged, goal)
+        if given is not None:
+            chosen = given.to(goal.device)[scene]
+            goal = torch.where(chosen >= 0, chosen, goal)
+        # Scenes without routes have no number of one either.
+        if ego and scenes.route_point.shape[1]:
+            goal = torch.cat([logged[..., :1], goal[..., 1:]], -1)
+        return goal
+
+    return fixed
+
+
+def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
+    """Steps after a planner, number [B, K, 1], failed don't count."""
+    scenes, rollouts = number.shape[:2]
+    each = planned.failures(number)
+    steps = found.rollouts.counted.shape[-2]
+    until = torch.tensor([steps if one is None else one.step for one in each], device=number.device)
+    going = torch.arange(steps, device=number.device) < until.reshape(scenes, rollouts, 1)
+    failed = tuple(
+        {k: one.reason for k, one in enumerate(each[b * rollouts : (b + 1) * rollouts]) if one is not None}
+        for b in range(scenes)
+    )
+    kept = found.rollouts._replace(counted=found.rollouts.counted & going[..., None])
+    return found._replace(rollouts=kept, failed=failed)
+
+
+def search_kind(agent: Agent, config: EvaluateConfig) -> str:
+    """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
+    if agent.policy is None:
+        return "log"
+    blind = config.score == "discriminator" and agent.discriminator is None
+    if config.search == "agent":
+        return "tree" if agent.searches and not blind else "none"
+    if config.search != "none" and blind:
+        raise ConfigError(
+            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
+            "score: --score flags or rule"
+        )
+    return config.search
+
+
+def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
+    """Trees per segment, branches per tree, and rollouts taken from each tree."""
+    kind = search_kind(agent, config)
+    if kind in ("none", "log", "backtrack"):
+        return config.rollouts, 1, 1
+    branches = config.pruning(agent.search).test_branches
+    if kind == "best":
+        return config.rollouts, branches, 1
+    taken = config.rollouts // config.trees
+    if taken > branches:
+        raise ConfigError(
+            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
+        )
+    return config.trees, branches, taken
+
+
+def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
+    """How many of the run segments give a number of runs together, and the configuration with as few rollouts of
+    each as that takes: what is independent of each other are segments.
+
+    It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
+    rollouts than a tree has branches come from as few trees as that takes.
+    """
+    kind, least = search_kind(agent, config), -(-runs // segments)
+    branches = config.pruning(agent.search).test_branches
+
+    def whole(each: int) -> tuple[int, int]:
+        """At least so many rollouts, as many of each tree, and how many trees that takes."""
+        trees = max(config.trees, -(-each // branches)) if kind == "tree" else 1
+        return -(-each // trees) * trees, trees
+
+    exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
+    each, trees = whole(next((each for each in exact if whole(each)[0] == each), least))
+    return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
+
+
+def _branches(part: Tensor, order: Tensor) -> Tensor:
+    """part [B, trees, S, ...] at the branches order [B, trees, K]."""
+    index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
+    return part.gather(2, index)
+
+
+def driven_by(
+    agent: Agent,
+    scenes: SceneBatch,
+    config: EvaluateConfig,
+    *,
+    keep_tree: bool = False,
+    egos: EgoPlanners | None = None,
+    given: Int[Tensor, "B N"] | None = None,
+) -> Simulation:
+    """What an agent does: :func:`playback` of the log, or a :func:`simulation`; collisions of the rollouts are found
+    between states, too.
+    """
+    if agent.policy is not None or egos is not None:
+        found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        rollouts = found.rollouts
+        between = between_states(scenes, rollouts.state, existing(scenes, rollouts))
+        return found._replace(rollouts=rollouts._replace(collision=between))
+    _check_given(agent, scenes, config, given)
+    log = playback(scenes)
+    at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
+    return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
+
+
+def playback(scenes: SceneBatch) -> Rollouts:
+    """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
+    log, valid = logged(scenes)
+    row, height = torch.arange(len(scenes), device=log.device), logged_heights(scenes)
+    height = None if height is None else height.flatten(1, 2)
+    off = offroad_flags(scenes, row, log[..., :2].flatten(1, 2), height=height).view(valid.shape) & valid
+    hit = _logged_collisions(scenes)
+    return Rollouts(log[:, None], hit[:, None], off[:, None, 1:], valid[:, None, 1:])
+
+
+def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[Tensor, "B T N"]:
+    """See :func:`symphony.metrics.collisions`; what an agent does that is not there is no collision."""
+    moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
+    subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
+    height = scenes.agent_height.transpose(1, 2) if scenes.agent_height.shape[1] else None
+    hit = collisions(
+        moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, height, at_states=at_states
+    )
+    return hit.transpose(1, 2)

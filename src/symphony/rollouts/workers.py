@@ -1,0 +1,127 @@
+"""Run segments, shared among processes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import lru_cache
+from typing import Any, TypeVar, cast
+
+from symphony import allocator
+from symphony.agents import Agent
+from symphony.config import EvaluateConfig
+from symphony.config.evaluation import TOGETHER
+from symphony.errors import ConfigError, SymphonyError
+from symphony.learning.demonstrations import SceneDataset
+from symphony.parallel import WorkerError, ordered_map
+from symphony.rollouts.driving import planned_trees, search_kind
+from symphony.rollouts.search import FILL
+
+POINTS = 1 << 19
+"""Map points that all agents of a batch see together, at most: some 50 MB of features."""
+IN_TRAFFIC = 32
+"""Agents that a run segment is taken to have where everyone is driven: all of a batch have room for as many as the
+fullest."""
+NAMED = 8
+"""Run segments of a batch that an error names, at most."""
+
+T = TypeVar("T")
+R = TypeVar("R")
+Work = Callable[[T], R]
+"""What is done with a task, such as a batch of items; a picklable object, with the dataset and the agent inside."""
+
+
+def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
+    """Run segments to simulate at a time: as many as the configuration says. Where it leaves that open, up to
+    ``TOGETHER``, as a step of few agents costs little less than one of many; fewer if they see more than ``POINTS``.
+
+    Args:
+        agent: that drives.
+        config: in how many rollouts and branches.
+        interactive: agents per segment, where not everyone is driven.
+    """
+    if config.batch:
+        return config.batch
+    everyone = config.interactive == "all" or config.open_traffic or config.others != "log"
+    trees, branches, _ = planned_trees(agent, config)
+    agents = trees * branches * (IN_TRAFFIC if everyone else interactive)
+    found = min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
+    return found * FILL if search_kind(agent, config) == "backtrack" else found
+
+
+def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:
+    """Items in their order, so many at a time; where the configuration leaves that open, so few that each of several
+    workers gets two batches.
+    """
+    if config.workers > 1 and not config.batch:
+        size = max(1, min(size, -(-len(items) // (2 * config.workers))))
+    return [list(items[first : first + size]) for first in range(0, len(items), size)]
+
+
+def shared(
+    work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig, dataset: SceneDataset | None = None
+) -> Generator[R, None, None]:
+    """The results of some work on every task, in the order of the tasks, by ``config.workers`` processes.
+
+    With a dataset, tasks are a list of batches of its items.
+
+    One local worker is this very process. ``close`` ends the others.
+
+    Raises:
+        ConfigError: the work can't be sent to another process, or Ray is not installed.
+        SymphonyError: a worker process died, with the run segments at hand if the dataset is given; what the work
+            raises comes through unchanged.
+    """
+    if config.workers == 1 and config.engine == "local":
+        yield from map(work, tasks)
+        return
+    try:
+        sent = pickle.dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ConfigError(f"can't be shared among processes: {error}") from error
+    pairs = ((sent, task) for task in tasks)
+    done = ordered_map(
+        _done, pairs, workers=config.workers, engine=config.engine, imports=[type(work).__module__]
+    )
+    with closing(done) as results:
+        try:
+            for result in results:
+                yield cast(R, pickle.loads(result))  # noqa: S301  (from our own worker)
+        except WorkerError as error:
+            if dataset is None:
+                raise
+            batched = cast("Sequence[list[int]]", tasks)
+            names = _names(dataset, [i for number in error.tasks for i in batched[number]])
+            raise SymphonyError(f"{error}; at hand were the run segments {names}") from error
+
+
+@contextmanager
+def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
+    """An unexpected error inside names the run segments at hand; those of this package do so themselves."""
+    try:
+        yield
+    except SymphonyError:
+        raise
+    except Exception as error:
+        error.add_note(f"in one of the run segments {_names(dataset, items)}")
+        raise
+
+
+def _names(dataset: SceneDataset, items: Sequence[int]) -> str:
+    names = ", ".join(dataset.store.ids[dataset.indices[i]] for i in items[:NAMED])
+    more = len(items) - NAMED
+    return f"{names} and {more} more (batches of 1 tell which)" if more > 0 else names
+
+
+@lru_cache(1)
+def _opened(sent: bytes) -> Work[Any, Any]:
+    """The work, once per process: it keeps what it prepared from one task to the next."""
+    allocator.tune()  # this process is ours
+    return cast("Work[Any, Any]", pickle.loads(sent))  # noqa: S301  (from our own parent)
+
+
+def _done(pair: tuple[bytes, Any]) -> bytes:
+    # As bytes: tensors of their own would travel through shared memory, of which containers have little.
+    sent, task = pair
+    return pickle.dumps(_opened(sent)(task))

@@ -1,0 +1,1 @@
+"""Rollouts on disk: the format, writing, reading and export to other tools."""

@@ -1,0 +1,123 @@
+"""Who drives, as digests: another agent or planner of the same name is another simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+import json
+import re
+import shlex
+from collections.abc import Callable, Mapping, Set
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor, nn
+
+from symphony.agents import Agent
+from symphony.planners.interface import PIPE, planner_maker
+from symphony.planners.view import FunctionPlanner
+
+_PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
+
+
+def identity_of(agent: Agent) -> dict[str, str]:
+    """Digests of an agent's weights and of what it is built and searched by, as settings: another agent of the same
+    name is another simulation.
+    """
+    if not agent.modules:
+        return {}
+    digest = hashlib.sha256()
+    for part, module in sorted(agent.modules.items()):
+        for name, value in sorted(module.state_dict().items()):
+            digest.update(f"{part}.{name} {value.dtype} {tuple(value.shape)}".encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    specification = "" if agent.spec is None else json.dumps(dataclasses.asdict(agent.spec), sort_keys=True)
+    return {"weights": digest.hexdigest()[:12], "specification": _short(specification.encode())}
+
+
+def source_of(planner: str | Callable[..., Any]) -> str:
+    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it (by
+    ``functools.partial``, as an object's attributes, by the function around it): one that was changed is another one.
+
+    Of a command what it starts, where that is a file, and the first other word that is one. Empty for what comes with
+    the package, and where no source is known.
+    """
+    if isinstance(planner, str) and planner.startswith(PIPE):
+        words = shlex.split(planner.removeprefix(PIPE))
+        found = [_digest(words[0]), next(filter(None, map(_digest, words[1:])), "")]
+        return _short("".join(found).encode()) if all(found) else "".join(found)
+    given, bound = planner_maker(planner), ""
+    if isinstance(given, partial) and given.func is FunctionPlanner:
+        given = given.args[0]
+    while isinstance(given, partial):
+        bound += _content((given.args, given.keywords))
+        given = given.func
+    held = _held_by(given)
+    bound += _content(held) if held else ""
+    code = _code_of(given)
+    return _short((code + bound).encode()) if bound else code
+
+
+def _content(value: Any, inside: tuple[int, ...] = ()) -> str:
+    """A value in words that are the same in every process, and others where any part of it is another.
+
+    What Python prints of an array leaves out its middle, of a set is in any order, and of an object may be its name
+    only.
+    """
+    if id(value) in inside:
+        return "itself"
+    inside = (*inside, id(value))
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        return f"{value.dtype}{value.shape}{_short(np.ascontiguousarray(value).tobytes())}"
+    if isinstance(value, nn.Module):
+        value = {"": type(value).__qualname__, **value.state_dict()}
+    if isinstance(value, Mapping):
+        parts = [f"{_content(name, inside)}: {_content(held, inside)}" for name, held in value.items()]
+    elif isinstance(value, Set):
+        parts = sorted(_content(held, inside) for held in value)
+    elif isinstance(value, (list, tuple, np.ndarray)):
+        parts = [_content(held, inside) for held in value]
+    elif type(value).__repr__ is object.__repr__ and getattr(value, "__dict__", None):
+        parts = [_content(vars(value), inside)]
+    else:
+        # Where an object lies in memory is nothing of it.
+        return _PLACE.sub("", repr(value))
+    return f"{type(value).__qualname__}({', '.join(parts)})"
+
+
+def _held_by(given: Any) -> Mapping[str, Any]:
+    """What an object or a function has beside its code, by name."""
+    if inspect.isfunction(given):
+        return inspect.getclosurevars(given).nonlocals
+    owner = given.__self__ if inspect.ismethod(given) else given
+    return {} if inspect.isclass(owner) else getattr(owner, "__dict__", {})
+
+
+def _code_of(given: Any) -> str:
+    module = inspect.getmodule(given)
+    if module is None or module.__name__.partition(".")[0] == "symphony":
+        return ""
+    file = getattr(module, "__file__", None)
+    if file is not None:
+        return _digest(file)
+    try:  # of a notebook, say
+        return _short(inspect.getsource(given).encode())
+    except (OSError, TypeError):
+        return ""
+
+
+def _short(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:12]
+
+
+def _digest(file: str) -> str:
+    """Of what a file holds; empty where there is none that can be read."""
+    try:
+        return _short(Path(file).read_bytes()) if Path(file).is_file() else ""
+    except OSError:
+        return ""

@@ -1,0 +1,172 @@
+"""Simulate an agent and keep its rollouts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from symphony.agents import Agent
+from symphony.config import EvaluateConfig
+from symphony.errors import DataError
+from symphony.learning.demonstrations import SceneDataset
+from symphony.planners.calls import SECONDS
+from symphony.planners.driver import EgoPlanners
+from symphony.planners.interface import planner_maker, planner_name
+from symphony.rollouts.control import given_goals
+from symphony.rollouts.driving import driven_by
+from symphony.rollouts.finite import NotFiniteError
+from symphony.rollouts.workers import batches, naming, segments_together, shared
+from symphony.saved.folder import About, RolloutFolder, RolloutWriter
+from symphony.saved.identity import identity_of, source_of
+from symphony.saved.rollouts import PLAYBACK, SavedRollouts, saved_rollouts
+
+_MEMORY = ("batch", "device", "metric", "workers", "engine")
+"""Settings that change no rollout."""
+PLANNED = 16
+"""Run segments simulated at a time with a planner, of which each rollout has a copy, unless more are asked for."""
+
+
+def save_simulation(
+    path: str | Path,
+    agent: Agent,
+    dataset: SceneDataset,
+    config: EvaluateConfig,
+    *,
+    keep_tree: bool = True,
+    planner: str | Callable[..., Any] = "",
+    planner_seconds: float = SECONDS,
+    goals: Sequence[str] = (),
+    progress: Callable[[int, int], None] | None = None,
+) -> RolloutFolder:
+    """Simulate an agent on every run segment of a dataset and keep the rollouts, segment by segment.
+
+    What was cut short goes on where it stopped: rollouts depend on the seed and the segment, not on the batch.
+
+    Args:
+        path: the folder.
+        agent: on ``config.device``; log playback is kept as it is.
+        dataset: in the agent's action space, with routes if it follows goals.
+        config: how it is simulated.
+        keep_tree: of a search keep all branches with their scores, too.
+        planner: of the ego, or its name, as of :func:`symphony.planners.interface.planner_maker`; then the dataset
+            holds routes and the agent drives the other interactive agents. Segments whose ego can't be driven are put
+            on record as failed.
+        planner_seconds: that it has for one answer; more fails the run.
+        goals: of agents, as :func:`symphony.rollouts.control.given_goals` reads them; then the dataset has routes.
+        progress: called with the segments done and their total.
+
+    Raises:
+        DataError: the folder holds something else, or the disk refuses.
+        ConfigError: the agent can't be simulated so, or a goal can't be reached.
+        NotFiniteError: a network of the agent puts out a number that is not finite.
+    """
+    if planner:
+        planner_maker(planner)  # or complain before anything is simulated
+    settings = plain_settings(config, dataset.interactive, dataset.duration) | identity_of(agent)
+    if goals:
+        settings["goal"] = list(goals)
+    if planner:
+        settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds}
+    about = About.of(agent.name, dataset.store, settings, seed=config.seed)
+    with RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about) as writer:
+        names = [dataset.store.ids[i] for i in dataset.indices]
+        todo = [i for i, name in enumerate(names) if not writer.has(name)]
+        if planner:
+            todo = _with_ego(writer, dataset, todo, config.rollouts)
+        done = len(names) - len(todo)
+        drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
+        together = segments_together(agent, config, dataset.interactive)
+        if planner and not config.batch:
+            together = min(together, PLANNED)
+        tasks = batches(todo, together, config)
+        with closing(shared(drive, tasks, config, dataset)) as results:
+            for saved in results:
+                for one in saved:
+                    writer.add(one)
+                done += len(saved)
+                if progress is not None:
+                    progress(done, len(names))
+    return RolloutFolder(path)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """Simulates an agent on a batch of run segments, and a planner as the ego if one is named."""
+
+    agent: Agent
+    dataset: SceneDataset
+    config: EvaluateConfig
+    keep_tree: bool
+    planner: str | Callable[..., Any]
+    planner_seconds: float
+    goals: tuple[str, ...]
+
+    def __call__(self, items: list[int]) -> list[SavedRollouts]:
+        """What they did in each."""
+        with naming(self.dataset, items):
+            scenes = self.dataset.scenes(items).to(torch.device(self.config.device))
+            segments = [self.dataset.segment(i) for i in items]
+            egos = None
+            if self.planner:
+                name, make = planner_name(self.planner), planner_maker(self.planner)
+                egos = EgoPlanners(name, make, segments, self.planner_seconds)
+            given = (
+                given_goals(self.goals, segments, scenes, planned=bool(self.planner)) if self.goals else None
+            )
+            try:
+                found = driven_by(
+                    self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos, given=given
+                )
+            except NotFiniteError as error:
+                raise error.named(segments[error.row].segment_id) from error
+            rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
+            return [
+                saved_rollouts(
+                    segment,
+                    on_cpu,
+                    rollouts,
+                    b,
+                    goal=found.goal,
+                    search=found.search if self.keep_tree else None,
+                    driver=self._drivers(on_cpu.interactive.shape[1]),
+                    others=self.config.others,
+                    failed=found.failed[b] if found.failed else None,
+                )
+                for b, segment in enumerate(segments)
+            ]
+
+    def _drivers(self, agents: int) -> str | list[str]:
+        name = PLAYBACK if self.agent.policy is None else self.agent.name
+        if not self.planner:
+            return name
+        return [planner_name(self.planner), *[name] * (agents - 1)]
+
+
+def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:
+    """Those whose first interactive agent is the ego; the others are put on record as failed."""
+    found = []
+    for i in items:
+        segment = dataset.segment(i)
+        try:
+            usable = int(dataset.scene(i).interactive[0, 0]) == segment.ego
+            why = "the ego is no vehicle that is seen at the first step"
+        except DataError as error:
+            usable, why = False, error.message
+        if usable:
+            found.append(i)
+        else:
+            writer.fail(segment.segment_id, rollouts, why, segment.group)
+    return found
+
+
+def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:
+    """Settings that change what is simulated, with the agent's own where the configuration leaves them to it."""
+    found = dataclasses.asdict(config)
+    found |= {"interactive": config.interactive or interactive, "duration": config.duration or duration}
+    return {name: value for name, value in found.items() if name not in _MEMORY}

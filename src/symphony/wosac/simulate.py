@@ -1,0 +1,248 @@
+"""Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of everyone, 8 s (or less) at 10 Hz.
+
+Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
+latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive; everyone
+else goes on at the velocity of the current step.
+
+Legend: n agents valid at the current step, N vehicles among them, R rollouts, F future steps (80), U decisions and
+the first state.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from symphony.agents import Agent
+from symphony.config import WosacSettings
+from symphony.data.resample import wrap
+from symphony.data.segment import AgentType, RunSegment, SignalState
+from symphony.envs.routes import route_table
+from symphony.envs.scene import scene
+from symphony.errors import ConfigError, DataError
+from symphony.roadgraph import LaneGraph
+from symphony.rollouts.driving import planned_trees, search_kind, simulation
+from symphony.rollouts.finite import NotFiniteError
+from symphony.wosac.records import CURRENT, DT
+from symphony.wosac.rollouts import RolloutArrays
+from symphony.wosac.submission import FUTURE, ROLLOUTS
+
+Doubles = NDArray[np.float64]
+
+AT_ONCE = 1600
+"""Observations made at a time in a search, 0.1 MB each."""
+
+
+def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings | None = None) -> RolloutArrays:
+    """32 rollouts of everyone who is valid at the segment's current step.
+
+    Between the agent's decisions positions are interpolated linearly and headings along the shorter arc; z is held.
+
+    Args:
+        agent: drives the vehicles.
+        segment: with steps of 0.1 s; what lies behind its current step, 10, is not looked at, but for the routes
+            where they are the log's.
+        settings: how the agent is simulated.
+
+    Returns:
+        World frame of the log, headings in [-π, π).
+
+    Raises:
+        ConfigError: the agent is log playback, or can't search as asked for.
+        DataError: other steps, or nobody is valid at the current one.
+        NotFiniteError: a network of the agent puts out a number that is not finite; names the segment.
+    """
+    settings = WosacSettings() if settings is None else settings
+    if agent.policy is None:
+        raise ConfigError("log playback knows the future and can't be simulated")
+    rows = _present(segment)
+    dt = DT if agent.spec is None else agent.spec.dt
+    future = settings.future
+    start = history_only(segment, dt, future)
+    vehicles = np.flatnonzero(start.agent_type == AgentType.VEHICLE)
+    states = _repeated(_extrapolated(segment, rows, future))
+    if len(vehicles):
+        try:
+            log = future_log(segment) if settings.logged_goals else None
+            driven = _driven(agent, start, vehicles, settings, log)
+            states[:, vehicles] = between_decisions(driven, dt, future)
+        except NotFiniteError as error:
+            raise error.named(segment.segment_id) from error
+    return _arrays(segment, rows, states)
+
+
+def constant_velocity(segment: RunSegment, future: int = FUTURE) -> RolloutArrays:
+    """32 equal rollouts of everyone at the velocity and heading of the current step.
+
+    Raises:
+        DataError: as :func:`wosac_rollouts`.
+    """
+    rows = _present(segment)
+    return _arrays(segment, rows, _repeated(_extrapolated(segment, rows, future)))
+
+
+def with_the_rest(found: RolloutArrays, segment: RunSegment) -> RolloutArrays:
+    """Rollouts with those of the agents that were left out of them as odd: a submission must hold everyone.
+
+    Args:
+        found: rollouts of some agents.
+        segment: all agents; the others go on at their velocity.
+
+    Raises:
+        DataError: a state of theirs at the current step is not finite.
+    """
+    now = segment.current_step
+    rest = np.asarray(segment.valid[:, now] & ~np.isin(segment.agent_id, found.object_id))
+    if not rest.any():
+        return found
+    logged = [getattr(segment, name)[rest, now] for name in ("position", "heading", "velocity")]
+    if not all(np.isfinite(values).all() for values in logged):
+        raise DataError("not finite at the current step", segment=segment.segment_id, field="tracks.states")
+    alone = segment.replace(valid=segment.valid & rest[:, None])
+    more = constant_velocity(alone, found.x.shape[-1])
+    joined = {n: np.concatenate([getattr(found, n), getattr(more, n)], 1) for n in ("x", "y", "z", "heading")}
+    return RolloutArrays(np.concatenate([found.object_id, more.object_id]), **joined)
+
+
+def _repeated(states: Doubles) -> Doubles:
+    return np.repeat(states[None], ROLLOUTS, 0)
+
+
+def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
+    """What a simulator may know, as a segment to drive in: it begins with the current step, all agents that are
+    valid then go on at constant velocity, and lights keep their latest state.
+
+    Args:
+        segment: see :func:`wosac_rollouts`.
+        dt: seconds between its steps.
+        future: steps of 0.1 s that it lasts.
+    """
+    rows, now = _present(segment), segment.current_step
+    steps = math.ceil(future * DT / dt - 1e-6) + 1
+    velocity = segment.velocity[rows, now].astype(np.float64)
+    path = np.repeat(segment.position[rows, now, None].astype(np.float64), steps, 1)
+    path[..., :2] += velocity[:, None] * (np.arange(steps) * dt)[:, None]
+    where = {int(row): k for k, row in enumerate(rows)}
+    return segment.replace(
+        dt=dt,
+        # The recording vehicle is not always among them; nothing here depends on who it is.
+        ego=where.get(segment.ego, 0),
+        agent_id=segment.agent_id[rows],
+        agent_type=segment.agent_type[rows],
+        size=segment.size[rows],
+        position=path.astype(np.float32),
+        heading=np.repeat(segment.heading[rows, now, None], steps, 1),
+        velocity=np.repeat(segment.velocity[rows, now, None], steps, 1),
+        valid=np.ones((len(rows), steps), bool),
+        signal_state=np.repeat(_latest_lights(segment)[:, None], steps, 1),
+        current_step=0,
+        interest=np.zeros(0, np.int32),
+        predict=np.zeros(0, np.int32),
+    )
+
+
+def future_log(segment: RunSegment) -> RunSegment:
+    """What became of those who are valid at the current step, from it on, in the rows of :func:`history_only`."""
+    rows, now = _present(segment), segment.current_step
+    timed = ("position", "heading", "velocity", "valid")
+    return segment.replace(
+        ego=0,
+        agent_id=segment.agent_id[rows],
+        agent_type=segment.agent_type[rows],
+        size=segment.size[rows],
+        **{name: getattr(segment, name)[rows, now:] for name in timed},
+        signal_state=segment.signal_state[:, now:],
+        current_step=0,
+        interest=np.zeros(0, np.int32),
+        predict=np.zeros(0, np.int32),
+    )
+
+
+def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubles:
+    """[R, N, F, 3] x, y, heading at 10 Hz from states [R, U, N, 3] every ``dt`` s, the first at the current step."""
+    where = np.arange(1, future + 1) * DT / dt
+    before = np.floor(where + 1e-6).astype(np.int64)
+    share = np.where(where - before < 1e-6, 0.0, where - before)[:, None]
+    after = np.where(share[:, 0] > 0, before + 1, before)
+    first, second = states[:, before], states[:, after]
+    place = first[..., :2] + share[..., None] * (second[..., :2] - first[..., :2])
+    heading = wrap(first[..., 2] + share * wrap(second[..., 2] - first[..., 2]))
+    return np.concatenate([place, heading[..., None]], -1).swapaxes(1, 2)
+
+
+def _present(segment: RunSegment) -> NDArray[np.int64]:
+    """[n] rows of the agents that are valid at the current step."""
+
+    def error(message: str, field: str) -> DataError:
+        return DataError(message, file=segment.file or None, segment=segment.segment_id, field=field)
+
+    if abs(segment.dt - DT) > 1e-6:
+        raise error(f"has steps of {segment.dt:g} s, needs {DT:g}", "dt")
+    if segment.current_step != CURRENT:
+        raise error(f"is {segment.current_step}, needs {CURRENT}", "current_step")
+    rows = np.flatnonzero(segment.valid[:, CURRENT])
+    if len(rows) == 0:
+        raise error(f"no agent at step {CURRENT}", "valid")
+    return rows
+
+
+def _latest_lights(segment: RunSegment) -> NDArray[Any]:
+    """[Q] the latest known states up to the current step."""
+    seen = segment.signal_state[:, segment.current_step :: -1]
+    latest = (seen != SignalState.UNKNOWN).argmax(1)
+    return seen[np.arange(len(seen)), latest]
+
+
+def _extrapolated(segment: RunSegment, rows: NDArray[np.int64], future: int) -> Doubles:
+    """[n, F, 3] x, y, heading at constant velocity."""
+    now = segment.current_step
+    place = segment.position[rows, now, None, :2].astype(np.float64)
+    path = place + segment.velocity[rows, now, None] * (np.arange(1, future + 1) * DT)[:, None]
+    heading = np.repeat(wrap(segment.heading[rows, now, None].astype(np.float64)), future, 1)
+    return np.concatenate([path, heading[..., None]], -1)
+
+
+def _driven(
+    agent: Agent,
+    start: RunSegment,
+    vehicles: NDArray[np.int64],
+    settings: WosacSettings,
+    log: RunSegment | None = None,
+) -> Doubles:
+    """[R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
+    graph = LaneGraph(start.road) if agent.routed else None
+    scenes = scene(start, vehicles.tolist(), graph)
+    if graph is not None and log is not None:
+        # The first state is the same, so the routes are; which of them was taken is for the log to say.
+        taken = [route_table(log, graph, int(row)).logged for row in vehicles]
+        scenes.route_logged = torch.tensor([taken])
+    scenes = scenes.to(torch.device(settings.device))
+    one = settings.config(1, 0)
+    if search_kind(agent, one) == "none":
+        plans = [settings.config(ROLLOUTS, settings.seed)]
+    else:
+        # All branches of all trees together would take gigabytes.
+        _, branches, _ = planned_trees(agent, one)
+        trees = max(AT_ONCE // (branches * len(vehicles)), 1)
+        plans = [
+            settings.config(min(trees, ROLLOUTS - first), settings.seed * ROLLOUTS + first)
+            for first in range(0, ROLLOUTS, trees)
+        ]
+    found = [simulation(agent, scenes, plan).rollouts.state[0, ..., :3].cpu() for plan in plans]
+    return torch.cat(found).double().numpy()
+
+
+def _arrays(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> RolloutArrays:
+    """States [32, n, F, 3] of the segment's frame in that of the log."""
+    z = segment.position[rows, segment.current_step, 2].astype(np.float64) + segment.origin[2]
+    return RolloutArrays(
+        object_id=segment.agent_id[rows],
+        x=states[..., 0] + segment.origin[0],
+        y=states[..., 1] + segment.origin[1],
+        z=np.broadcast_to(z[:, None], states.shape[:-1]).copy(),
+        heading=states[..., 2],
+    )
