@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers_saved import played, searched
-from helpers_segments import CAR, LANE_WIDTH, crossing, crossing_road, make_road, make_segment, straight_road
+from helpers_segments import CAR, LANE_WIDTH, crossing, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony.cli import main
 from symphony.data.builtin import builtin_store
@@ -30,10 +30,10 @@ from symphony.errors import DataError
 from symphony.evaluation.contacts import HORIZON, contacts, time_to_collision
 from symphony.evaluation.driving import red_lights, wrong_way
 from symphony.evaluation.fault import at_fault
+from symphony.evaluation.lanes import Lanes
 from symphony.evaluation.report import Report, add_segment, report, total_numbers
 from symphony.geometry import box_gap
 from symphony.metrics import CollisionKind
-from symphony.roadgraph import LaneGraph
 from symphony.rollouts.driving import playback
 from symphony.saved.folder import About, RolloutWriter, save_rollouts
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts
@@ -66,7 +66,8 @@ def touched(segment: RunSegment, agent: int = 0, offroad: bool = False) -> list[
     world = world_of(played(segment, [agent]), 0)
     off = np.full(world.valid.shape, offroad)
     (found,) = contacts([world], np.array([agent]))
-    fault = at_fault(world, found, LaneGraph(segment.road), segment, off)
+    lanes = Lanes(segment)
+    fault = at_fault(world, found, lanes, off, red_lights(world, np.arange(len(world.size)), lanes, 0))
     parts = found.other, found.kind, found.step, fault
     return [
         (other, CollisionKind(kind).name, step, mine)
@@ -236,7 +237,7 @@ def red(states: Any = SignalState.STOP, **changes: Any) -> list[tuple[int, int]]
     heading = np.full((1, 31), np.pi / 2, np.float32)
     segment = segment.replace(position=position, heading=heading, signal_state=light)
     saved = played(segment)
-    found = red_lights(world_of(saved, 0), np.array([0]), segment, 0)
+    found = red_lights(world_of(saved, 0), np.array([0]), Lanes(segment), 0)
     return list(zip(found.step.tolist(), found.light.tolist(), strict=True))
 
 
@@ -262,12 +263,11 @@ def test_a_light_of_another_lane_is_not_the_cars() -> None:
         heading=np.full((1, 31), np.pi / 2, np.float32),
         signal_state=light,
     )
-    assert len(red_lights(world_of(played(segment), 0), np.array([0]), segment, 0).step) == 0
+    assert len(red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0).step) == 0
 
 
 def test_wrong_way_is_against_the_only_lane_there() -> None:
-    road = crossing_road()
-    graph = LaneGraph(road)
+    lanes = Lanes(crossing(1))
     # Southern arm: up at x = 1.75, down at x = -1.75; standing is driving no way.
     states = [
         (1.75, np.pi / 2, 5),
@@ -282,7 +282,7 @@ def test_wrong_way_is_against_the_only_lane_there() -> None:
     world = World(
         position[:, None], heading[:, None], velocity[:, None], np.ones((5, 1), bool), np.ones((5, 2))
     )
-    assert wrong_way(world, np.arange(5), graph)[:, 0].tolist() == [False, True, True, False, False]
+    assert wrong_way(world, np.arange(5), lanes)[:, 0].tolist() == [False, True, True, False, False]
 
 
 def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:

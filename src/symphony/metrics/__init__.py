@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from symphony.metrics.agents import AgentResult, AgentSteps
-from symphony.metrics.choices import Choice, Standing, choices, route_turns, standing_at_end
+from symphony.metrics.choices import Choice, choices, route_turns
 from symphony.metrics.curvature import (
     Divergence,
     curvature_histogram,
@@ -13,13 +12,10 @@ from symphony.metrics.curvature import (
 )
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
-from symphony.metrics.rates import SegmentResult
-from symphony.metrics.realism import Meetings, collisions, displacement, meetings, offroad
-from symphony.metrics.summary import RolloutMetrics
+from symphony.metrics.overlaps import Meetings, collisions, meetings
+from symphony.metrics.summary import RolloutMetrics, SegmentResult
 
 __all__ = [
-    "AgentResult",
-    "AgentSteps",
     "Choice",
     "CollisionKind",
     "CollisionKinds",
@@ -28,19 +24,15 @@ __all__ = [
     "OrderStatistics",
     "RolloutMetrics",
     "SegmentResult",
-    "Standing",
     "choices",
     "collision_kinds",
     "collisions",
     "curvature_histogram",
-    "displacement",
     "jensen_shannon",
     "meetings",
-    "offroad",
     "order_statistics",
     "passing_gap",
     "route_turns",
     "sampled_divergence",
     "sampling_floor",
-    "standing_at_end",
 ]
