@@ -51,8 +51,8 @@ class Curvature:
 
         from symphony.agents.included import run_folder
         from symphony.cli.plot import run_names
-        from symphony.evaluation.entries import method_name
         from symphony.evaluation.records import read_run
+        from symphony.evaluation.table import method_name
         from symphony.metrics import jensen_shannon
         from symphony.render import plot_curvature
         from symphony.render.style import picture_path
@@ -79,8 +79,7 @@ class Curvature:
             raise ConfigError(str(error)) from error
 
     def _record(self, run: Path, folder: Path) -> dict[str, Any]:
-        from symphony.evaluation.entries import choose_evaluation
-        from symphony.evaluation.records import kept_evaluations
+        from symphony.evaluation.records import choose_evaluation, kept_evaluations
 
         if self.data is None:
             return choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
@@ -37,7 +35,7 @@ class RolloutKeeper:
     """Saves rollouts while they are evaluated; see the evaluator's ``observe``.
 
     Args:
-        writer: of the folder.
+        writer: of the folder; segments that are there already are left as they are.
         driver: name of the agent.
         others: what drives background agents.
     """
@@ -46,20 +44,19 @@ class RolloutKeeper:
         self.writer, self.driver, self.others = writer, driver, others
 
     def __call__(self, batch: EvaluatedBatch) -> None:
-        """Save a batch, but for segments that are there already."""
+        """Save a batch."""
         for row, segment in enumerate(batch.segments):
             if not self.writer.has(segment.segment_id):
-                self.writer.add(
-                    saved_rollouts(
-                        segment,
-                        batch.scenes,
-                        batch.rollouts,
-                        row,
-                        goal=batch.goal,
-                        driver=self.driver,
-                        others=self.others,
-                    )
+                saved = saved_rollouts(
+                    segment,
+                    batch.scenes,
+                    batch.rollouts,
+                    row,
+                    goal=batch.goal,
+                    driver=self.driver,
+                    others=self.others,
                 )
+                self.writer.add(saved)
 
 
 class ClipKeeper:
@@ -83,8 +80,7 @@ class ClipKeeper:
         for row, (item, segment) in enumerate(zip(batch.items, batch.segments, strict=True)):
             if item in self.items:
                 title = f"{self.title}{segment.segment_id}"
-                clip = clip_of(segment, batch.scenes, batch.rollouts, row, self.rollouts, title)
-                self.clips.append(clip)
+                self.clips.append(clip_of(segment, batch.scenes, batch.rollouts, row, self.rollouts, title))
 
 
 def clip_of(
@@ -95,34 +91,15 @@ def clip_of(
     count: int | None = None,
     title: str | None = None,
 ) -> Clip:
-    """Rollouts of one run segment, to be drawn or animated.
-
-    Args:
-        segment: in row ``row`` of the scenes.
-        scenes: that were simulated, on the CPU.
-        rollouts: [B, K, ...] of them, on the CPU.
-        row: of the batch.
-        count: how many of the K; all by default.
-        title: of the picture; by default the segment's id.
-    """
-    # Past the segment's end there is only the padding of its batch.
-    steps = segment.num_steps - 1
-    state = rollouts.state[row, :count, 1 : steps + 1].transpose(1, 2).numpy()
-    counted, collision, offroad = (
-        part[row, :count, :steps].transpose(1, 2).numpy()
-        for part in (rollouts.counted, rollouts.collision, rollouts.offroad)
-    )
-    agents = torch.where(scenes.interactive_valid[row], scenes.interactive[row], -1).numpy()
-    return Clip(segment, state[..., :2], state[..., 2], agents, 1, counted, collision, offroad, title=title)
+    """Rollouts [B, K, ...] of the run segment in row ``row`` of the scenes, see :func:`saved_clip`."""
+    return saved_clip(saved_rollouts(segment, scenes, rollouts, row), count, title)
 
 
 def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None = None) -> Clip:
-    """The first so many of the saved rollouts of a segment, all by default, to be drawn or animated."""
+    """The first so many of the rollouts of a segment, all by default, to be drawn or animated."""
     # The first state is the log's.
-    state = saved.state[:count, 1:].swapaxes(1, 2)
-    counted, collision, offroad = (
-        part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad)
-    )
+    state, flags = saved.state[:count, 1:].swapaxes(1, 2), (saved.counted, saved.collision, saved.offroad)
+    counted, collision, offroad = (part[:count].swapaxes(1, 2) for part in flags)
     return Clip(
         saved.segment,
         state[..., :2],
@@ -152,23 +129,13 @@ def draw_clips(clips: Sequence[Clip], path: Path, columns: int | None = None) ->
     if picture_path(path, (*FORMATS, *ANIMATIONS)).suffix[1:].lower() in ANIMATIONS:
         animate_rollouts(clips, path)
     else:
-        more: Mapping[str, Any] = {} if columns is None else {"columns": columns}
-        plot_grid([_panel(clip) for clip in clips], path, **more)
-
-
-def _panel(clip: Clip) -> Callable[[Any], Any]:
-    """What draws rollouts on axes."""
-    return lambda axes: plot_rollout(target=axes, **vars(clip))
+        more: dict[str, Any] = {} if columns is None else {"columns": columns}
+        panels = [lambda axes, clip=clip: plot_rollout(target=axes, **vars(clip)) for clip in clips]
+        plot_grid(panels, path, **more)
 
 
 def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: EvaluateConfig) -> SearchTree:
-    """The first tree that the evaluator grows of a run segment, pruned branches included.
-
-    Args:
-        agent: with a discriminator.
-        dataset: of the segment.
-        item: its number there.
-        config: how it is simulated.
+    """The first tree that the evaluator grows of an item of a dataset, pruned branches included.
 
     Raises:
         ConfigError: if the agent has no discriminator to search by, or is not to be searched.
@@ -176,10 +143,9 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
     if agent.policy is None or agent.discriminator is None:
         raise ConfigError(f"{agent.name} has no discriminator to search by: it was not trained with one")
     settings = config.pruning(agent.search)
-    if search_kind(agent, config) != "tree":
-        raise ConfigError(
-            f"with search '{search_kind(agent, config)}' there is no tree to draw: ask for one, --search tree"
-        )
+    kind = search_kind(agent, config)
+    if kind != "tree":
+        raise ConfigError(f"with search '{kind}' there is no tree to draw: ask for one, --search tree")
     most = config.trees * settings.test_branches
     config = dataclasses.replace(config, rollouts=min(config.rollouts, most))
     scene = dataset.scene(item).to(torch.device(config.device))
@@ -192,6 +158,12 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
     )
     agents = torch.where(scene.interactive_valid, scene.interactive, -1)[0]
+    goals = found.drawn[0, 0]
+    # No route is drawn of an agent that follows none, or not the same in all branches.
+    same = torch.where((goals == goals[:1]).all(0), goals[0], -1).tolist()
+    routes = [
+        scene.whole_route(0, n, route).cpu().numpy() if route >= 0 else None for n, route in enumerate(same)
+    ]
     return SearchTree(
         # In open traffic agents come and go.
         position=np.where(there[..., None], state[..., :2], np.nan),
@@ -202,14 +174,5 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
         agents=agents.cpu().numpy(),
         collision=collision[..., 0],
         offroad=offroad[..., 0],
-        routes=_routes(scene, found.drawn[0, 0]) if agent.goals is not None else [],
+        routes=routes if agent.goals is not None else [],
     )
-
-
-def _routes(scene: SceneBatch, goals: Int[Tensor, "S N"]) -> list[Any]:
-    """Points of the route of each agent; None where it follows none, or not the same in all branches."""
-    same = torch.where((goals == goals[:1]).all(0), goals[0], -1)
-    return [
-        scene.whole_route(0, n, route).cpu().numpy() if route >= 0 else None
-        for n, route in enumerate(same.tolist())
-    ]

@@ -31,7 +31,7 @@ class Near(NamedTuple):
     along: Reals
     heading: Reals
 
-    def only(self, keep: Bools) -> Near:
+    def only(self, keep: Bools | Indices) -> Near:
         """Some of the pairs."""
         point, line, distance, along, heading = self
         return Near(point[keep], line[keep], distance[keep], along[keep], heading[keep])
