@@ -16,8 +16,8 @@ from symphony.errors import ConfigError
 class Hardest:
     """List the run segments of a store that are most critical for the ego, the hardest first.
 
-    Four things make a segment critical, each with up to one point: a short time to collision, a short time between the
-    ego and another who crosses its way, hard braking, and a small distance to the road's boundary.
+    Four things make a segment critical, each with up to one point: a short time to collision, a short time between
+    the ego and another who crosses its way, hard braking, and a small distance to the road's boundary.
     """
 
     data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
