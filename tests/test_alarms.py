@@ -25,9 +25,8 @@ from symphony.errors import SymphonyError
 from symphony.objectives import BCLoss
 from symphony.recipes import train
 from symphony.training import Trainer
-from symphony.training.alarms import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, loss_of
 from symphony.training.logging import read_metrics
-from symphony.training.phases import Updates
+from symphony.training.trainer import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, Updates
 
 NAN, INF = math.nan, math.inf
 
@@ -68,7 +67,6 @@ def test_an_update_without_a_network_neither_counts_nor_forgives() -> None:
 
 def test_giving_up_names_the_loss() -> None:
     values = {"loss_bc": torch.tensor(2.0), "loss_policy": torch.tensor(NAN), **norms(policy=NAN)}
-    assert [loss_of(name) for name in ("policy", "goals")] == ["loss_policy", "loss_goals"]
     skips = Skips(in_row={"policy": PATIENCE - 1})
     with pytest.raises(TrainingError, match=r"policy network \(loss_policy is nan\)") as caught:
         skips.count(values)

@@ -29,10 +29,10 @@ from symphony.evaluation.pictures import clip_of
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import Clip, curves
-from symphony.rollouts.driving import playback, simulated
+from symphony.rollouts.driving import playback, simulate_batch
 from symphony.rollouts.unroll import Rollouts
+from symphony.training.hooks import QUANTILES, ROLLOUTS, Shown, samples_of
 from symphony.training.logging import read_metrics
-from symphony.training.previews import QUANTILES, ROLLOUTS, Preview, samples_of
 
 MOTIONS = ("speed", "acceleration", "turn")
 
@@ -41,7 +41,7 @@ MOTIONS = ("speed", "acceleration", "turn")
 def few() -> Iterator[None]:
     """Two run segments are shown."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("symphony.training.previews.SEGMENTS", 2)
+        patch.setattr("symphony.training.hooks.SEGMENTS", 2)
         yield
 
 
@@ -85,7 +85,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"".join(clip.position.tobytes() for clip in clips))
 
-    monkeypatch.setattr("symphony.training.previews.animate_rollouts", write)
+    monkeypatch.setattr("symphony.training.hooks.animate_rollouts", write)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_segments_to_validate_on_are_shown_where_there_are_some(
 ) -> None:
     seen: list[str] = []
     monkeypatch.setattr(
-        "symphony.training.previews.animate_rollouts",
+        "symphony.training.hooks.animate_rollouts",
         lambda clips, path: seen.extend(clip.segment.segment_id for clip in clips),
     )
     for data in (None, held_out):
@@ -167,7 +167,7 @@ def test_the_numbers_are_quantiles_of_what_the_agent_does(run: Path, store: Path
     agent, segments = load_agent(f"{run}@4"), SegmentStore(store)
     dataset = SceneDataset(segments, 2, agent.dynamics, [0, 1], routes=True)
     scenes = dataset.scenes([0, 1])
-    found = simulated(agent, scenes, EvaluateConfig(rollouts=ROLLOUTS))
+    found = simulate_batch(agent, scenes, EvaluateConfig(rollouts=ROLLOUTS)).rollouts
     values: dict[str, list[float]] = {name: [] for name in (*MOTIONS, *(f"{m}_log" for m in MOTIONS), "ade")}
     for b in range(2):
         segment, away = dataset.segment(b), []
@@ -200,7 +200,7 @@ def test_displacement_is_the_evaluators(run: Path, store: Path) -> None:
     agent = load_agent(str(run))
     dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
     scenes, how = dataset.scenes(range(3)), EvaluateConfig(rollouts=2)
-    samples = samples_of(scenes, simulated(agent, scenes, how), [0.2] * 3)
+    samples = samples_of(scenes, simulate_batch(agent, scenes, how).rollouts, [0.2] * 3)
     rows = evaluate(agent, SegmentStore(store), how).metrics.rows()
     np.testing.assert_allclose(sorted(samples["ade"]), sorted(row["ade"] for row in rows), rtol=1e-5)
 
@@ -224,7 +224,7 @@ def test_statistics_of_nothing_are_no_numbers(tmp_path: Path) -> None:
     nobody = Rollouts(*found[:3], torch.zeros_like(found.counted))
     samples = samples_of(scenes, nobody, [0.2])
     assert len(samples["speed"]) == len(samples["ade"]) == 0
-    numbers = Preview(tmp_path, samples).numbers()
+    numbers = Shown(tmp_path, samples).numbers()
     assert math.isnan(numbers["preview_speed_p50"])
     assert math.isfinite(numbers["preview_speed_log_p50"])
 
@@ -321,11 +321,11 @@ def test_networks_are_left_as_they_were(store: Path, tmp_path: Path) -> None:
     state = torch.get_rng_state()
     before = [parameter.clone() for parameter in policy.parameters()]
     first = previewer(2)
-    assert first.video.is_file()
+    assert media(tmp_path)
     assert all(map(torch.equal, before, policy.parameters()))
     assert policy.training
     assert torch.equal(state, torch.get_rng_state())
-    assert first.numbers().keys() == previewer(4).numbers().keys()
+    assert first.keys() == previewer(4).keys()
 
 
 def test_all_that_is_previewed_has_a_panel(run: Path) -> None:

@@ -31,7 +31,7 @@ from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.rollouts import simulate
-from symphony.rollouts.driving import simulated, simulation
+from symphony.rollouts.driving import simulate_batch, simulation
 from symphony.rollouts.search import ENDED, flag_score, search
 from symphony.rollouts.unroll import Rollouts, draw_goals, rollouts_of
 
@@ -251,8 +251,8 @@ def test_no_rollout_depends_on_the_batch(store: SegmentStore, kind: Any, goals: 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_rollout_depends_on_the_order_of_segments(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
     config, order = EvaluateConfig(search=kind, rollouts=4, trees=2), [2, 0, 3, 1]
-    sorted_ = simulated(agent, dataset.scenes(range(4)), config)
-    mixed = simulated(agent, dataset.scenes(order), config)
+    sorted_ = simulate_batch(agent, dataset.scenes(range(4)), config).rollouts
+    mixed = simulate_batch(agent, dataset.scenes(order), config).rollouts
     counted = sorted_.counted[order]
     assert torch.equal(mixed.counted, counted)
     real = counted.any(-1)
@@ -312,16 +312,16 @@ def test_leaves_are_chosen_in_the_period_in_which_a_scene_ends(
 
 def test_the_best_is_the_best_up_to_the_end(dataset: SceneDataset, agent: Agent) -> None:
     config = EvaluateConfig(search="best", rollouts=2)
-    together = simulated(agent, dataset.scenes(range(4)), config)
+    together = simulate_batch(agent, dataset.scenes(range(4)), config).rollouts
     for item in range(4):
-        alone = simulated(agent, dataset.scenes([item]), config)
+        alone = simulate_batch(agent, dataset.scenes([item]), config).rollouts
         assert torch.equal(together.state[item][:, : alone.state.shape[2]], alone.state[0])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rollouts_of_a_segment_stay_in_it(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
     scenes = dataset.scenes(range(4))
-    found = simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2))
+    found = simulate_batch(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2)).rollouts
     assert found.state.shape == (4, 4, DECISIONS + 1, 2, 4)
     assert found.collision.shape == found.offroad.shape == found.counted.shape == (4, 4, DECISIONS, 2)
     first = scenes.log_state[:, 0].gather(1, scenes.interactive[..., None].expand(4, 2, 5))
@@ -335,23 +335,32 @@ def test_rollouts_of_a_segment_stay_in_it(dataset: SceneDataset, agent: Agent, k
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_seed_decides_the_rollouts(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
     scenes = dataset.scenes([0])
-    a, b, c = (simulated(agent, scenes, EvaluateConfig(search=kind, rollouts=2, seed=s)) for s in (3, 3, 4))
+    a, b, c = (
+        simulate_batch(agent, scenes, EvaluateConfig(search=kind, rollouts=2, seed=s)).rollouts
+        for s in (3, 3, 4)
+    )
     assert same(a, b)
     assert not torch.equal(a.state, c.state)
 
 
 def test_trees_of_one_branch_are_independent_rollouts(dataset: SceneDataset, agent: Agent) -> None:
     scenes = dataset.scenes(range(4))
-    none = simulated(agent, scenes, EvaluateConfig(search="none", rollouts=3))
-    tree = simulated(agent, scenes, EvaluateConfig(search="tree", rollouts=3, trees=3, branches=1))
+    none = simulate_batch(agent, scenes, EvaluateConfig(search="none", rollouts=3)).rollouts
+    tree = simulate_batch(
+        agent, scenes, EvaluateConfig(search="tree", rollouts=3, trees=3, branches=1)
+    ).rollouts
     assert same(none, tree)
 
 
 @pytest.mark.parametrize("score", ["discriminator", "flags", "rule"])
 def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, score: Any) -> None:
     scenes = dataset.scenes(range(4))
-    few = simulated(agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=4, trees=2))
-    many = simulated(agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=6, trees=3))
+    few = simulate_batch(
+        agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=4, trees=2)
+    ).rollouts
+    many = simulate_batch(
+        agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=6, trees=3)
+    ).rollouts
     assert same(few, part(many, slice(None), slice(0, 4)))
 
 
@@ -362,13 +371,15 @@ def test_the_evaluation_decides_the_pruning(
     scenes, config = dataset.scenes(range(4)), EvaluateConfig(search="tree", rollouts=4)
     agent = searching(agent, rule="systematic" if "temperature" in changes else "best")
     trained = searching(agent, **changes)
-    found = simulated(agent, scenes, replace(config, **changes))
-    assert same(found, simulated(trained, scenes, config))
-    assert not same(found, simulated(agent, scenes, config))
+    found = simulate_batch(agent, scenes, replace(config, **changes)).rollouts
+    assert same(found, simulate_batch(trained, scenes, config).rollouts)
+    assert not same(found, simulate_batch(agent, scenes, config).rollouts)
 
 
 def test_trees_differ_from_each_other(dataset: SceneDataset, agent: Agent) -> None:
-    found = simulated(agent, dataset.scenes([0]), EvaluateConfig(search="tree", rollouts=4, trees=4))
+    found = simulate_batch(
+        agent, dataset.scenes([0]), EvaluateConfig(search="tree", rollouts=4, trees=4)
+    ).rollouts
     assert len({tuple(x.flatten().tolist()) for x in found.state[0]}) == 4
 
 
@@ -384,7 +395,7 @@ def goals_of(
 
     with monkeypatch.context() as patch:
         patch.setattr(sys.modules["symphony.rollouts.unroll"], "draw_goals", noted)
-        state = simulated(agent, scenes, config).state
+        state = simulate_batch(agent, scenes, config).rollouts.state
     assert len(found) == 1
     return found[0], state
 
@@ -430,7 +441,7 @@ def test_drawing_goals_builds_no_graph(env: DrivingEnv, agent: Agent) -> None:
     hook = agent.goals[0].register_forward_pre_hook(lambda *_: modes.append(torch.is_grad_enabled()))
     start = env.start(torch.arange(4))
     draw_goals(env, agent.goals, start, 0, torch.zeros(4, dtype=torch.int64))
-    simulated(agent, env.scenes, EvaluateConfig(search="none", rollouts=1))
+    simulate_batch(agent, env.scenes, EvaluateConfig(search="none", rollouts=1))
     hook.remove()
     assert modes == [False, False]
 
@@ -455,7 +466,7 @@ def test_agents_without_any_route_are_no_error(tmp_path: Path, agent: Agent) -> 
 def test_best_is_the_best_of_independent_rollouts(dataset: SceneDataset, agent: Agent) -> None:
     scenes, branches = dataset.scenes(range(4)), 3
     config = EvaluateConfig(search="best", rollouts=2, branches=branches, logged_goals=True, seed=5)
-    found = simulated(agent, scenes, config)
+    found = simulate_batch(agent, scenes, config).rollouts
     env = DrivingEnv(scenes, agent.dynamics, agent.observation)
     start = start_of(env, 2 * branches)
     every = plain(env, agent, start)
@@ -492,7 +503,7 @@ def test_the_oracle_lowers_what_it_measures() -> None:
     def bad(kind: Any) -> tuple[float, float]:
         """Share of rollouts with a collision, and of agent-steps with a collision or off the road."""
         config = EvaluateConfig(search=kind, score="flags", rollouts=16, trees=2, branches=8)
-        found = simulated(agent, scenes, config)
+        found = simulate_batch(agent, scenes, config).rollouts
         flags = (found.collision | found.offroad) & found.counted
         return found.collision.any(-1).any(-1).float().mean().item(), flags.float().mean().item()
 

@@ -28,8 +28,8 @@ from symphony.evaluation import evaluate
 from symphony.evaluation.evaluator import evaluate_dataset
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
+from symphony.training.hooks import METRICS
 from symphony.training.logging import read_metrics
-from symphony.training.validation import METRICS
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
 
     def script(*values: float) -> None:
         left = iter(values)
-        monkeypatch.setattr("symphony.training.validation.evaluate_dataset", lambda *_: Found(next(left)))
+        monkeypatch.setattr("symphony.training.hooks.evaluate_dataset", lambda *_: Found(next(left)))
 
     return script
 

@@ -68,15 +68,6 @@ class Simulation(NamedTuple):
     drawn: Int[Tensor, "B trees S N"] | None = None
 
 
-def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
-    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
-
-    Raises:
-        ConfigError, NotFiniteError: as :func:`simulation`.
-    """
-    return driven_by(agent, scenes, config).rollouts
-
-
 def simulation(
     agent: Agent,
     scenes: SceneBatch,
@@ -335,7 +326,7 @@ def _branches(part: Tensor, order: Tensor) -> Tensor:
     return part.gather(2, index)
 
 
-def driven_by(
+def simulate_batch(
     agent: Agent,
     scenes: SceneBatch,
     config: EvaluateConfig,

@@ -19,7 +19,7 @@ from symphony.planners.calls import SECONDS
 from symphony.planners.driver import EgoPlanners
 from symphony.planners.interface import planner_maker, planner_name
 from symphony.rollouts.control import given_goals
-from symphony.rollouts.driving import driven_by
+from symphony.rollouts.driving import simulate_batch
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutFolder, RolloutWriter
@@ -120,7 +120,7 @@ class _Drive:
                 given_goals(self.goals, segments, scenes, planned=bool(self.planner)) if self.goals else None
             )
             try:
-                found = driven_by(
+                found = simulate_batch(
                     self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos, given=given
                 )
             except NotFiniteError as error:

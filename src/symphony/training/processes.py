@@ -59,7 +59,7 @@ class Processes:
     count: int = 1
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this is the one that validates, writes and speaks."""
         return self.rank == 0
 
@@ -75,7 +75,7 @@ class Processes:
         if self.count > 1:
             torch.manual_seed(stream_of(f"update {seed} {self.rank} {step}"))
 
-    def share(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
+    def wrap_ddp(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
         """A loss that is that of the batches of all processes; itself where there is one process only."""
         if self.count == 1:
             return loss
