@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -31,6 +31,7 @@ from symphony.envs.flags import collision_flags
 from symphony.imports import build_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
+from symphony.rollouts.unroll import draw_goals
 from symphony.streams import Stream, fold_in, uniform
 
 ENDED = -100.0
@@ -137,6 +138,28 @@ def branched_streams(start: TensorDictBase) -> TensorDictBase:
     """A start state [*b, S] whose branches each have a stream of random numbers of their own."""
     slot = torch.arange(start.shape[-1], device=start.device)[:, None]
     return start.set(keys.STREAM, fold_in(start.get(keys.STREAM), slot))
+
+
+def with_drawn_goals(
+    env: DrivingEnv,
+    goals: TensorDictModuleBase,
+    start: TensorDictBase,
+    seed: int,
+    goals_per: Literal["tree", "branch"] = "tree",
+) -> TensorDictBase:
+    """Start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws.
+
+    Args:
+        env: the environment.
+        goals: the goal policy.
+        start: all branches of a tree, in one stream of random numbers.
+        seed: of the draw.
+        goals_per: who draws goals together: all branches of a tree (paper, section IV-B), or each branch alone.
+    """
+    start = branched_streams(start)
+    first = start if goals_per == "branch" else start[..., :1]
+    goal = draw_goals(env, goals, first, seed, first.get(keys.STREAM).squeeze(-1))
+    return env.with_goals(start, goal.expand(*start.shape, -1))
 
 
 def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
