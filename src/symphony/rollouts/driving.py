@@ -284,6 +284,14 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
     return config.search
 
 
+def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
+    """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
+    planner once for each branch.
+    """
+    asked = config.search != "agent" or config.branches or config.trees > 1
+    return config if asked else dataclasses.replace(config, search="none")
+
+
 def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
     """Trees per segment, branches per tree, and rollouts taken from each tree."""
     kind = search_kind(agent, config)
