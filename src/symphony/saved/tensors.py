@@ -117,13 +117,12 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
         raise DataError("must name rollouts by number", field="failed")
     if not all(isinstance(name, str) for name in facts["drivers"]):
         raise DataError("must be names", field="drivers")
-    lines = {name: _polylines(arrays, f"road.{name}") for name in _LINES}
+    road: dict[str, Any] = {name: _polylines(arrays, f"road.{name}") for name in _LINES}
+    road |= {name: arrays[f"road.{name}"] for name in _ROAD}
+    log: dict[str, Any] = {name: facts[name] for name in _SCALARS}
+    log |= {name: arrays[f"log.{name}"] for name in _LOG}
     return SavedRollouts(
-        segment=RunSegment(
-            **{name: facts[name] for name in _SCALARS},
-            **{name: arrays[f"log.{name}"] for name in _LOG},
-            road=RoadMap(**lines, **{name: arrays[f"road.{name}"] for name in _ROAD}),
-        ),
+        segment=RunSegment(**log, road=RoadMap(**road)),
         **{name: arrays[name] for name in _SHAPES},
         routes=_polylines(arrays, "routes"),
         start=facts["start"],
