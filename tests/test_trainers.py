@@ -34,7 +34,7 @@ from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
-from symphony.learning.experts import experts
+from symphony.learning.experts import fit_experts
 from symphony.metrics import collisions, offroad
 from symphony.objectives import GoalLoss
 from symphony.recipes import train
@@ -226,7 +226,7 @@ def test_experts_drive_or_wait_in_a_lane_and_are_not_parked() -> None:
     position[1:3] = position[1:3, :1]
     velocity[1:3] = 0
     position[2, :, 1] += 1.5  # beside its lane
-    found = experts(segment.replace(position=position, velocity=velocity), Bicycle())
+    (found,) = fit_experts([segment.replace(position=position, velocity=velocity)], Bicycle())
     assert found.agent.tolist() == [0, 1, 3]
     assert found.error.max() < 0.15
     assert (found.actions[1] == 73).all()  # who waits neither steers nor brakes

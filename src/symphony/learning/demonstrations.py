@@ -25,9 +25,8 @@ from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError
 from symphony.geometry.frames import with_speed
 from symphony.learning.experts import Experts, fit_experts
-from symphony.learning.kept import KeptExperts
+from symphony.learning.kept import ItemCache, KeptExperts
 from symphony.learning.logged import expert_batch, logged, logged_routes
-from symphony.learning.memory import ItemCache
 from symphony.roadgraph import LaneGraph
 
 if TYPE_CHECKING:

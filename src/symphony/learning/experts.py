@@ -54,17 +54,6 @@ class Experts:
         return sum(part.nbytes for part in (*tensors, *tables))
 
 
-def experts(
-    segment: RunSegment,
-    dynamics: Bicycle | Displacement,
-    graph: LaneGraph | None = None,
-    *,
-    routes: bool = False,
-) -> Experts:
-    """The demonstrations of one segment; see :func:`fit_experts`."""
-    return fit_experts([segment], dynamics, None if graph is None else [graph], routes=routes)[0]
-
-
 def fit_experts(
     segments: Sequence[RunSegment],
     dynamics: Bicycle | Displacement,

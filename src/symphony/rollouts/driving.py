@@ -94,15 +94,9 @@ def simulation(
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
     _check_given(agent, scenes, config, given)
-    policy = agent.policy
     if agent.rule:
         scenes, config = _ruled(agent, scenes, config, given)
-    if policy is None:
-        if egos is None:
-            raise ValueError("log playback has nothing to simulate")
-        if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
-            raise ConfigError("beside log playback the planner's ego is the only interactive agent")
-        policy = ConstantVelocity(Bicycle())
+    policy = _placeholder(scenes) if agent.policy is None else agent.policy
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
     settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
@@ -225,6 +219,13 @@ def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig
     if config.others in RULES:
         found = TensorDictSequential(found, RULES[config.others](env))
     return found
+
+
+def _placeholder(scenes: SceneBatch) -> TensorDictModuleBase:
+    """A policy for the ego of a planner beside log playback, whose actions nobody looks at."""
+    if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
+        raise ConfigError("beside log playback the planner's ego is the only interactive agent")
+    return ConstantVelocity(Bicycle())
 
 
 def _ruled(
