@@ -27,7 +27,7 @@ T = TypeVar("T")
 SHARE = 0.125
 """Part of the machine's memory that one cache may take; a data set has two."""
 VERSION = 3
-"""Version of the fit: raised when it gives something else for the same segment, or other routes (a test says when)."""
+"""Version of the fit: raised when it gives other numbers or routes for the same segment (a test says when)."""
 PACKAGE = Path(symphony.__file__).parent
 _TENSORS = ("agent", "states", "actions", "valid", "error", "progress")
 
@@ -99,8 +99,8 @@ class ItemCache(Generic[T]):
 class KeptExperts:
     """Demonstrations kept in a folder of their store, so that a segment is fitted once and not once a run.
 
-    Files of arrays, nothing pickled, are named after all that they depend on. They are a cache: one that is missing or
-    damaged is made anew, and where the folder can't be written or belongs to the package, nothing is kept.
+    Files of arrays, nothing pickled, are named after all that they depend on. They are a cache: one that is missing
+    or damaged is made anew, and where the folder can't be written or belongs to the package, nothing is kept.
 
     Args:
         store: the store's folder.
@@ -139,7 +139,7 @@ class KeptExperts:
                 )
                 for k, (end, count) in enumerate(zip(ends, arrays["route_number"], strict=True))
             )
-            return Experts(*(torch.from_numpy(arrays[name]) for name in _TENSORS), routes=tables)
+            return Experts(**{name: torch.from_numpy(arrays[name]) for name in _TENSORS}, routes=tables)
         except (DataError, OSError, ValueError, KeyError, IndexError):
             return None
 
