@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -149,29 +148,6 @@ def undisturbed(agent: Agent, device: torch.device) -> Iterator[None]:
             module.train(mode)
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What a preview shows after an update.
-
-    Attributes:
-        video: the animation.
-        samples: ``speed`` (m/s), ``acceleration`` (m/s^2) and ``turn`` (rad/s) of the interactive agents at every
-            step, simulated and, in ``speed_log`` etc., logged; ``ade`` (m) of every segment; where there is a
-            discriminator, its logits ``score_simulated`` and ``score_data`` of states it learns from.
-    """
-
-    video: Path
-    samples: Samples
-
-    def numbers(self) -> dict[str, float]:
-        """Quantiles for the record, all beginning with ``preview_``; those of nothing are NaN."""
-        found: dict[str, float] = {}
-        for name, values in self.samples.items():
-            levels = np.percentile(values, QUANTILES) if len(values) else [np.nan] * len(QUANTILES)
-            found |= {f"preview_{name}_p{q}": float(x) for q, x in zip(QUANTILES, levels, strict=True)}
-        return found
-
-
 class Previewer:
     """Simulates an agent as it is meant to be simulated, and shows it in the run's folder ``media``.
 
@@ -200,14 +176,10 @@ class Previewer:
         self.how = EvaluateConfig(rollouts=rollouts, device=str(device))
 
     def __call__(self, step: int, tracker: Tracker | None = None) -> dict[str, float]:
-        """Show the agent as it is after an update, in the folder and to a tracker; returns numbers for the record."""
-        found = self.show(step)
-        if tracker is not None:
-            tracker.preview(step, found.samples, found.video)
-        return found.numbers()
+        """Show the agent as it is after an update, in the folder and to a tracker.
 
-    def show(self, step: int) -> Shown:
-        """Simulate the agent as it is after an update, and write the animation.
+        Returns:
+            The numbers for the record, see :func:`quantiles`.
 
         Raises:
             DataError: if the disk refuses.
@@ -222,7 +194,9 @@ class Previewer:
         clips = [clip_of(segments[b], scenes, rollouts, b, 1) for b in range(min(PANELS, len(segments)))]
         with naming(video):
             animate_rollouts(clips, video)
-        return Shown(video, samples)
+        if tracker is not None:
+            tracker.preview(step, samples, video)
+        return quantiles(samples)
 
     @torch.no_grad()
     def _scores(self, step: int) -> dict[str, Float[Tensor, " K"]]:
@@ -236,13 +210,26 @@ class Previewer:
         return {"simulated": score[valid & fake], "data": score[valid & ~fake]}
 
 
+def quantiles(samples: Samples) -> dict[str, float]:
+    """Quantiles of samples for the record, all beginning with ``preview_``; those of nothing are NaN."""
+    found: dict[str, float] = {}
+    for name, values in samples.items():
+        levels = np.percentile(values, QUANTILES) if len(values) else [np.nan] * len(QUANTILES)
+        found |= {f"preview_{name}_p{q}": float(x) for q, x in zip(QUANTILES, levels, strict=True)}
+    return found
+
+
 def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> Samples:
-    """What interactive agents do in rollouts and in the log, and how far apart these are: see :class:`Shown`.
+    """What interactive agents do in rollouts and in the log, and how far apart these are.
 
     Args:
         scenes: B scenes.
         rollouts: [B, K, ...] of them.
         dt: [B] seconds per step.
+
+    Returns:
+        ``speed`` (m/s), ``acceleration`` (m/s^2) and ``turn`` (rad/s) at every step, simulated and, in ``speed_log``
+        etc., logged; ``ade`` (m) of every segment.
     """
     log, seen = (part[:, None] for part in logged(scenes))
     step = log.new_tensor(dt)[:, None, None, None]

@@ -169,7 +169,7 @@ class Alarms:
 
 
 class Validation(Protocol):
-    """A hook that evaluates the agent at every checkpoint.
+    """A hook that evaluates the agent as it is after an update; gives numbers for the record.
 
     Attributes:
         best: the best checkpoint so far.
@@ -181,15 +181,11 @@ class Validation(Protocol):
     what: str
     dataset: SceneDataset
 
-    def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]:
-        """Evaluate the agent as it is after an update; returns numbers for the record."""
+    def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]: ...  # noqa: D102
 
 
-class Preview(Protocol):
-    """A hook that shows the agent every ``preview.every`` updates."""
-
-    def __call__(self, step: int, tracker: Tracker | None = None) -> dict[str, float]:
-        """Show the agent as it is after an update; returns numbers for the record."""
+Preview = Callable[[int, Tracker], dict[str, float]]
+"""A hook that shows the agent as it is after an update, also to the tracker; gives numbers for the record."""
 
 
 class Trainer:
@@ -209,8 +205,8 @@ class Trainer:
         replay: what is drawn from searches, where there are any.
 
     Attributes:
-        validator: a hook, see :func:`symphony.training.hooks.add_hooks`; with it the best checkpoint is the agent.
-        previewer: another hook.
+        validator: a hook called at every checkpoint, of which the best then is the run's agent.
+        previewer: a hook called every ``preview.every`` updates; see :func:`symphony.training.hooks.add_hooks`.
 
     Raises:
         ConfigError: if the folder holds another run, or settings can't be used.
@@ -453,7 +449,7 @@ class Trainer:
                 file=self.data.store.path,
             )
         self.best, self.validated = Best.of(extra), extra.get("validated")
-        self.skips = Skips(**extra.get("skips", {}))
+        self.skips = Skips(**extra.get("skips") or {})
         if self.validator is not None:
             if self.best is not None and self.validated not in (None, self.validator.what):
                 raise ConfigError(
