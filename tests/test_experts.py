@@ -14,10 +14,9 @@ from helpers_segments import crossing, hide, straight_road
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
-from symphony.envs import Bicycle, Displacement, ObservationConfig
+from symphony.envs import Bicycle, Displacement
 from symphony.geometry import forward_speed
 from symphony.learning import experts as module
-from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import Experts, fit_experts
 from symphony.learning.kept import ItemCache
 
@@ -112,10 +111,3 @@ def test_the_cache_holds_no_more_bytes_than_it_may_and_gives_what_was_asked_for(
         # It is said once, when the first has to go.
         assert len(told) <= (not crowded)
         crowded = crowded or bool(told)
-
-
-def test_a_batch_of_expert_states_has_whole_actions() -> None:
-    dataset = SceneDataset(SegmentStore(builtin_store("train")))
-    batch = dataset.sample_states([0, 5, 9], 20, ObservationConfig(2, 10), torch.Generator().manual_seed(0))
-    assert batch["agents", "action"].dtype == torch.int64
-    assert batch["agents", "action"].unique().numel() > 3

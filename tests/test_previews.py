@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Iterator
@@ -15,17 +14,15 @@ import pytest
 import torch
 from PIL import Image
 
-from helpers_runs import build, same_weights, tiny, weights
+from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
-from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig, read_json, to_json
+from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import scene
-from symphony.errors import ConfigError, DataError
-from symphony.evaluation import evaluate
-from symphony.evaluation.pictures import clip_of
+from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import Clip, curves
@@ -196,15 +193,6 @@ def test_the_numbers_are_quantiles_of_what_the_agent_does(run: Path, store: Path
     assert len(record) == 3 * (len(values) + 2)
 
 
-def test_displacement_is_the_evaluators(run: Path, store: Path) -> None:
-    agent = load_agent(str(run))
-    dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
-    scenes, how = dataset.scenes(range(3)), EvaluateConfig(rollouts=2)
-    samples = samples_of(scenes, simulate_batch(agent, scenes, how).rollouts, [0.2] * 3)
-    rows = evaluate(agent, SegmentStore(store), how).metrics.rows()
-    np.testing.assert_allclose(sorted(samples["ade"]), sorted(row["ade"] for row in rows), rtol=1e-5)
-
-
 def test_the_log_is_like_itself_and_what_is_not_there_is_left_out() -> None:
     segment = crossing(4, steps=9)
     gone = hide(segment, 1, slice(3, 6))
@@ -241,19 +229,6 @@ def test_a_discriminator_that_has_not_scored_yet_has_no_scores(store: Path, tmp_
     assert not any(
         "score" in name for name in previewed(train(config(store, tmp_path / "bc", 2, steps=2)))[2]
     )
-
-
-def test_padding_of_a_batch_is_cut_off(store: Path) -> None:
-    dataset = SceneDataset(SegmentStore(store), 2)
-    together = dataset.scenes(range(3))
-    for b in range(3):
-        segment, alone = dataset.segment(b), dataset.scene(b)
-        one, other = (
-            clip_of(segment, together, playback(together), b),
-            clip_of(segment, alone, playback(alone)),
-        )
-        for name, value in vars(one).items():
-            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 
 
 class Recorder:
@@ -294,38 +269,12 @@ def test_weights_and_biases_gets_video_and_histograms(
         assert all(isinstance(value, wandb.Histogram) and sum(value.histogram) for value in values.values())
 
 
-def test_settings_are_checked_and_read_back(store: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        PreviewConfig(every=-1)
-    file = tmp_path / "config.json"
-    file.write_text(to_json(config(store, tmp_path, 7)))
-    assert read_json(TrainConfig, file).preview == PreviewConfig(every=7)
-    saved = json.loads(file.read_text())
-    del saved["preview"]
-    file.write_text(json.dumps(saved))
-    assert read_json(TrainConfig, file).preview == PreviewConfig()
-
-
 def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
     settings = config(store, tmp_path / "run", 2)
     settings.out.mkdir()
     (settings.out / "media").touch()
     with pytest.raises(DataError, match=r"rollout-000002\.gif"):
         train(settings)
-
-
-def test_networks_are_left_as_they_were(store: Path, tmp_path: Path) -> None:
-    trainer = build(config(store, tmp_path, 2, "bc_ts"))
-    previewer, policy = trainer.previewer, trainer.agent.modules["policy"]
-    assert previewer is not None
-    state = torch.get_rng_state()
-    before = [parameter.clone() for parameter in policy.parameters()]
-    first = previewer(2)
-    assert media(tmp_path)
-    assert all(map(torch.equal, before, policy.parameters()))
-    assert policy.training
-    assert torch.equal(state, torch.get_rng_state())
-    assert first.keys() == previewer(4).keys()
 
 
 def test_all_that_is_previewed_has_a_panel(run: Path) -> None:

@@ -276,14 +276,6 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
     assert reason in words
 
 
-def test_some_runs_that_fail_are_told_of(store: Path, told: Any) -> None:
-    Path("mine.py").write_text(PLAN.format("1 / (seen.seed % 2) and (0.0, 0.0)"))
-    code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a", rollouts=8))
-    assert code == 0
-    assert "of 8 runs failed, the first: " in words
-    assert told("report", "a", "--evaluated", "ego")[0] == 0
-
-
 def test_a_batch_of_planners_that_plans_nothing() -> None:
     class Idle:
         def plan_batch(self: Any, seen: Any) -> Any:
