@@ -17,7 +17,7 @@ from torch import Tensor
 
 @unique
 class Stream(IntEnum):
-    """What draws from a stream of its own, derived from that of a scene or a rollout.
+    """Uses of random numbers with a stream of their own, derived from that of a scene or a rollout.
 
     The numbers lie far above those of rollouts, branches and agents, which are counted from 0 and fold into the same
     streams. A number stays with its use, or a seed would give other rollouts: 2 belonged to a use that is gone.

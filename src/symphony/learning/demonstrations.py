@@ -310,7 +310,7 @@ class SceneDataset:
         return batch
 
     def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """What the interactive agents of some segments did, as the fit to the action space has it.
+        """The motion of the interactive agents of some segments, as the fit to the action space has it.
 
         Args:
             items: the segments.
@@ -338,7 +338,7 @@ def _seen_routes(
     progress: Float[Tensor, " M"],
     state: Float[Tensor, "M 4"],
 ) -> RouteWindow:
-    """What experts see of the routes they took from states that may lie beside where they were."""
+    """The part that experts see of the routes they took, from states that may lie beside where they were."""
     taken = logged_routes([table for expert in experts for table in expert.routes], row)
     # Whoever is displaced along the route by up to some metres has come as far as where it is now.
     near = torch.full_like(progress, DISPLACED)[:, None]

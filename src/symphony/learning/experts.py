@@ -132,7 +132,7 @@ def _fit_together(
     group: Sequence[int],
     dynamics: Bicycle | Displacement,
 ) -> dict[int, tuple[Tensor, Tensor]]:
-    """The same by segment for a group of one time step."""
+    """Actions and states by segment, for a group of segments with one time step."""
     steps = max(segments[k].num_steps for k in group)
 
     def joined(name: str) -> Tensor:

@@ -39,13 +39,13 @@ def room() -> int:
 
 
 class ItemCache(Generic[T]):
-    """What is made of items, made when first asked for, several at a time; those used longest ago go first.
+    """A cache of values made from items when first asked for, several at a time; those used longest ago go first.
 
     Warns once when items asked for have to go although fewer than ``keep`` are held.
 
     Args:
-        make: what belongs to some items, in their order.
-        size: bytes of one.
+        make: gives the values of some items, in their order.
+        size: gives the bytes of a value.
         keep: items held at most; None for no bound.
         limit: bytes held at most, beyond what was asked for last; :func:`room` by default.
         name: of what is held, for the warning.
@@ -69,11 +69,11 @@ class ItemCache(Generic[T]):
         self._held, self._warned = 0, False
 
     def __call__(self, item: int) -> T:
-        """What belongs to one item."""
+        """The value of one item."""
         return self.many([item])[0]
 
     def many(self, items: Sequence[int]) -> list[T]:
-        """What belongs to several items, in their order."""
+        """The values of several items, in their order."""
         missing = [item for item in dict.fromkeys(items) if item not in self.kept]
         for item, value in zip(missing, self.make(missing) if missing else [], strict=True):
             self.kept[item] = value, self.size(value)
@@ -121,7 +121,7 @@ class KeptExperts:
         return None if self.folder is None else self.folder / f"{key[:32]}.npz"
 
     def load(self, content: str) -> Experts | None:
-        """Those of the segment with this hash; None where there are none that can be read."""
+        """The demonstrations of the segment with this hash; None where there are none that can be read."""
         path = self._path(content)
         if path is None or not path.is_file():
             return None
@@ -144,7 +144,7 @@ class KeptExperts:
             return None
 
     def save(self, content: str, experts: Experts) -> None:
-        """Keep those of a segment, if the folder can be written and the disk has room."""
+        """Keep the demonstrations of a segment, if the folder can be written and the disk has room."""
         path, routes = self._path(content), experts.routes
         if path is None or not os.access(path.parent, os.W_OK):
             return

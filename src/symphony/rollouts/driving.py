@@ -1,4 +1,4 @@
-"""What an agent does on a batch of scenes, as it was trained or as a configuration says."""
+"""Simulation of an agent on a batch of scenes, as it was trained or as a configuration says."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
     "idm": CarFollower,
 }
-"""What can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
+"""Rules that can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
 
 
 class Simulation(NamedTuple):
-    """What came of a simulation.
+    """The result of a simulation.
 
     Attributes:
         rollouts: [B, K, ...].
@@ -189,8 +189,8 @@ def simulate_batch(
     egos: EgoPlanners | None = None,
     given: Int[Tensor, "B N"] | None = None,
 ) -> Simulation:
-    """What an agent does: :func:`playback` of the log, or a :func:`simulation`; collisions of the rollouts are found
-    between states, too.
+    """Simulate an agent: :func:`playback` of the log, or a :func:`simulation` whose collisions are found between
+    states, too.
     """
     if agent.policy is not None or egos is not None:
         found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
@@ -255,7 +255,7 @@ def _check_given(
 def _fixed_goals(
     scenes: SceneBatch, given: Int[Tensor, "B N"] | None, *, along_log: bool, ego: bool
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """From rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
+    """A function from rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
 
     Args:
         scenes: B scenes.

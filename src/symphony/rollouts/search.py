@@ -37,8 +37,8 @@ from symphony.streams import Stream, fold_in, uniform
 ENDED = -100.0
 """Score past a scene's last logged step, below all others: it decides no maximum, and other totals leave it out."""
 FILL, FEW = 4, 256
-"""Where lines go back, those of so many times the usual run segments are simulated one after the other, as many at a
-time as usual: else the last steps of every batch would be of few lines.
+"""Lines that go back: those of so many times the usual run segments are simulated one after the other, as many at a
+time as usual, at least so many: else the last steps of every batch would be of few lines.
 """
 AHEAD = 0.5
 """Seconds that :func:`rule_score` looks ahead."""
@@ -47,14 +47,15 @@ KEPT: Sequence[keys.Key] = [
     *(keys.STATE, keys.ACTION, keys.NOISE),
     *(("next", *key) for key in (keys.STATE, keys.VALID, keys.PROGRESS, keys.COLLISION, keys.OFFROAD)),
 ]
-"""What is kept of every step of a search: enough to observe its states anew. Beside it personas of agents that have
-them, and in open traffic who has not entered yet."""
+"""Entries that are kept of every step of a search, enough to observe its states anew; beside them personas of agents
+that have some, and in open traffic who has not entered yet.
+"""
 
 
 def _settings(
     env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[keys.Key] = ()
 ) -> dict[str, Any]:
-    """What every search of driving gives the collector."""
+    """Settings that every search of driving gives the collector."""
     persona = [keys.PERSONA] if env.observation.persona else []
     waiting = [keys.WAITING] if env.open_traffic else []
     return {
@@ -172,8 +173,8 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 def collector_settings(
     config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset, segments: int
 ) -> dict[str, Any]:
-    """What a collector of driving needs beside environment, policy and scores: whole trees, random numbers that
-    depend on nothing but seed, segment, branch and step.
+    """Settings that a collector of driving needs beside environment, policy and scores: whole trees, random numbers
+    that depend on nothing but seed, segment, branch and step.
 
     Args:
         config: of the search.

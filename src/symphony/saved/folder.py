@@ -30,7 +30,7 @@ LOCK = "rollouts.lock"
 LATER = ("weights", "specification", "planner", "planner_seconds")
 """Settings that a manifest has since November 2026."""
 _BEGUN = (LOCK, SEGMENTS, INDEX)
-"""In a folder whose writer died before there was a manifest."""
+"""Names in a folder whose writer died before there was a manifest."""
 _LONGEST = 120
 """Letters of a file's name."""
 _MANIFEST_KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
@@ -44,7 +44,7 @@ _ENTRY_KINDS: dict[str, tuple[type, ...]] = {
 
 @dataclass(frozen=True)
 class About:
-    """What all rollouts of a folder have in common.
+    """Facts that all rollouts of a folder have in common.
 
     Attributes:
         agent: name of what is evaluated.
@@ -62,7 +62,7 @@ class About:
 
     @classmethod
     def of(cls, agent: str, store: SegmentStore, settings: Any, *, seed: int = 0, planner: str = "") -> About:
-        """What rollouts of one agent beside log playback have in common.
+        """The facts of rollouts of one agent beside log playback.
 
         Args:
             agent: its name.
@@ -227,7 +227,7 @@ class RolloutFolder:
         self.failures = [entry for entry in found if entry.failed is not None]
 
     def only(self, segments: Iterable[str]) -> RolloutFolder:
-        """The same with some segments only."""
+        """The folder with some of its segments only."""
         wanted, found = set(segments), copy.copy(self)
         found.entries = [entry for entry in self.entries if entry.segment in wanted]
         found.failures = [entry for entry in self.failures if entry.segment in wanted]

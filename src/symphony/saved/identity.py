@@ -21,7 +21,7 @@ from symphony.planners.interface import PIPE, planner_maker
 from symphony.planners.view import FunctionPlanner
 
 _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
-"""Where an object lies in memory, in what Python prints of it."""
+"""The place of an object in memory, in what Python prints of it."""
 
 
 def identity_of(agent: Agent) -> dict[str, str]:

@@ -109,7 +109,7 @@ class _Drive:
     goals: tuple[str, ...]
 
     def __call__(self, items: list[int]) -> list[SavedRollouts]:
-        """What they did in each."""
+        """Rollouts of each segment."""
         agent, config = self.agent, self.config
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(config.device))

@@ -17,7 +17,7 @@ from symphony.errors import DataError
 from symphony.saved.rollouts import SavedRollouts, SavedTrees
 
 KEY = "symphony"
-"""Of the JSON in the header of a file."""
+"""The name of the JSON in the header of a file."""
 MAX_STATE = {"x": 1e5, "y": 1e5, "heading": 1e4, "speed": 1e3}
 """Metres, radians and m/s that a simulated state may have: some times those of a log, as nobody steers it back."""
 MAX_LENGTH = 100_000

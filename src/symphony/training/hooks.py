@@ -1,4 +1,4 @@
-"""What a run shows of its agent while it trains: validation, which chooses among checkpoints, and previews.
+"""Hooks of a run: validation, which chooses among checkpoints, and previews of the agent while it trains.
 
 Neither changes the course of the training. This module loads what simulates, judges and draws; the trainer does not.
 """
@@ -37,7 +37,7 @@ from symphony.training.logging import Tracker
 from symphony.training.trainer import Trainer
 
 METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
-"""What is recorded of a validation."""
+"""Metrics of a validation that are recorded."""
 PANELS = 2
 """Run segments in the animation of a preview, at most."""
 SEGMENTS = 8
@@ -220,7 +220,7 @@ def quantiles(samples: Samples) -> dict[str, float]:
 
 
 def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> Samples:
-    """What interactive agents do in rollouts and in the log, and how far apart these are.
+    """The motion of interactive agents in rollouts and in the log, and how far apart these are.
 
     Args:
         scenes: B scenes.

@@ -25,7 +25,7 @@ from symphony.streams import stream_of
 
 _SEED_STRIDE = 1 << 20
 _PATIENCE = timedelta(days=1)
-"""For the others to arrive, one of which may be validating; that one has died torchrun notices by itself."""
+"""Time that the others have to arrive, one of which may be validating; torchrun itself notices one that has died."""
 
 
 class SharedLoss(DistributedDataParallel):
@@ -46,7 +46,7 @@ class SharedLoss(DistributedDataParallel):
 
 @dataclass(frozen=True)
 class Processes:
-    """Those that train one run together, seen from one of them.
+    """The processes that train one run together, seen from one of them.
 
     Attributes:
         device: where this one computes.

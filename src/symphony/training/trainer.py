@@ -64,7 +64,7 @@ ALARMS = {
         "scores are chance; consider a higher rate, or more features or states for it"
     ),
 }
-"""What `alarm` in the metrics may be, and what it means."""
+"""Values that `alarm` in the metrics may have, and what they mean."""
 FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every")
 """Settings that may be others when a run goes on."""
 _SEED_STRIDE = 1_000_003
@@ -390,7 +390,7 @@ class Trainer:
         return {**named, f"loss_{name}": total.detach(), f"{NORM}{name}": norm}
 
     def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
-        """What the loop adds to a record, and shows."""
+        """Show the numbers of a record; returns what the loop adds to it."""
         added: dict[str, float | str] = {}
         if "policy" in self.optimizers:
             added["learning_rate"] = self.optimizers["policy"].param_groups[0]["lr"]
