@@ -17,8 +17,8 @@ from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement
 from symphony.geometry import forward_speed
 from symphony.learning import experts as module
+from symphony.learning.demonstrations import ItemCache
 from symphony.learning.experts import Experts, fit_experts
-from symphony.learning.kept import ItemCache
 
 DYNAMICS = pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 

@@ -15,8 +15,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement
 from symphony.learning import SceneDataset
-from symphony.learning.experts import Experts
-from symphony.learning.kept import VERSION
+from symphony.learning.experts import VERSION, Experts
 
 
 @pytest.fixture
