@@ -23,7 +23,7 @@ from symphony.config import EvaluateConfig
 from symphony.evaluation import evaluate
 from symphony.evaluation.planners import winners
 from symphony.evaluation.report import Report, add_segment, total_numbers
-from symphony.metrics.intervals import t_quantile, zero_bound
+from symphony.metrics.intervals import beta_quantile, t_quantile, zero_bound
 from symphony.saved.folder import About, save_rollouts
 
 
@@ -40,6 +40,11 @@ def test_quantiles_of_t_are_those_of_scipy(probability: float, freedom: int) -> 
     assert t_quantile(probability, freedom) == pytest.approx(
         stats.t.ppf(probability, freedom), rel=1e-7, abs=1e-9
     )
+
+
+@given(st.floats(1e-6, 1 - 1e-6), st.floats(0.5, 300), st.floats(0.5, 300))
+def test_quantiles_of_beta_are_those_of_scipy(probability: float, a: float, b: float) -> None:
+    assert beta_quantile(probability, a, b) == pytest.approx(stats.beta.ppf(probability, a, b), rel=1e-7)
 
 
 def rows_of(*chosen: Case) -> list[dict[str, Any]]:

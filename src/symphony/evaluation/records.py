@@ -108,7 +108,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
     tree, searched = result.search == "tree", result.search not in ("none", "log")
     filled = dataclasses.asdict(config) | {
         "search": result.search,
-        "score": config.score if searched else "discriminator",
+        "score": config.looks_for(agent.search) if searched else "discriminator",
         "interactive": result.interactive,
         "duration": config.duration or agent.duration,
         "goals": used.goals if tree else "tree",

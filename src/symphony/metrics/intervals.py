@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+_TINY = 1e-300
+
 
 def summed(values: NDArray[Any], member: NDArray[np.int64]) -> NDArray[Any]:
     """Sums of values [segments, ...] over the segments of each group, by the number of the group of each."""
@@ -64,27 +66,41 @@ def zero_bound(of: int) -> float:
 
 def t_quantile(probability: float, freedom: int) -> float:
     """Quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees of freedom."""
-    low, high = -1.0, 1.0
-    while _t_share(low, freedom) > probability:
-        low *= 2
-    while _t_share(high, freedom) < probability:
-        high *= 2
-    while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (middle, high) if _t_share(middle, freedom) < probability else (low, middle)
-    return high
+    if probability == 0.5:
+        return 0.0
+    tail = 2 * min(probability, 1 - probability)
+    # Of x = v / (v + t^2), or of what is left of 1 where that is nearly all.
+    x = beta_quantile(tail, freedom / 2, 0.5)
+    rest = 1 - x if x < 0.5 else beta_quantile(1 - tail, 0.5, freedom / 2)
+    return math.copysign(math.sqrt(freedom * rest / x), probability - 0.5)
 
 
-def _t_share(value: float, freedom: int) -> float:
-    """Probability that Student's t is below a value, for a whole number of degrees of freedom.
+def beta_quantile(probability: float, a: float, b: float) -> float:
+    """Quantile of the beta distribution, by halving until nothing is left between two numbers."""
+    low, high = 0.0, 1.0
+    while True:
+        middle = 0.5 * (low + high) if low > 0 else high / 1024 if high > _TINY else 0.0
+        if not low < middle < high:
+            return high
+        low, high = (middle, high) if _beta(middle, a, b) < probability else (low, middle)
 
-    Source: Abramowitz and Stegun, "Handbook of Mathematical Functions" (1964), 26.7.3 and 26.7.4.
-    """
-    angle = math.atan(value / math.sqrt(freedom))
-    squared, odd = math.cos(angle) ** 2, freedom % 2
-    term = math.sin(angle) * (math.cos(angle) if odd else 1.0)
-    total = 0.0
-    for k in range(2 + odd, freedom + 1, 2):
-        total += term
-        term *= squared * (k - 1) / k
-    share = 2 / math.pi * (angle + total) if odd else total
-    return 0.5 + 0.5 * share
+
+def _beta(x: float, a: float, b: float) -> float:
+    """Regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22)."""
+    if x > (a + 1) / (a + b + 2):
+        return 1.0 - _beta(1.0 - x, b, a)
+    front = a * math.log(x) + b * math.log1p(-x) + math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)
+    # Lentz's way through the continued fraction.
+    c, d = 1.0, 1.0 / (1.0 - (a + b) * x / (a + 1))
+    result, k = d, 0
+    while k < 10_000:
+        k += 1
+        for term in (
+            k * (b - k) * x / ((a + 2 * k - 1) * (a + 2 * k)),
+            -(a + k) * (a + b + k) * x / ((a + 2 * k) * (a + 2 * k + 1)),
+        ):
+            d, c = 1.0 / ((1.0 + term * d) or _TINY), (1.0 + term / c) or _TINY
+            result *= c * d
+        if abs(c * d - 1.0) < 1e-15:
+            break
+    return math.exp(front) * result / a
