@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from symphony.geometry import boxes_overlap, levels_apart, meeting_time, pose_at
+from symphony.geometry import boxes_overlap, levels_apart, meeting_time
 from symphony.metrics import meetings
 from symphony.metrics.kinds import kind_of_contact
 from symphony.saved.world import World
@@ -120,16 +120,6 @@ def pose_ends(world: World, row: Indices, other: Indices, step: Indices) -> tupl
         for at in (np.where(seen, step - 1, step), step)
     )
     return before, after
-
-
-def poses(world: World, row: Indices, found: Contacts) -> tuple[Reals, Reals, Reals]:
-    """Position [E, 2], heading [E] and velocity [E, 2] at contacts of one of the two agents of each, by its row."""
-    other = np.where(row == found.agent, found.other, found.agent)
-    ends = torch.stack(pose_ends(world, row, other, found.step), 1)
-    share = torch.from_numpy(found.share)
-    place, heading = pose_at(ends[..., :2], ends[..., 2], share)
-    velocity = ends[:, 0, 3:] + share[:, None] * (ends[:, 1, 3:] - ends[:, 0, 3:])
-    return place.numpy(), heading.numpy(), velocity.numpy()
 
 
 def time_to_collision(world: World, evaluated: Indices) -> Reals:

@@ -18,7 +18,6 @@ from symphony.evaluation.lanes import Heights, Lanes
 from symphony.geometry import levels_apart
 from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
-from symphony.roadgraph import LaneGraph
 from symphony.roadgraph.lines import line_strings, turn_between
 from symphony.roadgraph.routes import ends_inside
 from symphony.saved.rollouts import SavedRollouts
@@ -231,7 +230,7 @@ class Progress(NamedTuple):
     logged: Reals
 
 
-def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
+def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> Progress:
     """How far evaluated agents (numbers [M] of the driven ones) got on.
 
     It is measured along the route that an agent follows, and beyond its end along the path of the log, where the log
@@ -253,33 +252,26 @@ def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     if not has.any():
         return Progress(driven, compared, logged)
     # Agents have routes of their own, so a route is that of one agent.
-    number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)
-    pairs = dict(zip(goal[has].tolist(), number[has].tolist(), strict=True))
-    whole = {
-        route: _with_log(saved.routes[route][:, :2].astype(np.float64), log[agent], seen[agent])
+    pairs = dict(zip(goal[has].tolist(), has.nonzero()[1].tolist(), strict=True))
+    who, number = list(pairs.values()), {route: k for k, route in enumerate(pairs)}
+    which = [number[route] for route in goal[has].tolist()]
+    whole = [
+        _with_log(saved.routes[route][:, :2].astype(np.float64), log[agent], seen[agent])
         for route, agent in pairs.items()
-    }
-    most = max(map(len, whole.values()))
-    along = {route: np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for route, line in whole.items()}
-    lines = np.stack([along[route] for route in goal[has].tolist()])
-    places = stations_along(lines, path[has], there[has])
+    ]
+    most = max(map(len, whole))
+    lines = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in whole])
+    places = stations_along(lines[which], path[has], there[has])
     driven[has], compared[has] = _advance(places, there[has]), _advance(places, both[has])
-    who = list(pairs.values())
-    of_log = stations_along(np.stack(list(along.values())), log[who], seen[who])
-    advance = dict(zip(whole, _advance(of_log, seen[who]).tolist(), strict=True))
-    logged[has] = [advance[route] for route in goal[has].tolist()]
+    logged[has] = _advance(stations_along(lines, log[who], seen[who]), seen[who])[which]
     # Whoever is farther from the end than a vehicle is long has gone on from it.
-    past = np.linalg.norm(path[has] - lines[:, -1:], axis=-1) > PAST_END
-    past &= places >= np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)[:, None] - 1e-3
-    beyond = np.flatnonzero((past & there[has]).any(1))
-    if len(beyond):
-        graph = LaneGraph(saved.segment.road)
-        open_end = {route: ends_inside(graph, line) for route, line in whole.items()}
-        undefined = [k for k in beyond.tolist() if open_end[int(goal[has][k])]]
-        for part in (driven, compared):
-            values = part[has]
-            values[undefined] = np.nan
-            part[has] = values
+    past = np.linalg.norm(path[has] - lines[which][:, -1:], axis=-1) > PAST_END
+    past &= places >= np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)[which][:, None] - 1e-3
+    beyond = np.zeros_like(has)
+    beyond[has] = (past & there[has]).any(1)
+    if beyond.any():
+        beyond[has] &= np.array([ends_inside(lanes.graph, line) for line in whole])[which]
+        driven[beyond] = compared[beyond] = np.nan
     return Progress(driven, compared, logged)
 
 

@@ -58,7 +58,7 @@ class EvaluatedBatch(NamedTuple):
     goal: Int[Tensor, "B K N"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Evaluation:
     """What the evaluator found.
 
@@ -169,37 +169,28 @@ def evaluate_dataset(
     ]
     for path in config.metric:
         load_object(path)  # or complain before anything is simulated
-    seconds, steps = [0.0] * len(everyone), [0] * len(everyone)
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
     tasks = batches(range(len(dataset)), segments_together(agent, config, dataset.interactive), config)
     with closing(shared(evaluator, tasks, config, dataset)) as results:
-        for batch in results:
-            for k, part in enumerate(batch.parts):
-                found[k].metrics.merge(part.metrics)
+        for numbers, parts, seen in results:
+            for whole, part in zip(found, parts, strict=True):
+                whole.metrics.merge(part.metrics)
                 for path, values in part.own.items():
-                    found[k].own.setdefault(path, {}).update(values)
-                seconds[k] += part.seconds
-                steps[k] += part.steps
-            if observe is not None and batch.seen is not None:
-                scenes, rollouts, goal = batch.seen
-                segments = [dataset.segment(i) for i in batch.items]
-                observe(EvaluatedBatch(batch.items, segments, scenes, rollouts, goal))
-            done += len(batch.items)
+                    whole.own.setdefault(path, {}).update(values)
+                whole.seconds += part.seconds
+                whole.steps += part.steps
+            if observe is not None and seen is not None:
+                observe(EvaluatedBatch(numbers, [dataset.segment(i) for i in numbers], *seen))
+            done += len(numbers)
             if progress is not None:
                 progress(done, len(dataset))
-    costs = zip(found, seconds, steps, strict=True)
-    found = [dataclasses.replace(one, seconds=spent, steps=made) for one, spent, made in costs]
     # The evaluated agent itself where it is one of the baselines.
     named = {evaluation.agent: evaluation for evaluation in found}
     return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
 
 
-class _BatchResult(NamedTuple):
-    """What was found of each agent in a batch, and the scenes, rollouts and goals of the first, on the CPU."""
-
-    items: list[int]
-    parts: list[Evaluation]
-    seen: tuple[SceneBatch, Rollouts, Tensor] | None
+_BatchResult = tuple[list[int], list[Evaluation], tuple[SceneBatch, Rollouts, Tensor] | None]
+"""Items of a batch, what was found of each agent, and the scenes, rollouts and goals of the first, on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +230,7 @@ class _BatchEvaluator:
                 parts.append(part)
                 if self.seen and seen is None:
                     seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
-            return _BatchResult(items, parts, seen)
+            return items, parts, seen
 
     def _add(
         self,

@@ -15,12 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+import torch
 from torch import from_numpy
 
 from symphony.data.segment import AgentType
-from symphony.evaluation.contacts import STILL, Bools, Contacts, Indices, Reals, poses
+from symphony.evaluation.contacts import STILL, Bools, Contacts, Indices, Reals, pose_ends
 from symphony.evaluation.driving import Lights
 from symphony.evaluation.lanes import Heights, Lanes
+from symphony.geometry import pose_at
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind
 from symphony.metrics.kinds import STANDING
@@ -118,7 +120,11 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
 
 
 def _party(world: World, row: Indices, found: Contacts) -> _Party:
-    position, heading, velocity = poses(world, row, found)
+    other = np.where(row == found.agent, found.other, found.agent)
+    ends = torch.stack(pose_ends(world, row, other, found.step), 1)
+    share = torch.from_numpy(found.share)
+    position, heading = (part.numpy() for part in pose_at(ends[..., :2], ends[..., 2], share))
+    velocity = (ends[:, 0, 3:] + share[:, None] * (ends[:, 1, 3:] - ends[:, 0, 3:])).numpy()
     # The box may have turned by half a turn; where its front is the state says.
     front = world.heading[row, found.step]
     heading = heading + np.pi * (np.cos(heading - front) < 0)

@@ -212,7 +212,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
 def _numbers(saved: SavedRollouts, who: NDArray[np.int64]) -> tuple[list[Row], list[Event]]:
     """Numbers of every rollout, and what is to be marked in them."""
     segment, rows, lanes = saved.segment, saved.agents[who], Lanes(saved.segment)
-    moved, motion = progress(saved, who), comfort(saved, who)
+    moved, motion = progress(saved, who, lanes), comfort(saved, who)
     distance, logged = log_distance(saved, who)
     out, events = [], []
     worlds = [world_of(saved, k) for k in range(saved.rollouts)]
