@@ -109,7 +109,7 @@ def test_other_commands_exist() -> None:
 @pytest.fixture(scope="module")
 def tables() -> dict[str, Any]:
     """The program that writes tables into pages."""
-    return runpy.run_path(str(ROOT / "scripts" / "results_page.py"))
+    return runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))
 
 
 def test_tables_are_those_of_the_records(tables: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -170,7 +170,7 @@ def test_nothing_tells_to_install_another_project() -> None:
         assert OTHERS.search(wrong)
     files = [
         file
-        for folder in ("", "docs", "src", "tests", "scripts", "recipes", "examples", "benchmarks")
+        for folder in ("", "docs", "src", "tests", "recipes", "examples", "benchmarks")
         for pattern in ("*.md", "*.py", "*.toml")
         for file in (ROOT.glob(pattern) if not folder else (ROOT / folder).rglob(pattern))
     ]

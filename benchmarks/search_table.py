@@ -1,6 +1,6 @@
 """Simulate the included agent by each way to search, and write `results/search.json` and `results/search-cost.json`.
 
-    python scripts/search_table.py --data DIR --out FOLDER      # FOLDER keeps a record of every evaluation
+    python benchmarks/search_table.py --data DIR --out FOLDER      # FOLDER keeps a record of every evaluation
 
 ``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are taken) and ``ngsim-test``, see
 docs/datasets.md; the built-in test segments are taken, too. Evaluations whose records are there are not made again.
@@ -125,7 +125,7 @@ def main() -> None:
             one = found[way][store]
             row += [round(one["steps"] / plain, 2), round(one["seconds"] / one["segments"], 2)]
             row += [round(one["along"], 1), round(one["any"])]
-    made = {"command": "python scripts/search_table.py --data DIR --out FOLDER"}
+    made = {"command": "python benchmarks/search_table.py --data DIR --out FOLDER"}
     for name, of, heads, lines in (
         ("search", "ways to search with the included agent, ± over recordings", columns, rows),
         ("search-cost", "what they cost, and how many rollouts take the logged route", costs, each),

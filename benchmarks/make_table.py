@@ -1,4 +1,4 @@
-"""The whole way to a table of the paper, small: ``python scripts/make_table.py --out out/table``.
+"""The whole way to a table of the paper, small: ``python benchmarks/make_table.py --out out/table``.
 
 Runs the eight recipes on the run segments that come with the package and prints the table of what they score, some
 minutes in all. What it shows is that everything works; agents as small as these have hardly learned to drive. Every

@@ -16,7 +16,7 @@ import helpers_runs
 from helpers_convert import FakeReader
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
-from kills_run import Target
+from kills import Target
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig, ValidationConfig
 from symphony.data import generate as generation

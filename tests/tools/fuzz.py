@@ -1,7 +1,12 @@
-"""Running targets on changed files, in processes that may take little time and memory, and counting the outcomes."""
+"""Feed changed files to everything that reads files, and count what comes of it.
+
+Each input gets 10 s and 1 GiB in a process that other inputs share; the same seed gives the same inputs. What was
+done is kept, so that the same command goes on until there are as many as are asked for. Linux only.
+"""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import faulthandler
 import gc
@@ -11,6 +16,7 @@ import resource
 import select
 import shutil
 import signal
+import sys
 import tempfile
 import time
 import traceback
@@ -22,9 +28,14 @@ from pathlib import Path
 
 import numpy as np
 
+# Pools that reserve address space for later would be taken for use of memory.
+os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
 from fuzz_base import FOREIGN, Files, Target, every
 from fuzz_targets import TARGETS
-from kills_run import spent_alone as spent
+from kills import spent_alone as spent
 
 SECONDS, MEMORY = 10, 1 << 30
 """What one input may take; CPU time, as the machine may be busy."""
@@ -98,7 +109,7 @@ def attempt(target: Target, files: Files, folder: Path) -> tuple[str, str]:
     return outcome, detail
 
 
-def fuzz(
+def run(
     name: str,
     counts: Counts,
     total: int,
@@ -185,3 +196,63 @@ def to_json(counts: dict[str, Counts]) -> str:
 def from_json(text: str) -> dict[str, Counts]:
     """The reverse of :func:`to_json`."""
     return {name: Counts(**each) for name, each in json.loads(text).items()}
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run and report; status 1 if any input was not read as it should be."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--inputs", type=int, default=1000, help="per target, those of earlier runs included")
+    parser.add_argument("--targets", nargs="+", choices=list(TARGETS), default=list(TARGETS))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="to stop after, whatever is done")
+    parser.add_argument("--state", type=Path, default=Path("out/fuzz.json"), help="where the counts are kept")
+    parser.add_argument("--save", metavar="TARGET:NUMBER", help="only write this input's files to out/fuzz/")
+    given = parser.parse_args(args)
+    if given.save:
+        return _save(given.save, given.seed)
+    counts = from_json(given.state.read_text()) if given.state.is_file() else {}
+    given.state.parent.mkdir(parents=True, exist_ok=True)
+
+    def keep() -> None:
+        draft = given.state.with_suffix(".new")
+        draft.write_text(to_json(counts), encoding="utf-8")
+        draft.replace(given.state)
+
+    until = time.monotonic() + given.seconds
+    while time.monotonic() < until:
+        behind = [name for name in given.targets if counts.get(name, Counts()).inputs < given.inputs]
+        if not behind:
+            break
+        # In turns, so that a run that is stopped has looked at all of them.
+        for name in behind:
+            mine = counts.setdefault(name, Counts())
+            goal = min(given.inputs, mine.inputs + 5 * BATCH)
+            run(name, mine, goal, seed=given.seed, until=until, tell=keep)
+    _report({name: counts[name] for name in given.targets if name in counts})
+    return 1 if any(each.bad for each in counts.values()) else 0
+
+
+def _save(which: str, seed: int) -> int:
+    name, _, number = which.partition(":")
+    folder = Path("out/fuzz") / f"{name}-{number}"
+    for file, data in inputs(name, seed, int(number)).items():
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    print(folder)
+    return 0
+
+
+def _report(counts: dict[str, Counts]) -> None:
+    print(f"{'target':14}{'inputs':>9}" + "".join(f"{name:>10}" for name in OUTCOMES))
+    for name, each in counts.items():
+        print(f"{name:14}{each.inputs:9}" + "".join(f"{each.outcomes[key]:10}" for key in OUTCOMES))
+    for name, each in counts.items():
+        for number, outcome, detail in each.found:
+            print(f"{outcome}: {name}:{number}: {detail}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""Make an agent that comes with the package from a run: ``python scripts/make_pretrained.py RUN NAME``.
+"""Make an agent that comes with the package from a run: ``python benchmarks/make_pretrained.py RUN NAME``.
 
 Writes ``src/symphony/pretrained/NAME`` anew: configuration, the weights of the checkpoint that is the run's agent,
 the evaluations that were given, and a model card made of these, ``card.json`` (which `symphony agents` prints) and
@@ -6,12 +6,12 @@ the evaluations that were given, and a model card made of these, ``card.json`` (
 
     symphony evaluate RUN --data town-small/test
     symphony evaluate RUN --data ngsim
-    python scripts/make_pretrained.py RUN NAME --scores RUN/evaluations/test-....json RUN/evaluations/ngsim-....json
+    python benchmarks/make_pretrained.py RUN NAME --scores RUN/evaluations/{test,ngsim}-*.json
 
 Scores of an agent that is there already, on further data (the same data's are replaced):
 
     symphony evaluate pretrained:NAME --data ngsim --json ngsim.json
-    python scripts/make_pretrained.py pretrained:NAME NAME --scores ngsim.json
+    python benchmarks/make_pretrained.py pretrained:NAME NAME --scores ngsim.json
 """
 
 from __future__ import annotations
@@ -304,7 +304,7 @@ def page(facts: dict[str, Any]) -> str:
         "`config.json`: all settings of the training, with names in place of paths. `checkpoints/`: the weights as "
         "safetensors, each with its checksum in `checkpoint.json`, without the state of the optimizers. "
         + ("`evaluations/`: the scores above. " if facts["scores"] else "")
-        + "Licence: that of the package, Apache-2.0. Made by `scripts/make_pretrained.py`.",
+        + "Licence: that of the package, Apache-2.0. Made by `benchmarks/make_pretrained.py`.",
     ]
     return "\n\n".join(parts) + "\n"
 

@@ -1,4 +1,4 @@
-"""Make the built-in data set with SUMO: ``python scripts/make_builtin.py``.
+"""Make the built-in data set with SUMO: ``python benchmarks/make_builtin.py``.
 
 Writes ``src/symphony/data/builtin/train`` and ``.../test`` anew and prints what is in them. The two share no road
 network: each network has a seed of its own. Needs the extra ``symphony-traffic[sumo]``.

@@ -1,7 +1,7 @@
 """Write the tables of the pages from the records in `results/`, between their markers.
 
-    python scripts/results_page.py            # rewrites the pages
-    python scripts/results_page.py --check    # says what differs, and fails if anything does
+    python benchmarks/results_page.py            # rewrites the pages
+    python benchmarks/results_page.py --check    # says what differs, and fails if anything does
 
 A block is `<!-- table NAME -->`, the table, `<!-- end table -->`, and `results/NAME.json` its record: what it is
 `of`, the commit and the command that `made` it, a heading and the digits after the point for each of its `columns`,
@@ -72,7 +72,7 @@ def main(args: list[str] | None = None) -> int:
             if not check:
                 page.write_text(after, encoding="utf-8")
     for name in differing:
-        verb = "differs from the records: run scripts/results_page.py" if check else "rewritten"
+        verb = "differs from the records: run benchmarks/results_page.py" if check else "rewritten"
         print(f"{name}: {verb}", file=sys.stderr)
     return 1 if check and differing else 0
 

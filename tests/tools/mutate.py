@@ -14,9 +14,10 @@ import io
 import json
 import os
 import random
+import re
 import resource
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -24,107 +25,21 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
-TESTED = {
-    "geometry.boxes": "test_geometry_boxes.py",
-    "geometry.frames": "test_geometry_frames.py",
-    "geometry.polylines": "test_geometry_polylines.py",
-    "geometry.cells": "test_cells.py",
-    "geometry.edges": "test_cells.py",
-    "geometry.nearest": "test_cells.py",
-    "envs.flags": "test_env.py test_cells.py test_device_numbers.py",
-    "envs.objects": "test_env_observation.py test_env_routes.py test_env.py test_env_not_finite.py"
-    " test_device_numbers.py",
-    "envs.observation": "test_env_observation.py test_env.py test_driving_inputs.py",
-    "envs.points": "test_env_observation.py test_cells.py test_env.py test_driving_inputs.py test_device_numbers.py",
-    "envs.road": "test_cells.py test_driving_inputs.py test_device_numbers.py",
-    "envs.routes": "test_env_routes.py test_driving_inputs.py",
-    "modules.pooling": "test_modules_pooling.py",
-    "modules.rows": "test_modules_pooling.py test_modules_policy.py",
-    "modules.winners": "test_modules_winners.py test_modules_pooling.py",
-    "modules.displacement": "test_modules_displacement.py test_modules_histogram.py",
-    "modules.goals": "test_modules_goals.py",
-    "modules.sampling": "test_modules_sampling.py test_modules_histogram.py",
-    "envs.dynamics": "test_dynamics.py test_perturbation.py",
-    "envs.traffic": "test_traffic.py test_crowd.py",
-    "envs.edge": "test_traffic.py test_crowd.py",
-    "geometry.stations": "test_stations.py",
-    "roadgraph.assign": "test_roadgraph_routes.py test_env_routes.py",
-    "roadgraph.branches": "test_roadgraph_branches.py",
-    "roadgraph.routes": "test_roadgraph_routes.py test_env_routes.py",
-    "simulation.experts": "test_experts.py test_fit.py",
-    "simulation.search": "test_search.py test_search_goals.py test_planner.py test_mgail_training.py",
-    "simulation.rollouts": "test_search.py test_search_goals.py test_driving_inputs.py",
-    "simulation.background": "test_crowd.py",
-    "simulation.crowd": "test_crowd.py",
-    "simulation.export": "test_export.py",
-    "simulation.personas": "test_personas.py",
-    "simulation.perturbation": "test_perturbation.py",
-    "simulation.planned": "test_planner.py test_planner_kinds.py",
-    "simulation.planner_view": "test_planner.py test_planner_kinds.py test_planners.py",
-    "simulation.planners": "test_planners.py",
-    "simulation.wosac": "test_wosac_rollouts.py",
-    "training.alarms": "test_alarms.py",
-    "agents.checkpoint": "test_checkpoint.py test_checkpoint_hostile.py",
-    "agents.choice": "test_validation.py",
-    "data.crop": "test_crop.py",
-    "data.merge": "test_merge.py",
-    "data.overlaps": "test_overlaps.py",
-    "data.plausibility": "test_conformance.py test_segment.py",
-    "data.segment": "test_segment.py test_conformance.py",
-    "data.sources.argoverse2": "test_argoverse2.py",
-    "data.sources.argoverse2_map": "test_argoverse2.py",
-    "data.sources.commonroad": "test_commonroad.py",
-    "data.sources.commonroad_map": "test_commonroad_map.py test_commonroad.py",
-    "data.sources.commonroad_tracks": "test_commonroad.py",
-    "data.sources.egos": "test_interaction.py test_commonroad.py",
-    "data.sources.geodesy": "test_geodesy.py",
-    "data.sources.interaction_motion": "test_interaction.py",
-    "data.sources.interaction_signals": "test_interaction.py",
-    "data.sources.interaction_tracks": "test_interaction.py",
-    "data.sources.lanelet2": "test_lanelet2.py test_interaction.py",
-    "data.sources.lanelet2_road": "test_lanelet2.py test_interaction.py",
-    "data.sources.lines": "test_limits.py test_lanelet2.py test_commonroad_map.py",
-    "data.sources.scenarionet": "test_scenarionet.py",
-    "data.sources.scenarionet_map": "test_scenarionet.py",
-    "data.sources.womd": "test_womd.py",
-    "data.resample": "test_resample.py test_time_step.py",
-    "data.context": "test_context.py",
-    "evaluation.blocking": "truth",
-    "evaluation.contacts": "test_report.py truth",
-    "evaluation.driving": "test_report.py",
-    "evaluation.fault": "truth",
-    "evaluation.paired": "test_paired.py",
-    "evaluation.report": "test_report.py",
-    "evaluation.relations": "test_relations.py",
-    "collectors.rules": "test_collectors_rules.py",
-    "collectors.beam_search": "test_collectors_beam_search.py",
-    "collectors.result": "test_collectors_beam_search.py",
-    "collectors.scores": "test_collectors_beam_search.py",
-    "objectives.base": "test_objectives_bc.py test_objectives_masks.py",
-    "objectives.goal": "test_objectives_goal.py",
-    "objectives.distillation": "test_objectives_distillation.py",
-    "objectives.discriminator": "test_objectives_discriminator.py",
-    "objectives.mgail": "test_objectives_mgail.py",
-    "metrics.realism": "test_metrics_realism.py",
-    "metrics.order": "test_metrics_order.py",
-    "metrics.kinds": "test_metrics_kinds.py",
-    "metrics.agents": "test_metrics_agents.py",
-    "metrics.choices": "test_choices.py",
-    "metrics.curvature": "test_metrics_summary.py test_choices.py",
-    "metrics.summary": "test_metrics_summary.py test_metrics_kinds.py test_choices.py",
-    "metrics.rates": "test_metrics_summary.py test_metrics_kinds.py test_choices.py",
-    "metrics.wosac.boxes": "test_wosac_features.py test_wosac_parity.py",
-    "metrics.wosac.composite": "test_wosac_scoring.py",
-    "metrics.wosac.estimators": "test_wosac_scoring.py test_wosac_parity.py",
-    "metrics.wosac.interaction": "test_wosac_features.py test_wosac_parity.py",
-    "metrics.wosac.kinematics": "test_wosac_features.py test_wosac_parity.py",
-    "metrics.wosac.lights": "test_wosac_features.py test_wosac_parity.py",
-    "metrics.wosac.road": "test_wosac_features.py test_wosac_parity.py",
-    "metrics.wosac.scoring": "test_wosac_scoring.py test_wosac_parity.py test_wosac_evaluation.py",
-}
-"""Modules of ``symphony`` and the files of tests that are to notice."""
+PACKAGE = ROOT / "src" / "symphony"
+ROOMS = (
+    "geometry",
+    "roadgraph",
+    "envs",
+    "modules",
+    "collectors",
+    "objectives",
+    "learning",
+    "rollouts",
+    "metrics",
+)
+"""Where changes are made unless others are asked for: rooms that compute."""
 SECONDS = 300
 """CPU time that the tests may take with a change: one that makes them go on for ever is noticed, too."""
 QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
@@ -199,7 +114,7 @@ def _function(value: Any) -> FunctionType | None:
     return value if isinstance(value, FunctionType) else None
 
 
-def noticed(module: ModuleType, number: int | None, test: str) -> bool:
+def noticed(module: ModuleType, number: int | None, files: Sequence[str]) -> bool:
     """Whether the tests fail with a change, or as it is; not here, where they could leave threads that forks lack."""
     child = os.fork()
     if child == 0:
@@ -210,15 +125,43 @@ def noticed(module: ModuleType, number: int | None, test: str) -> bool:
                 tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
                 list(changes(tree))[number][2]()
                 replace_code(module, tree)
-            status = tests(test)
+            status = tests(files)
         finally:
             os._exit(int(status != 0))
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
 
 
-def tests(names: str) -> int:
+def modules(names: Sequence[str]) -> list[str]:
+    """The modules of rooms, such as ``envs``, and those that are named themselves, such as ``envs.road``."""
+    found = []
+    for name in names:
+        place = PACKAGE / name.replace(".", "/")
+        files = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+        found += [
+            ".".join(file.relative_to(PACKAGE).with_suffix("").parts)
+            for file in files
+            if file.stem != "__init__"
+        ]
+    return found
+
+
+def tests_of(module: str) -> list[str]:
+    """The files of tests that are to notice: those that name the module or, where none does, its room.
+
+    Those that have its name come first, as the first test that fails is enough.
+    """
+    texts = {
+        str(file): file.read_text(encoding="utf-8") for file in sorted((ROOT / "tests").rglob("test_*.py"))
+    }
+    for name in (module, module.partition(".")[0]):
+        found = [file for file, text in texts.items() if re.search(rf"\bsymphony\.{re.escape(name)}\b", text)]
+        if found:
+            return sorted(found, key=lambda file: module.rpartition(".")[2] not in file)
+    return []
+
+
+def tests(files: Sequence[str]) -> int:
     """Run files of tests quietly."""
-    files = [str(ROOT / "tests" / name) for name in names.split()]
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         return int(pytest.main([*files, "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
 
@@ -229,7 +172,7 @@ def main(args: list[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--changes", type=int, default=10, help="of each module")
-    parser.add_argument("--modules", nargs="+", choices=list(TESTED), default=list(TESTED))
+    parser.add_argument("--modules", nargs="+", default=ROOMS, help="such as envs, or envs.road")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--again", type=Path, help="earlier counts: make only the changes that were not noticed"
@@ -238,19 +181,19 @@ def main(args: list[str] | None = None) -> int:
     given = parser.parse_args(args)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {} if given.again is None else json.loads(given.again.read_text())
-    for name in list(found) or given.modules:
-        module = importlib.import_module(f"symphony.{name}")
-        if noticed(module, None, TESTED[name]):
-            raise SystemExit(f"{TESTED[name]} fails as it is")
+    for name in list(found) or modules(given.modules):
+        module, files = importlib.import_module(f"symphony.{name}"), tests_of(name)
+        if noticed(module, None, files):
+            raise SystemExit(f"{' '.join(files)}: fails as it is")
         tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
         possible = [f"line {line}: {what}" for what, line, _ in changes(tree)]
         if name in found:
             chosen = [k for k, text in enumerate(possible) if text in found[name]["missed"]]
         else:
             number = min(given.changes, len(possible))
-            chosen = random.Random(given.seed).sample(range(len(possible)), number)  # noqa: S311
+            chosen = random.Random(given.seed).sample(range(len(possible)), number)
             found[name] = {"possible": len(possible), "made": number}
-        missed = [possible[k] for k in sorted(chosen) if not noticed(module, k, TESTED[name])]
+        missed = [possible[k] for k in sorted(chosen) if not noticed(module, k, files)]
         for text in missed:
             print(f"not noticed: {name}, {text}", flush=True)
         print(f"{name}: {len(chosen)} of {len(possible)} changes made", flush=True)
