@@ -1,9 +1,9 @@
-"""Simulate the included agent by each way to search, and write `results/search.json` and `results/search-cost.json`.
+"""Simulate the included agent by each way to search, and print what each gives and costs as a table.
 
     python benchmarks/search_table.py --data DIR --out FOLDER      # FOLDER keeps a record of every evaluation
 
-``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are taken) and ``ngsim-test``, see
-docs/datasets.md; the built-in test segments are taken, too. Evaluations whose records are there are not made again.
+``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are taken) and ``ngsim-test``; the
+included test segments are taken, too. Evaluations whose records are there are not made again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from symphony.files import write_json
 from symphony.learning.logged import logged
 from symphony.rollouts.unroll import Rollouts
 
-ROOT = Path(__file__).resolve().parents[1]
 AGENT, ROLLOUTS, NEAR, MOVES = "pretrained:bc_ts_h", 16, 3.0, 5.0
 STORES = {
     "built-in": (builtin_store("test"), None),
@@ -84,18 +83,12 @@ def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
         route = {"along": ROLLOUTS * numbers[METRICS[0]], "any": 100 * numbers[METRICS[1]]}
         numbers = {name: value for name, value in numbers.items() if not name.startswith(METRICS)}
         write_json(file, {**numbers, **route, "steps": found.steps, "seconds": found.seconds})
-        print(
-            file.name,
-            {name: numbers[name] for name, _ in FIGURES.values()},
-            route,
-            found.steps,
-            found.seconds,
-        )
+        print(file, flush=True)
     return json.loads(file.read_text(encoding="utf-8"))
 
 
 def main() -> None:
-    """Make what is not there, then both tables."""
+    """Make what is not there, then the table, a row for each way and store."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -103,36 +96,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    found = {way: {store: record(given.data, given.out, store, way) for store in STORES} for way in WAYS}
-    columns, rows = [[""]], [[way] for way in WAYS]
-    costs, each = [[""]], [[way] for way in WAYS]
+    columns = ["", *FIGURES, "steps", "CPU s a segment", f"of {ROLLOUTS} on the log's route", "any %"]
+    lines = [columns, ["---"] * len(columns)]
     for store in STORES:
-        for heading, (name, digits) in FIGURES.items():
-            columns.append([f"{store}: {heading}", digits])
-            for row, way in zip(rows, WAYS, strict=True):
-                one = found[way][store]
-                row.append([round(one[part], digits) for part in (name, f"{name}_se")])
-    for store in list(STORES)[1:]:
-        for heading, digits in (
-            ("steps", 2),
-            ("CPU s a segment", 2),
-            (f"of {ROLLOUTS} on the log's route", 1),
-            ("any %", 0),
-        ):
-            costs.append([f"{store}: {heading}", digits])
-        plain = found["no search"][store]["steps"]
-        for row, way in zip(each, WAYS, strict=True):
-            one = found[way][store]
-            row += [round(one["steps"] / plain, 2), round(one["seconds"] / one["segments"], 2)]
-            row += [round(one["along"], 1), round(one["any"])]
-    made = {"command": "python benchmarks/search_table.py --data DIR --out FOLDER"}
-    for name, of, heads, lines in (
-        ("search", "ways to search with the included agent, ± over recordings", columns, rows),
-        ("search-cost", "what they cost, and how many rollouts take the logged route", costs, each),
-    ):
-        write_json(
-            ROOT / "results" / f"{name}.json", {"of": of, "made": made, "columns": heads, "rows": lines}
-        )
+        found = {way: record(given.data, given.out, store, way) for way in WAYS}
+        for way, one in found.items():
+            cells = [
+                f"{one[name]:.{digits}f} ± {one[f'{name}_se']:.{digits}f}"
+                for name, digits in FIGURES.values()
+            ]
+            costs = [one["steps"] / found["no search"]["steps"], one["seconds"] / one["segments"]]
+            cells += [*(f"{cost:.2f}" for cost in costs), f"{one['along']:.1f}", f"{one['any']:.0f}"]
+            lines.append([f"{store}: {way}", *cells])
+    print("\n".join(f"| {' | '.join(line)} |" for line in lines))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,84 @@
+"""For the reference: a page for each package, and docstrings as Markdown."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from griffe import Extension, Object
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOMS = ("geometry", "roadgraph", "data", "envs", "modules", "collectors", "objectives", "metrics", "agents")
+ROOMS += (
+    "learning",
+    "planners",
+    "rollouts",
+    "saved",
+    "wosac",
+    "evaluation",
+    "training",
+    "recipes",
+    "render",
+    "config",
+)
+FURTHER = {
+    "data": (
+        *("segment.RunSegment", "store.SegmentStore", "builtin.builtin_store", "convert.convert"),
+        *("sources.base.Reader", "conformance.check_reader", "conformance.check_segments"),
+    ),
+    "envs": ("scene.scene", "gym.DrivingGym"),
+    "modules": ("discriminator.discriminator",),
+    "collectors": ("beam_search.beam_search",),
+    "roadgraph": ("routes.routes",),
+    "metrics": ("choices.choices",),
+    "planners": (
+        *(f"interface.{name}" for name in ("Planner", "Scenario", "Traffic", "Pose", "Control")),
+        *("included.IDMPlanner", "included.LogPlanner"),
+    ),
+    "saved": (
+        "rollouts.SavedRollouts",
+        "rollouts.saved_rollouts",
+        "folder.save_rollouts",
+        "folder.load_rollouts",
+    ),
+    "wosac": ("scorer", "submission.write_submission"),
+    "training": ("processes.processes",),
+    "recipes": tuple(
+        f"{name}.{name}"
+        for name in ("bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h")
+    ),
+}
+"""What is not found through a package: modules that it does not import, and functions with the name of theirs."""
+ROLE = re.compile(r":(?:class|func|meth|data|mod|attr|exc):`~?([^`]+)`")
+STAR = re.compile(r"(`+[^`]+`+)|\[\*")
+
+
+def page(room: str) -> str:
+    """The page of a package: all that it exports, then what it does not; recipes with their code."""
+    options = "    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n"
+    source = "    options:\n      show_source: true\n" if room == "recipes" else ""
+    parts = [f"# symphony.{room}\n", f"::: symphony.{room}\n{options}"]
+    parts += [f"::: symphony.{room}.{name}\n{source}" for name in FURTHER.get(room, ())]
+    return "\n".join(parts)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages of all packages."""
+    for room in ROOMS:
+        files.append(File.generated(config, f"reference/{room}.md", content=page(room)))
+    return files
+
+
+def as_markdown(text: str) -> str:
+    """Roles become code; a star that begins a shape, outside of code, no emphasis."""
+    return STAR.sub(lambda found: found[1] or r"[\*", ROLE.sub(r"`\1`", text))
+
+
+class Markdown(Extension):
+    """Rewrites every docstring that is loaded."""
+
+    def on_object(self, *, obj: Object, **kwargs: Any) -> None:
+        """See :func:`as_markdown`."""
+        if obj.docstring is not None:
+            obj.docstring.value = as_markdown(obj.docstring.value)
