@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 from griffe import Extension, Object
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-ROOMS = ("geometry", "roadgraph", "data", "envs", "modules", "collectors", "objectives", "metrics", "agents")
-ROOMS += (
-    "learning",
-    "planners",
-    "rollouts",
-    "saved",
-    "wosac",
-    "evaluation",
-    "training",
-    "recipes",
-    "render",
-    "config",
-)
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = sorted({file.parent.name for file in ROOT.glob("src/symphony/*/__init__.py")} - {"cli"})
+RECIPES = [
+    file.stem for file in sorted((ROOT / "recipes").glob("*.py")) if f"def {file.stem}(" in file.read_text()
+]
 FURTHER = {
     "data": (
         *("segment.RunSegment", "store.SegmentStore", "builtin.builtin_store", "convert.convert"),
@@ -44,10 +37,7 @@ FURTHER = {
     ),
     "wosac": ("scorer", "submission.write_submission"),
     "training": ("processes.processes",),
-    "recipes": tuple(
-        f"{name}.{name}"
-        for name in ("bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h")
-    ),
+    "recipes": tuple(f"{name}.{name}" for name in RECIPES),
 }
 """What is not found through a package: modules that it does not import, and functions with the name of theirs."""
 ROLE = re.compile(r":(?:class|func|meth|data|mod|attr|exc):`~?([^`]+)`")
