@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,8 @@ from typing import Any
 from griffe import Extension, Object
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+
+import symphony
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = sorted({file.parent.name for file in ROOT.glob("src/symphony/*/__init__.py")} - {"cli"})
@@ -31,6 +35,7 @@ FURTHER = {
     ),
     "saved": (
         "rollouts.SavedRollouts",
+        "rollouts.SavedTrees",
         "rollouts.saved_rollouts",
         "folder.save_rollouts",
         "folder.load_rollouts",
@@ -40,6 +45,14 @@ FURTHER = {
     "recipes": tuple(f"{name}.{name}" for name in RECIPES),
 }
 """What is not found through a package: modules that it does not import, and functions with the name of theirs."""
+TOP = """# symphony
+
+What `import symphony` offers. These names stay what they are, or are announced in the changelog before they
+change; all else may change with a version.
+
+| name | what it is |
+| --- | --- |
+"""
 ROLE = re.compile(r":(?:class|func|meth|data|mod|attr|exc):`~?([^`]+)`")
 STAR = re.compile(r"(`+[^`]+`+)|\[\*")
 
@@ -53,8 +66,21 @@ def page(room: str) -> str:
     return "\n".join(parts)
 
 
+def public() -> str:
+    """The page of the names that most users need: each with the first sentence of its docstring."""
+    tree = ast.parse((ROOT / "src/symphony/__init__.py").read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    homes = {name.name: node.module for node in imports for name in node.names}
+    rows = []
+    for name in (name for name in symphony.__all__ if not name.startswith("_")):
+        first = as_markdown(inspect.getdoc(getattr(symphony, name)) or "").partition("\n")[0].rstrip(".")
+        rows.append(f"| [`{name}`][{homes[name]}.{name}] | {first} |\n")
+    return TOP + "".join(rows)
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages of all packages."""
+    """Add the pages of all packages, and of what the package itself names."""
+    files.append(File.generated(config, "reference/symphony.md", content=public()))
     for room in ROOMS:
         files.append(File.generated(config, f"reference/{room}.md", content=page(room)))
     return files
