@@ -60,9 +60,7 @@ class Table:
 
     def run(self) -> None:
         """Collect, compare and write."""
-        from rich.console import Console
-
-        from symphony.evaluation.formats import FORMATS, print_text
+        from symphony.evaluation.formats import FORMATS
         from symphony.evaluation.relations import RELATION_FORMATS, paired_lines, relations
         from symphony.evaluation.table import collect, compare
 
@@ -76,9 +74,6 @@ class Table:
                 sys.stderr.write(f"{line}\n")
         if self.relations:
             text = RELATION_FORMATS[self.format](relations(entries, self.setting))
-        elif self.out is None and self.format == "text" and (console := Console()).is_terminal:
-            print_text(comparison, console)
-            return
         else:
             text = FORMATS[self.format](comparison)
         if self.out is not None:

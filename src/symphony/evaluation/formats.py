@@ -2,123 +2,84 @@
 
 from __future__ import annotations
 
-import io
 import math
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.measure import Measurement
-from rich.table import Table
-from rich.text import Text
-
 from symphony.config import TableFormat
-from symphony.evaluation.table import ABSENT, SETTINGS, Cell, Column, Comparison, family, method_name
+from symphony.evaluation.table import ABSENT, SETTINGS, Cell, Column, Comparison, family
 from symphony.files import json_text
 
 NOTHING = "–"
+Grid = Sequence[Sequence[str]]
+"""Lines of cells, the heading first."""
 
 
-def _shown(cell: Cell, column: Column, plus: str = " ± ") -> str:
-    if math.isnan(cell.mean):
-        return NOTHING
-    mean = column.shown(cell.mean)
-    return mean if math.isnan(cell.error) else f"{mean}{plus}{column.shown(cell.error)}"
+def aligned(grid: Grid) -> str:
+    """A grid as plain text: columns of one width each, the first one flush left."""
+    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if k else cell.ljust(width)
+            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in grid
+    ]
+    return "".join(f"{line}\n" for line in [lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
-def print_text(comparison: Comparison, console: Console) -> None:
-    """Print the table; the best values bold on a terminal and with a star elsewhere."""
-    table = Table(title=comparison.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    ways, beside = any(row.way for row in comparison.rows), comparison.dataset is not None
-    table.add_column("method", max_width=None if ways else 10)  # wide enough for MGAIL+TS+H
-    table.add_column("seeds", justify="right")
+def markdown(grid: Grid) -> str:
+    """A grid as a table in Markdown."""
+    rule = ["---", *["---:"] * (len(grid[0]) - 1)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in [grid[0], rule, *grid[1:]])
+
+
+def _grid(
+    comparison: Comparison, best: Callable[[str], str], plus: str = " ± ", nothing: str = NOTHING
+) -> list[list[str]]:
+    """The table with the paper's figures in columns of their own; ``best`` marks the best of a family."""
+    paper = comparison.dataset is not None
+    head = ["method", "seeds"]
     for column in comparison.columns:
-        table.add_column(f"{column.title}\n{column.unit}", justify="right", no_wrap=True)
-    for row, following in zip(comparison.rows, [*comparison.rows[1:], None], strict=True):
-        label = Text(method_name(row.method))
-        label.append(f"\n  {row.way}" if row.way else "", "dim").append("\n  paper" if beside else "", "dim")
-        cells = []
-        for column in comparison.columns:
-            text = Text(justify="right")
-            lines = [(row.cells[column.key], ""), (row.paper.get(column.key, ABSENT), "dim")]
-            for k, (cell, faint) in enumerate(lines[: 1 + beside]):
-                star = "*" if cell.best and not console.is_terminal else ""
-                style = f"{'bold' * cell.best} {faint}".strip()
-                text.append("\n" * (k > 0)).append(_shown(cell, column, "±") + star, style)
-            cells.append(text)
-        # Families stand apart, as in the paper.
-        apart = following is not None and family(row.method) != family(following.method)
-        table.add_row(label, str(len(row.seeds) or ""), *cells, end_section=apart)
-    # As wide as what is in it: neither names nor numbers are cut.
-    before, unlimited = console.width, console.options.update(max_width=sys.maxsize)
-    console.width = max(before, Measurement.get(console, unlimited, table).maximum)
-    console.print(table, crop=False)
-    console.width = before
-    for note in comparison.notes:
-        plain = note if console.is_terminal else note.replace("bold:", "*:")
-        console.print(plain, style="dim", markup=False, highlight=False)
-
-
-def _as_text(comparison: Comparison) -> str:
-    file = io.StringIO()
-    print_text(comparison, Console(file=file, width=200, force_terminal=False, color_system=None))
-    return "\n".join(line.rstrip() for line in file.getvalue().splitlines()) + "\n"
-
-
-def _grid(comparison: Comparison, shown: Callable[[Cell, Column], str]) -> list[list[str]]:
-    """A line for each row: its name, its seeds, and its cells, each followed by the paper's where these are shown."""
-    grid = []
-    for row in comparison.rows:
-        line = [row.name, str(len(row.seeds) or "")]
-        for column in comparison.columns:
-            line.append(shown(row.cells[column.key], column))
-            if comparison.dataset is not None:
-                line.append(shown(row.paper.get(column.key, ABSENT), column))
-        grid.append(line)
-    return grid
-
-
-def _as_markdown(comparison: Comparison) -> str:
-    """The paper's figures have columns of their own."""
-
-    def shown(cell: Cell, column: Column) -> str:
-        return f"**{_shown(cell, column)}**" if cell.best else _shown(cell, column)
-
-    paper = [] if comparison.dataset is None else ["paper"]
-    heads = [part for column in comparison.columns for part in (f"{column.title} {column.unit}", *paper)]
-    lines = [["method", "seeds", *heads], ["---", *["---:"] * (len(heads) + 1)], *_grid(comparison, shown)]
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"{table}\n\n{comparison.title}: {_escaped('; '.join(comparison.notes), '_*|')}.\n"
-
-
-def _as_latex(comparison: Comparison) -> str:
-    """A ``tabular`` that needs no package."""
+        head += [f"{column.title} {column.unit}".strip(), *["paper"] * paper]
 
     def shown(cell: Cell, column: Column) -> str:
         if math.isnan(cell.mean):
-            return "--"
-        text = column.shown(cell.mean)
-        text = rf"\textbf{{{text}}}" if cell.best else text
-        return text if math.isnan(cell.error) else rf"{text} {{\scriptsize $\pm${column.shown(cell.error)}}}"
+            return nothing
+        error = "" if math.isnan(cell.error) else f"{plus}{column.shown(cell.error)}"
+        return best(column.shown(cell.mean) + error) if cell.best else column.shown(cell.mean) + error
 
-    double = comparison.dataset is not None
-    units = {"%": r"\%", "10⁻³": r"$\times 10^{-3}$"}
-    first, second = ["Method", "Seeds"], ["", ""]
-    for column in comparison.columns:
-        title = _escaped(column.title.replace("curvature JSD", "curv. JSD"), "_%&#$")
-        head = f"{title} ({units.get(column.unit, column.unit)})"
-        first.append(rf"\multicolumn{{2}}{{c}}{{{head}}}" if double else head)
-        second += ["ours", "paper"]
+    lines = [head]
+    for row in comparison.rows:
+        line = [row.name, str(len(row.seeds) or "")]
+        for column in comparison.columns:
+            cells = (row.cells[column.key], row.paper.get(column.key, ABSENT))
+            line += [shown(cell, column) for cell in cells[: 1 + paper]]
+        lines.append(line)
+    return lines
+
+
+def _as_text(comparison: Comparison) -> str:
+    notes = "".join(f"{note}\n" for note in comparison.notes).replace("bold:", "*:")
+    return f"{comparison.title}\n\n{aligned(_grid(comparison, '{}*'.format, plus='±'))}\n{notes}"
+
+
+def _as_markdown(comparison: Comparison) -> str:
+    notes = _escaped("; ".join(comparison.notes), "_*|")
+    return f"{markdown(_grid(comparison, '**{}**'.format))}\n{comparison.title}: {notes}.\n"
+
+
+def _as_latex(comparison: Comparison) -> str:
+    """A ``tabular`` that needs no package; families of methods stand apart."""
+    head, *rows = _grid(comparison, r"\textbf{{{}}}".format, plus=r" $\pm$ ", nothing="--")
+    titles = [_escaped(title, "_%&#$").replace("10⁻³", r"$\times 10^{-3}$") for title in head]
     lines = [f"% {note}" for note in comparison.notes]
-    lines.append(rf"\begin{{tabular}}{{lr{'r' * len(comparison.columns) * (1 + double)}}}")
-    lines += [r"\hline", *(rf"{' & '.join(line)} \\" for line in [first, second][: 1 + double])]
+    lines += [rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}", r"\hline", rf"{' & '.join(titles)} \\"]
     last = ""
-    for row, (name, *cells) in zip(comparison.rows, _grid(comparison, shown), strict=True):
+    for row, (name, *cells) in zip(comparison.rows, rows, strict=True):
         lines += [r"\hline"] if family(row.method) != last else []
         last = family(row.method)
-        lines.append(rf"{' & '.join([_escaped(name.replace('+', ' + '), '_%&#$'), *cells])} \\")
+        lines.append(rf"{' & '.join([_escaped(name, '_%&#$'), *cells])} \\")
     return "\n".join([*lines, r"\hline", r"\end{tabular}"]) + "\n"
 
 

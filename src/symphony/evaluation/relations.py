@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from symphony.config import PaperData, Setting, TableFormat
 from symphony.errors import ConfigError, DataError
+from symphony.evaluation.formats import markdown
 from symphony.evaluation.paper import paper_figures
 from symphony.evaluation.table import ASKED, COLUMNS, ROWS, Entry, method_name, number
 from symphony.files import json_text
@@ -300,11 +301,6 @@ def _as_text(found: Sequence[Relation]) -> str:
     return "".join(lines)
 
 
-def _as_markdown(found: Sequence[Relation]) -> str:
-    lines = [f"| {' | '.join(line)} |\n" for line in grid(found)]
-    return "".join([lines[0], "| --- | ---: | ---: | ---: | --- |\n", *lines[1:]])
-
-
 def _as_json(found: Sequence[Relation]) -> str:
     rows = []
     for one in found:
@@ -317,7 +313,7 @@ def _as_json(found: Sequence[Relation]) -> str:
 
 RELATION_FORMATS: dict[TableFormat, Callable[[Sequence[Relation]], str]] = {
     "text": _as_text,
-    "markdown": _as_markdown,
+    "markdown": lambda found: markdown(grid(found)),
     "json": _as_json,
 }
 """How relations are written."""

@@ -372,26 +372,30 @@ def compare(
         ]
         wosac = WOSAC if _wosac_year(entries) else ()
         columns = (*COLUMNS, *floor, *columns[len(COLUMNS) :], *wosac, *own, COST)
-    theirs = {
-        method: {key: Cell((), *figure) for key, figure in row.items()} for method, row in figures.items()
-    }
     found: dict[tuple[str, str], list[Entry]] = {(name, ""): [] for name in BASELINES}
     for entry in entries:
         found.setdefault((entry.method, entry.way), []).append(entry)
-    rows = []
-    for (method, way), mine in found.items():
-        cells = {
-            column.key: Cell.of([_number(entry, column) for entry in mine])
-            if mine
-            else _baseline(entries[0], column, method)
-            for column in columns
+    theirs = _with_best(
+        {
+            (method, ""): {key: Cell((), *figure) for key, figure in row.items()}
+            for method, row in figures.items()
         }
-        seeds, names = tuple(entry.seed for entry in mine), tuple(entry.name for entry in mine)
-        rows.append(Row(method, way, seeds, names, cells, theirs.get(method, {})))
-    ours = _with_best({(row.method, row.way): row.cells for row in rows})
-    paper = _with_best({(method, ""): cells for method, cells in theirs.items()})
+    )
+    ours = _with_best(
+        {
+            name: {column.key: _cell(mine, column, name[0], entries[0]) for column in columns}
+            for name, mine in found.items()
+        }
+    )
     rows = [
-        replace(row, cells=ours[row.method, row.way], paper=paper.get((row.method, ""), {})) for row in rows
+        Row(
+            *name,
+            tuple(entry.seed for entry in mine),
+            tuple(entry.name for entry in mine),
+            ours[name],
+            theirs.get((name[0], ""), {}),
+        )
+        for name, mine in found.items()
     ]
     return Comparison(setting, dataset, columns, tuple(rows), tuple(_notes(entries, dataset)))
 
@@ -415,11 +419,13 @@ def _number(entry: Entry, column: Column, part: str = "") -> float:
     return math.nan if column.optional and column.key not in where else number(entry, where, column.key)
 
 
-def _baseline(entry: Entry, column: Column, name: str) -> Cell:
-    """What an evaluation says of the log or of constant velocity."""
+def _cell(mine: Sequence[Entry], column: Column, name: str, first: Entry) -> Cell:
+    """A metric of a method over its seeds; of a baseline what the first evaluation says of it."""
+    if mine:
+        return Cell.of([_number(entry, column) for entry in mine])
     at_log = name == "playback" and column.key in _AT_A_DISTANCE
     known = not at_log and (column.key in METRICS or column.optional)
-    return Cell.of([_number(entry, column, name)]) if known else ABSENT
+    return Cell.of([_number(first, column, name)]) if known else ABSENT
 
 
 def _with_best(
