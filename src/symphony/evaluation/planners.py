@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.records import read_object
 from symphony.evaluation.report import grouped_mean, report, total_numbers
 from symphony.metrics.intervals import t_quantile
 from symphony.saved.folder import LATER, RolloutFolder
-from symphony.saved.rollouts import PLAYBACK, SavedRollouts
+from symphony.saved.rollouts import PLAYBACK
 
 FORMAT = 1
 """Version of a record."""
@@ -69,8 +68,7 @@ def planner_record(folder: RolloutFolder) -> Record:
         ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
         ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
         evaluated, progress relative to the log's along routes only; ``score``, the mean of :func:`run_score`,
-        ``score_se``, and ``score_runs`` that have one; ``search``, what :func:`selection` gives, None where no search
-        was kept; ``per_run``.
+        ``score_se``, and ``score_runs`` that have one; ``per_run``.
 
     Raises:
         DataError: there is no planner in it, or a file of it can't be read.
@@ -101,46 +99,8 @@ def planner_record(folder: RolloutFolder) -> Record:
         "score": score,
         "score_se": error,
         "score_runs": int(known.sum()),
-        "search": selection(saved for saved in folder if saved.trees is not None),
         "per_run": [{name: row[name] for name in (*_RUN, *_LATER)} for row in rows],
     }
-
-
-def selection(found: Iterable[SavedRollouts]) -> Record | None:
-    """Whether searches flatter the ego, which they don't score: how often it begins to collide, per 100 steps without
-    a collision, in all that was ``simulated`` and in what was ``kept`` (the leaves); None without any search.
-    """
-    counts = sum((_begun(saved) for saved in found), np.zeros((2, 2)))
-    out: Record = {}
-    for name, (begun, steps) in zip(("simulated", "kept"), counts.tolist(), strict=True):
-        out |= {name: 100.0 * begun / steps if steps else None, f"{name}_steps": int(steps)}
-    return out if counts.any() else None
-
-
-def _begun(saved: SavedRollouts) -> NDArray[np.float64]:
-    """[2, 2] collisions of the ego that begin, and the steps at which one could, in all slots and in leaves."""
-    trees = saved.trees
-    if trees is None:
-        return np.zeros((2, 2))
-    hit = trees.collision[..., 0]
-    before = np.zeros_like(hit)
-    before[..., 1:] = hit[..., :-1]
-    # The first step of a period follows the slot it was continued from.
-    for period, step in enumerate(range(trees.prune_every, hit.shape[-1], trees.prune_every)):
-        before[..., step] = np.take_along_axis(hit[..., step - 1], trees.parents[:, period], -1)
-    # Of leaves as of all slots at states; what is saved of rollouts is also found between them.
-    slot = np.repeat(trees.slots, trees.prune_every, 1)[:, : hit.shape[-1]]
-    going = saved.counted[..., 0]
-    own = np.take_along_axis(hit, slot.swapaxes(1, 2), 1).reshape(going.shape) & going
-    own_before = np.zeros_like(own)
-    own_before[:, 1:] = own[:, :-1]
-    return np.array(
-        [
-            [(hit & ~before).sum(), (~before).sum()],
-            [(own & ~own_before).sum(), (going & ~own_before).sum()],
-        ],
-        np.float64,
-    )
 
 
 def read_planner_record(path: Path) -> Record:

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from symphony.metrics.choices import Choice, choices, route_turns
-from symphony.metrics.curvature import (
-    Divergence,
-    curvature_histogram,
-    jensen_shannon,
-    sampled_divergence,
-    sampling_floor,
-)
+from symphony.metrics.curvature import curvature_histogram, jensen_shannon, sampled_divergence, sampling_floor
 from symphony.metrics.kinds import CollisionKind, CollisionKinds, collision_kinds
 from symphony.metrics.order import OrderStatistics, order_statistics, passing_gap
-from symphony.metrics.overlaps import Meetings, collisions, meetings
-from symphony.metrics.summary import RolloutMetrics, SegmentResult
+from symphony.metrics.overlaps import collisions, meetings
+from symphony.metrics.summary import RolloutMetrics
 
 __all__ = [
     "Choice",
     "CollisionKind",
     "CollisionKinds",
-    "Divergence",
-    "Meetings",
     "OrderStatistics",
     "RolloutMetrics",
-    "SegmentResult",
     "choices",
     "collision_kinds",
     "collisions",

@@ -119,7 +119,7 @@ class RolloutMetrics:
             speed: m/s in the rollouts.
             speed_log: m/s in the log.
             last: number of the last step of each segment.
-            kinds: [B, K, N] first collisions of simulated agents, the ego first.
+            kinds: [B, K, N] first collisions of simulated agents.
             kinds_logged: [B, K, N] first collisions of simulated agents while their log exists.
             curvature: per segment, the average curvature of every branching region visited by each rollout.
             curvature_log: per segment, the same of those visited by the log.
@@ -131,8 +131,8 @@ class RolloutMetrics:
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
         away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()
         kind, playback = (part.cpu().numpy() for part in kinds.first())
-        by_agent, by_agent_logged, playback_logged = (
-            part.cpu().numpy() for part in (kinds.kind, kinds_logged.kind, kinds_logged.playback)
+        kind_logged, playback_logged = (
+            part.cpu().numpy() for part in (kinds_logged.kind, kinds_logged.playback)
         )
         steps = [part.cpu().numpy() for part in (simulated, logged, at_states, offroad, speed, speed_log)]
         ends, edged = last.tolist(), bounded.tolist()
@@ -142,19 +142,17 @@ class RolloutMetrics:
             there, has_log, touching, off, own, log = (part[b] for part in steps)
             both, log = there & has_log, np.broadcast_to(log, own.shape)
             at_end = both[..., ends[b]]
-            rollouts, agents, compared = len(there), there.any(-1).sum(0), both.sum()
+            rollouts, agents, compared = len(there), both.any(-1).sum(), both.sum()
             first = _by_kind(kind[b], playback[b])
-            met = _by_kind(by_agent_logged[b], playback_logged[b])
+            met = _by_kind(kind_logged[b], playback_logged[b])
             shares = {
                 **_collision_shares("", first.sum(-1), rollouts),
                 "collision_with_playback": (first[:, 1].sum(), rollouts),
                 "collision_rear_ended_by_playback": (first[CollisionKind.REAR_ENDED, 1], rollouts),
                 "collision_rate_at_states": ((touching & there).any((1, 2)).sum(), rollouts),
                 "offroad_time": ((off & there).sum(), there.sum() * edged[b]),
-                **_collision_shares("ego_", _by_kind(by_agent[b][:, :1]).sum(-1), agents[0]),
-                **_collision_shares("others_", _by_kind(by_agent[b][:, 1:]).sum(-1), agents[1:].sum()),
-                **_collision_shares("agent_", met.sum(-1), both.any(-1).sum()),
-                "agent_collision_with_playback": (met[:, 1].sum(), both.any(-1).sum()),
+                **_collision_shares("agent_", met.sum(-1), agents),
+                "agent_collision_with_playback": (met[:, 1].sum(), agents),
                 "agent_offroad_time": ((off & both).sum(), compared * edged[b]),
                 "agent_progress": (own[both].sum(dtype=np.float64), log[both].sum(dtype=np.float64)),
             }
@@ -248,8 +246,7 @@ class RolloutMetrics:
             Of collisions: ``collision_rate_at_states`` counts overlaps at states only, as the paper and WOSAC do;
             ``collision_into_leader`` and so on are rollouts by the :class:`CollisionKind` of their first collision
             (they sum to ``collision_rate``), ``collision_with_playback`` those in which that is with a playback
-            agent, ``collision_rear_ended_by_playback`` both; ``ego_collision_rate`` and ``others_collision_rate``
-            are of agents, and by kind.
+            agent, ``collision_rear_ended_by_playback`` both.
 
             Of single agents while they are driven and logged: ``agent_collision_rate``, by kind, and
             ``agent_collision_with_playback``, percent of agents; ``agent_offroad_time``; ``agent_progress``, metres
@@ -292,10 +289,10 @@ def _nearest(error: NDArray[np.float64], count: NDArray[np.float64]) -> tuple[fl
     return float(error[best]), float(count[best])
 
 
-def _by_kind(kind: NDArray[np.int64], playback: NDArray[np.bool_] | bool = False) -> NDArray[np.int64]:
+def _by_kind(kind: NDArray[np.int64], playback: NDArray[np.bool_]) -> NDArray[np.int64]:
     """How many collisions there are by kind and whether the other is a playback agent [kinds, 2]."""
     same = kind[..., None] == np.array(CollisionKind)
-    other = np.broadcast_to(playback, kind.shape)[..., None] == np.array([False, True])
+    other = playback[..., None] == np.array([False, True])
     return (same[..., None] & other[..., None, :]).sum(tuple(range(kind.ndim)))
 
 
