@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,8 +19,10 @@ from symphony.errors import ConfigError
 if TYPE_CHECKING:
     from symphony.agents import Agent
     from symphony.data.store import SegmentStore
-    from symphony.evaluation import EvaluatedBatch, Evaluation
+    from symphony.evaluation import Evaluation
+    from symphony.evaluation.evaluator import Observer
     from symphony.evaluation.pictures import ClipKeeper
+    from symphony.saved.rollouts import SavedRollouts
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Evaluate:
             future = WosacSettings.of(config).future
             scorable(store, chosen or range(len(store)), future)  # or complain now, not after the work
         clips: ClipKeeper | None = None
-        keepers: list[Callable[[EvaluatedBatch], None]] = []
+        keepers: list[Observer] = []
         if self.figure is not None:
             from symphony.evaluation.pictures import PANELS, ClipKeeper
 
@@ -115,11 +117,11 @@ class Evaluate:
 
             plain = plain_settings(config, agent.interactive, agent.duration) | identity_of(agent)
             about = About.of(agent.name, store, plain, seed=config.seed)
-            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about), agent.name, config.others))
+            keepers.append(RolloutKeeper(RolloutWriter(self.save_rollouts, about)))
 
-        def observe(batch: EvaluatedBatch) -> None:
+        def observe(item: int, saved: SavedRollouts) -> None:
             for keeper in keepers:
-                keeper(batch)
+                keeper(item, saved)
 
         found = evaluate_with_bar(
             agent,
@@ -202,7 +204,7 @@ def evaluate_with_bar(
     config: EvaluateConfig,
     *,
     baselines: bool = False,
-    observe: Callable[[EvaluatedBatch], None] | None = None,
+    observe: Observer | None = None,
     items: Sequence[int] | None = None,
 ) -> Evaluation:
     """Evaluate an agent on a store, or on some of its items, showing on stderr how far it is."""

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from symphony.evaluation.evaluator import EvaluatedBatch, Evaluation, evaluate
+from symphony.evaluation.evaluator import Evaluation, evaluate
 
-__all__ = ["EvaluatedBatch", "Evaluation", "evaluate"]
+__all__ = ["Evaluation", "evaluate"]

@@ -8,17 +8,16 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.agents import Agent, load_agent
 from symphony.config import EvaluateConfig
-from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
@@ -33,29 +32,14 @@ from symphony.rollouts.driving import Simulation, search_kind, simulate_batch
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.unroll import Rollouts, existing
 from symphony.rollouts.workers import batches, naming, segments_together, shared
+from symphony.saved.rollouts import SavedRollouts, saved_rollouts
 
 BASELINES = ("playback", "constant_velocity")
 """Evaluated beside every agent, on the agents it drives and for as long."""
 Metric = Callable[[SceneBatch, Rollouts], Float[Tensor, "B K"]]
 """A metric of a user's own: a number [B, K] per rollout, NaN where there is none."""
-
-
-class EvaluatedBatch(NamedTuple):
-    """Scenes and the very rollouts that the metrics are of.
-
-    Attributes:
-        items: numbers of the run segments in their dataset.
-        segments: the run segments.
-        scenes: B scenes, on the CPU.
-        rollouts: [B, K, ...], on the CPU.
-        goal: [B, K, N] number of the route that each agent followed, -1 for none.
-    """
-
-    items: list[int]
-    segments: list[RunSegment]
-    scenes: SceneBatch
-    rollouts: Rollouts
-    goal: Int[Tensor, "B K N"]
+Observer = Callable[[int, SavedRollouts], None]
+"""Called with the number of each run segment in its dataset and the very rollouts that the metrics are of."""
 
 
 @dataclass
@@ -110,7 +94,7 @@ def evaluate(
     *,
     items: Sequence[int] | None = None,
     baselines: bool = False,
-    observe: Callable[[EvaluatedBatch], None] | None = None,
+    observe: Observer | None = None,
 ) -> Evaluation:
     """Evaluate an agent on every run segment of a store (paper, section V-B).
 
@@ -121,7 +105,7 @@ def evaluate(
         progress: called with the segments done and their total.
         items: only these run segments of the store, by their numbers.
         baselines: evaluate :data:`BASELINES` on the same segments, too.
-        observe: called with every batch of rollouts in this process, to draw or keep them.
+        observe: called in this process with the rollouts of every run segment, to draw or keep them.
 
     Raises:
         ConfigError: if the agent learned another time step than the store has.
@@ -143,7 +127,7 @@ def evaluate_dataset(
     progress: Callable[[int, int], None] | None = None,
     *,
     baselines: bool = False,
-    observe: Callable[[EvaluatedBatch], None] | None = None,
+    observe: Observer | None = None,
 ) -> Evaluation:
     """Evaluate an agent on every run segment of a prepared dataset, as :func:`evaluate` does.
 
@@ -179,8 +163,9 @@ def evaluate_dataset(
                     whole.own.setdefault(path, {}).update(values)
                 whole.seconds += part.seconds
                 whole.steps += part.steps
-            if observe is not None and seen is not None:
-                observe(EvaluatedBatch(numbers, [dataset.segment(i) for i in numbers], *seen))
+            if observe is not None:
+                for item, saved in zip(numbers, seen, strict=True):
+                    observe(item, saved)
             done += len(numbers)
             if progress is not None:
                 progress(done, len(dataset))
@@ -189,8 +174,8 @@ def evaluate_dataset(
     return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))
 
 
-_BatchResult = tuple[list[int], list[Evaluation], tuple[SceneBatch, Rollouts, Tensor] | None]
-"""Items of a batch, what was found of each agent, and the scenes, rollouts and goals of the first, on the CPU."""
+_BatchResult = tuple[list[int], list[Evaluation], list[SavedRollouts]]
+"""Items of a batch, what was found of each agent, and the rollouts of the first where they are asked for."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +200,8 @@ class _BatchEvaluator:
             scenes = self.dataset.scenes(items).to(torch.device(self.blank[0].config.device))
             log, log_valid = logged(scenes)
             logged_curvature = self._curvatures(items, log, log_valid & ~scenes.background[:, None])
-            parts, seen = [], None
+            parts: list[Evaluation] = []
+            seen: list[SavedRollouts] = []
             for agent, blank in zip(self.agents, self.blank, strict=True):
                 began = time.process_time()
                 try:
@@ -228,8 +214,20 @@ class _BatchEvaluator:
                 )
                 self._add(part, items, scenes, found, logged_curvature)
                 parts.append(part)
-                if self.seen and seen is None:
-                    seen = scenes.cpu(), found.rollouts.cpu(), found.goal.cpu()
+                if self.seen and not seen:
+                    driver, others = agent.name, blank.config.others
+                    seen = [
+                        saved_rollouts(
+                            self.dataset.segment(item),
+                            scenes,
+                            found.rollouts,
+                            row,
+                            goal=found.goal,
+                            driver=driver,
+                            others=others,
+                        )
+                        for row, item in enumerate(items)
+                    ]
             return items, parts, seen
 
     def _add(

@@ -16,7 +16,6 @@ from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.learning.demonstrations import SceneDataset
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
@@ -32,31 +31,15 @@ SHOWN = 8
 
 
 class RolloutKeeper:
-    """Saves rollouts while they are evaluated; see the evaluator's ``observe``.
+    """Saves rollouts while they are evaluated (see the evaluator's ``observe``), but for segments that are there."""
 
-    Args:
-        writer: of the folder; segments that are there already are left as they are.
-        driver: name of the agent.
-        others: what drives background agents.
-    """
+    def __init__(self, writer: RolloutWriter) -> None:
+        self.writer = writer
 
-    def __init__(self, writer: RolloutWriter, driver: str, others: str = "log") -> None:
-        self.writer, self.driver, self.others = writer, driver, others
-
-    def __call__(self, batch: EvaluatedBatch) -> None:
-        """Save a batch."""
-        for row, segment in enumerate(batch.segments):
-            if not self.writer.has(segment.segment_id):
-                saved = saved_rollouts(
-                    segment,
-                    batch.scenes,
-                    batch.rollouts,
-                    row,
-                    goal=batch.goal,
-                    driver=self.driver,
-                    others=self.others,
-                )
-                self.writer.add(saved)
+    def __call__(self, item: int, saved: SavedRollouts) -> None:
+        """Save the rollouts of a run segment."""
+        if not self.writer.has(saved.segment.segment_id):
+            self.writer.add(saved)
 
 
 class ClipKeeper:
@@ -75,12 +58,11 @@ class ClipKeeper:
         self.items, self.rollouts, self.title = set(items), rollouts, title
         self.clips: list[Clip] = []
 
-    def __call__(self, batch: EvaluatedBatch) -> None:
-        """Keep what is wanted of a batch."""
-        for row, (item, segment) in enumerate(zip(batch.items, batch.segments, strict=True)):
-            if item in self.items:
-                title = f"{self.title}{segment.segment_id}"
-                self.clips.append(clip_of(segment, batch.scenes, batch.rollouts, row, self.rollouts, title))
+    def __call__(self, item: int, saved: SavedRollouts) -> None:
+        """Keep the rollouts of a run segment if they are wanted."""
+        if item in self.items:
+            title = f"{self.title}{saved.segment.segment_id}"
+            self.clips.append(saved_clip(saved, self.rollouts, title))
 
 
 def clip_of(
