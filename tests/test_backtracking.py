@@ -114,7 +114,7 @@ def test_who_begins_again_draws_goals_anew(store: SegmentStore, monkeypatch: pyt
     assert torch.equal(logged.goal, routes.route_logged[:, None].expand_as(logged.goal))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_rule_is_that_of_the_gaps_agents_may_observe(seed: int) -> None:
     scenes = scene(
         crossing(6, seed=seed, steps=12) if seed % 2 else straight_road(6, seed=seed, steps=12), [0, 1, 2]

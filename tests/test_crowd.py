@@ -221,9 +221,6 @@ def cars(k: int) -> list[tuple[float, float, int]]:
     return [(60, 10, 0), (85, 10, 0), (190, 12, 1), (-6, 12, 2), (120, 0, 2)][: 3 + k]
 
 
-SEARCHES = ("none", "tree")
-
-
 def test_traffic_drawn_from_a_store_is_as_open_as_that_at_hand(store: SegmentStore) -> None:
     data = CrowdDataset(store, Crowd(3, open_traffic=True))
     at_hand, drawn = looking(data.scenes([0])), Playback(data, None, ObservationConfig.nothing())
@@ -253,8 +250,7 @@ def test_routes_begin_where_an_agent_comes_in() -> None:
     assert scenes.route_count[0, 1, 0] > 1
 
 
-@pytest.mark.parametrize("search", SEARCHES)
-@pytest.mark.parametrize("others", ["log", "idm", "learned"])
+@pytest.mark.parametrize(("search", "others"), [("none", "idm"), ("tree", "log"), ("tree", "learned")])
 def test_batch_and_padding_change_nothing(store: SegmentStore, search: Any, others: Any) -> None:
     config = EvaluateConfig(rollouts=4, search=search, interactive=2, others=others, seed=3)
     config = config if others != "log" else replace(config, interactive="all")

@@ -116,7 +116,6 @@ SEARCHES: list[dict[str, Any]] = [
     {"search": "none"},
     {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5},
     {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2},
-    {"search": "tree", "score": "flags", "branches": 4},
     {"search": "best", "branches": 2},
 ]
 
@@ -148,7 +147,7 @@ def test_one_that_cannot_be_copied_drives_without_a_search() -> None:
         simulated(Locked, search="tree", branches=6, rule="replace", threshold=1e9, prune_every=5)
 
 
-@pytest.mark.parametrize("score", ["discriminator", "flags", "rule"])
+@pytest.mark.parametrize("score", ["discriminator", "rule"])
 def test_the_search_scores_learned_agents_only(score: str) -> None:
     result = simulated(Wanderer, search="tree", score=score, branches=6).search
     assert (result.simulated_scores[..., 0] == 0).all()
@@ -217,12 +216,9 @@ def test_it_steers_a_vehicle_of_its_own_length() -> None:
     [
         (lambda _: 1 / 0, "step 3: ZeroDivisionError: division by zero (test_planner.py:"),
         ((float("nan"), 0.0), "step 3: ValueError: a plan that is not finite"),
-        ((0.0, 0.0, float("inf"), 0.0), "not finite"),
         ((1.0, 2.0, 3.0), "not a 3 one"),
         (None, "step 3: "),
-        ("left", "step 3: ValueError"),
         (lambda t: Pose(t.state[0] + 50, t.state[1], 0.0, 5.0), "a target 50.0 m away"),
-        (lambda t: Pose(t.state[0], t.state[1], 0.0, 500.0), "at 500.0 m/s"),
         (lambda t: t.position.fill(0), "read-only"),
     ],
 )
@@ -407,10 +403,8 @@ def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> No
     ("name", "why"),
     [
         ("best", "idm, log, an import path"),
-        ("pipe:", "there is no command ''"),
         ("pipe:no_such_command -x", "there is no command 'no_such_command'"),
         ("no_such.py:plan", "no such file"),
-        ("no_such_module:Planner", "can't import"),
         ("dataclasses:Field", "can't be made: TypeError"),
         ("threading:Event", "has no reset and no plan"),
         (f"{__name__}:Angry", "can't be made: RuntimeError: never"),

@@ -105,7 +105,7 @@ def test_runs_shorter_than_that_and_others_show_nothing(store: Path, tmp_path: P
         assert previewed(out) == {}
 
 
-@pytest.mark.parametrize(("method", "validated"), [("bc", True), ("bc_ts_h", True), ("mgail", False)])
+@pytest.mark.parametrize(("method", "validated"), [("bc_ts_h", True), ("mgail", False)])
 @pytest.mark.usefixtures("undrawn")
 def test_being_watched_changes_nothing(
     store: Path, held_out: Path, tmp_path: Path, method: str, validated: bool
