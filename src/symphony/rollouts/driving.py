@@ -129,7 +129,7 @@ def simulation(
     if egos is not None:
         if kind == "backtrack":
             raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
-        planned = egos.begin(env, start, seed=config.seed, forked=searches)
+        planned = EgoPolicy(env, egos, start, config.seed, forked=searches)
         actor = TensorDictSequential(actor, planned)
     if not searches:
         noise = SeededNoise(config.seed, env.dynamics.numbers)
