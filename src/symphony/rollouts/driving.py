@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -156,7 +156,7 @@ def simulation(
                 seed=config.seed,
                 rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
-                score=config.score,
+                score=config.looks_for(agent.search),
                 leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
@@ -170,8 +170,13 @@ def simulation(
     chosen = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1)
     if kind == "best" and result is not None:
         chosen = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
+    goal = ends.get(keys.GOAL)
+    if kind == "backtrack" and result is not None:
+        # Lines are trees of one branch each; to be filled from each other they are the branches of one.
+        chosen = filled_lines(result.totals.squeeze(-1), settings.threshold)[:, None]
+        found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
     rollouts = Rollouts(*(_branches(part, chosen).flatten(1, 2) for part in found))
-    goal = _branches(ends.get(keys.GOAL), chosen).flatten(1, 2)
+    goal = _branches(goal, chosen).flatten(1, 2)
     tree = result if kind == "tree" else None
     drawn = None if tree is None else start.get(keys.GOAL)
     whole = Simulation(rollouts, goal, tree, at_states=rollouts.collision, steps=steps, drawn=drawn)
@@ -298,9 +303,9 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
     """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
     if agent.policy is None:
         return "log"
-    blind = config.score == "discriminator" and agent.discriminator is None
+    blind = config.looks_for(agent.search) == "discriminator" and agent.discriminator is None
     if config.search == "agent":
-        return "tree" if agent.searches and not blind else "none"
+        return agent.search.way if agent.searches and not blind else "none"
     if config.search != "none" and blind:
         raise ConfigError(
             f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
@@ -351,6 +356,22 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
     each, trees = whole(next((each for each in exact if whole(each)[0] == each), least))
     return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
+
+
+def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor, "B K"]:
+    """Which line stands in each place after backtracking: its own, but a good one of its scene where it stayed bad.
+
+    The places of bad lines take the good ones in turn, so that none is copied much more often than another.
+
+    Args:
+        totals: of the periods of every line.
+        threshold: the highest one of a good period.
+    """
+    good = (totals <= threshold).all(-1)
+    count, place = good.sum(-1, keepdim=True), torch.arange(good.shape[-1], device=good.device)
+    good_first = (~good).to(torch.int8).argsort(dim=-1, stable=True)
+    turn = ((~good).cumsum(-1) - 1) % count.clamp_min(1)
+    return torch.where(good | (count == 0), place, good_first.gather(-1, turn.clamp_min(0)))
 
 
 def _branches(part: Tensor, order: Tensor) -> Tensor:
