@@ -385,9 +385,13 @@ def test_beside_a_planner_nothing_is_searched_unless_asked_for(store: Path, tmp_
     """A search asks the planner once for each branch."""
     agent = small()
     data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=2)
-    for changes, kind in (({}, "none"), ({"search": "tree"}, "tree"), ({"branches": 3}, "agent")):
+    for name, changes, kind in (
+        ("a", {}, "none"),
+        ("b", {"search": "tree"}, "tree"),
+        ("c", {"branches": 3}, "tree"),
+    ):
         config = EvaluateConfig(rollouts=2, **changes)
-        folder = save_simulation(tmp_path / kind, agent, data, config, planner=f"{__name__}:Wanderer")
+        folder = save_simulation(tmp_path / name, agent, data, config, planner=f"{__name__}:Wanderer")
         assert folder.about.settings["search"] == kind
         assert (folder[0].trees is None) == (kind == "none")
 

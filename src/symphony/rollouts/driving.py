@@ -316,10 +316,11 @@ def search_kind(agent: Agent, config: EvaluateConfig) -> str:
 
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
-    planner once for each branch.
+    planner once for each branch; trees where there shall be branches.
     """
-    asked = config.search != "agent" or config.branches or config.trees > 1
-    return config if asked else dataclasses.replace(config, search="none")
+    if config.search != "agent":
+        return config
+    return dataclasses.replace(config, search="tree" if config.branches or config.trees > 1 else "none")
 
 
 def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
