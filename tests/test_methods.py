@@ -456,7 +456,7 @@ def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneD
             draw(each, [2, 0, 1], 40, ROUTED, torch.Generator().manual_seed(3)) for each in (small, dataset)
         )
         assert (one == two).all()
-    assert len(small.scene) == len(small.experts) == 1
+    assert len(small.scene.kept) == len(small.experts.kept) == 1
 
 
 def test_one_search_serves_as_many_updates_as_configured(
