@@ -65,7 +65,7 @@ TESTED = {
     "simulation.planner_view": "test_planner.py test_planner_kinds.py test_planners.py",
     "simulation.planners": "test_planners.py",
     "simulation.wosac": "test_wosac_rollouts.py",
-    "training.alarms": "test_alarms.py",
+    "training.trainer": "test_alarms.py",
     "agents.checkpoint": "test_checkpoint.py test_checkpoint_hostile.py",
     "agents.choice": "test_validation.py",
     "data.crop": "test_crop.py",
