@@ -171,12 +171,6 @@ def test_whatever_a_planner_holds_is_looked_at_whole(kind: str, bind: Any) -> No
     assert one == same != other
 
 
-def test_the_order_of_a_set_is_nothing_of_a_planner() -> None:
-    one, other = {0, 8}, {8, 0}
-    assert list(one) != list(other)  # as of words from one process to the next
-    assert source_of(partial(steady, one)) == source_of(partial(steady, other))
-
-
 @pytest.mark.parametrize("make", [steadily, Shop, lambda gain: Shop(gain).plan])
 def test_what_a_function_or_an_object_holds_is_part_of_the_planner(make: Any) -> None:
     assert source_of(make(1.0)) == source_of(make(1.0)) != source_of(make(2.0))
