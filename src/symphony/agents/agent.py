@@ -30,7 +30,7 @@ from symphony.imports import load_object
 PLAYBACK = "playback"
 """Name of the logged trajectories themselves, evaluated like an agent."""
 FILE = "agent.json"
-"""Of a run's folder: the agent's specification."""
+"""File in a run's folder that holds the agent's specification."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class Agent:
 
     @property
     def interactive(self) -> int:
-        """How many agents a segment it was trained with (2 for baselines)."""
+        """How many agents of a run segment it was trained with (2 for baselines)."""
         return 2 if self.spec is None else self.spec.agent.interactive
 
     @property
     def duration(self) -> int:
-        """Seconds of a segment it was trained with; 0 for all."""
+        """Seconds of a run segment it was trained with; 0 for all."""
         return 0 if self.spec is None else self.spec.duration
 
     @property
@@ -96,7 +96,7 @@ class Agent:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Those of its networks that there are, by name."""
+        """The networks that it has, by name."""
         parts = {"policy": self.policy, "goals": self.goals, "discriminator": self.discriminator}
         return {name: module for name, module in parts.items() if module is not None}
 

@@ -7,7 +7,7 @@ import difflib
 import functools
 import json
 import types
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from pathlib import Path
 from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
@@ -18,17 +18,8 @@ FORMAT = 3
 
 
 def to_json(config: Any) -> str:
-    """A configuration as text that :func:`from_dict` reads back."""
-    return json.dumps({"format": FORMAT, **_values(config)}, indent=2) + "\n"
-
-
-def _values(config: Any) -> dict[str, Any]:
-    def value(item: Any) -> Any:
-        if dataclasses.is_dataclass(item):
-            return _values(item)
-        return str(item) if isinstance(item, Path) else item
-
-    return {f.name: value(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    """A configuration as text that :func:`read_json` reads back."""
+    return json.dumps({"format": FORMAT, **dataclasses.asdict(config)}, indent=2, default=str) + "\n"
 
 
 def read_json(kind: type[Any], file: Path) -> Any:
@@ -95,9 +86,7 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:
         if name not in fields:
-            close = difflib.get_close_matches(str(name), fields, 1)
-            hint = f", did you mean '{close[0]}'?" if close else ""
-            raise ConfigError(f"{where}unknown setting '{name}'{hint}")
+            raise ConfigError(f"{where}unknown setting '{name}'{_nearest(str(name), fields)}")
     for name, field in fields.items():
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if needed and name not in values:
@@ -114,9 +103,15 @@ def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind)  # compiles every annotation anew
 
 
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, known, 1)
+    return f", did you mean '{close[0]}'?" if close else ""
+
+
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
     """A value as its annotation wants it."""
     origin, options = get_origin(hint), get_args(hint)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and isinstance(value, dict):
         return from_dict(hint, value, where=f"{where}{name}.")
     if origin in (Union, types.UnionType):
@@ -127,15 +122,9 @@ def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
         return tuple(_typed(options[0], item, where, name) for item in value)
     if origin is Literal and isinstance(value, str):
         if value not in options:
-            close = difflib.get_close_matches(value, options, 1)
-            nearest = f", did you mean '{close[0]}'?" if close else ""
-            raise ConfigError(f"{where}{name} is one of {', '.join(options)}, not '{value}'{nearest}")
+            known = f"{', '.join(options)}, not '{value}'{_nearest(value, options)}"
+            raise ConfigError(f"{where}{name} is one of {known}")
         return value
-    return _plain(hint, value, where, name)
-
-
-def _plain(hint: Any, value: Any, where: str, name: str) -> Any:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
     if hint is Path and isinstance(value, str):
         return Path(value)
     if hint is float and number:
