@@ -32,13 +32,21 @@ from symphony.cli import (
     report,
     simulate,
     table,
+    test,
     train,
     view,
     wosac,
 )
 from symphony.cli.shared import PARAGRAPHS, warn
 from symphony.config.profiles import expanded
-from symphony.errors import AllFailedError, ConfigError, DataWarning, SymphonyError, printable
+from symphony.errors import (
+    AllFailedError,
+    ConfigError,
+    CouldNotRunError,
+    DataWarning,
+    SymphonyError,
+    printable,
+)
 from symphony.files import check_writable, lock_file
 
 __all__ = ["main"]
@@ -71,6 +79,7 @@ app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
 app.command(name="planners")(planners.Planners)
+app.command(name="test")(test.Test)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="agents")(agents.Agents)
 app.command(name="demo")(demo.Demo)
@@ -127,7 +136,7 @@ def results_of(command: Any) -> Iterator[Path]:
     for name, hint in get_type_hints(type(command), include_extras=True).items():
         path, extras = getattr(command, name), getattr(hint, "__metadata__", ())
         named = any(getattr(extra, "metavar", None) == "FILE" for extra in extras)
-        if name in ("json", "figure", "out") and named and path is not None and str(path) != "-":
+        if name in ("json", "figure", "out", "junit") and named and path is not None and str(path) != "-":
             yield path
 
 
@@ -176,6 +185,8 @@ def guarded(action: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except (SymphonyError, OSError) as error:
+        if isinstance(error, CouldNotRunError):
+            return _complain(error, USAGE)
         return _complain(error, ALL_FAILED if isinstance(error, AllFailedError) else FAILED)
     return 0
 
