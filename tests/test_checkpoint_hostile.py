@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from symphony.agents.fitting import match_optimizer
 from torch import nn
 
 from helpers_runs import tiny
@@ -25,7 +26,6 @@ from symphony.agents.checkpoint import (
     save_checkpoint,
 )
 from symphony.agents.choice import choose
-from symphony.agents.fitting import match_optimizer
 from symphony.config import ValidationConfig
 from symphony.recipes import train
 from symphony.training.alarms import Skips

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
+from symphony.render.genealogy import rows
+from symphony.render.tree import FATES, STROKES, score_colors
 
 import symphony.render
 from helpers_segments import crossing, straight_road
@@ -29,9 +31,7 @@ from symphony.errors import ConfigError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import SearchTree, plot_genealogy, plot_search, plot_tree
-from symphony.render.genealogy import rows
 from symphony.render.style import AGENT_COLORS, new_figure
-from symphony.render.tree import FATES, STROKES, score_colors
 from symphony.rollouts.driving import simulated
 
 EVERY, BRANCHES, STEPS = 2, 4, 5

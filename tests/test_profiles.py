@@ -8,11 +8,11 @@ from typing import Literal
 
 import pytest
 import tyro
+from symphony.cli.profiles import expanded
 from tensordict.nn import TensorDictModule
 
 from symphony.agents import Agent, discriminator_network, goal_network, policy_network
 from symphony.cli import main
-from symphony.cli.profiles import expanded
 from symphony.cli.recipe import Arguments
 from symphony.config import METHODS, PROFILES, AgentSpec, TrainConfig
 from symphony.errors import ConfigError

@@ -258,7 +258,9 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     # Earlier versions wrote no checksum. Its own name may be what was changed, hence no others are known.
     strange = set(manifest) - {"format", "step", "torch", "parts", "sha256"}
     if strange or manifest.get("sha256", checksum) != checksum:
-        raise CheckpointError("damaged: its checksum differs from the recorded one", file=file, field="sha256")
+        raise CheckpointError(
+            "damaged: its checksum differs from the recorded one", file=file, field="sha256"
+        )
     step, parts = manifest.get("step"), manifest.get("parts")
     if type(step) is not int or not 0 <= step < 10**12:
         raise CheckpointError(f"no number of updates: {str(step)[:40]!r}", file=file, field="step")
@@ -310,7 +312,9 @@ def _match(file: Path, own: Mapping[str, Any], saved: Mapping[str, Any]) -> None
             raise CheckpointError(f"only {where} has it", file=file, field=str(name))
         mine, other = own[name], saved[name]
         if not isinstance(other, Tensor) or mine.shape != other.shape or mine.dtype != other.dtype:
-            found = f"{other.dtype} {tuple(other.shape)}" if isinstance(other, Tensor) else type(other).__name__
+            found = (
+                f"{other.dtype} {tuple(other.shape)}" if isinstance(other, Tensor) else type(other).__name__
+            )
             raise CheckpointError(
                 f"saved as {found}, expected {mine.dtype} {tuple(mine.shape)}", file=file, field=name
             )

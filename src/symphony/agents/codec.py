@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,10 @@ def encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
         return [encode(item, tensors, f"{name}.{index}") for index, item in enumerate(value)]
     if isinstance(value, tuple):
         return {TAG: "tuple", "items": encode(list(value), tensors, name)}
+    return _encode_leaf(value, tensors, name)
+
+
+def _encode_leaf(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
     if isinstance(value, float):
         # JSON knows no infinity. (A numpy float64 is a float too: hence the conversion.)
         return float(value) if math.isfinite(value) else {TAG: "float", "value": repr(float(value))}
@@ -62,14 +66,18 @@ def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     kind = value.get(TAG)
     if kind is None:
         return {key: decode(item, tensors) for key, item in value.items()}
-    if kind in ("tensor", "array"):
-        tensor = tensors[value["value"]]
-        return tensor if kind == "tensor" else tensor.numpy()
-    if kind == "float":
-        return float(value["value"])
+    if kind in _LEAVES:
+        return _LEAVES[kind](value["value"], tensors)
     items = decode(value["items"], tensors)
     if kind == "dict":
         return dict(zip(decode(value["keys"], tensors), items, strict=True))
-    if kind == "tuple":
-        return tuple(items)
-    raise ValueError(f"unknown kind {kind!r}")
+    if kind != "tuple":
+        raise ValueError(f"unknown kind {kind!r}")
+    return tuple(items)
+
+
+_LEAVES: dict[str, Callable[[str, Mapping[str, Tensor]], Any]] = {
+    "array": lambda text, tensors: tensors[text].numpy(),
+    "float": lambda text, _: float(text),
+    "tensor": lambda text, tensors: tensors[text],
+}

@@ -86,15 +86,11 @@ class Generate:
         found = {}
         for split, (plan, path) in self._plans().items():
             with progress(f"generating {split}") as advance:
-                made = generate(
-                    plan,
-                    path,
-                    workers=self.workers,
-                    engine=self.engine,
-                    progress=lambda done, state, total=plan.segments, advance=advance: advance(
-                        done, total, f"from {state.networks} networks"
-                    ),
-                )
+
+                def show(done: int, state: Generation, total: int = plan.segments, to: Any = advance) -> None:
+                    to(done, total, f"from {state.networks} networks")
+
+                made = generate(plan, path, workers=self.workers, engine=self.engine, progress=show)
             found[split] = entry = describe(path, plan, made)
             print_facts(entry, str(path), aside=str(self.json) == "-")
             if entry["checksum"] != expected.get(split, entry["checksum"]):
@@ -230,7 +226,9 @@ class Convert:
                 sys.stderr.write("What is done is kept: the same command goes on with it.\n")
                 raise
         firsts = {
-            f"{reason} (first: {report.odd_examples[reason]})" if reason in report.odd_examples else reason: count
+            f"{reason} (first: {report.odd_examples[reason]})"
+            if reason in report.odd_examples
+            else reason: count
             for reason, count in report.odd.items()
         }
         rows = {
@@ -363,7 +361,11 @@ def _print_info(found: dict[str, Any]) -> None:
     }
     if chosen:
         partners = {f"partner: {context}": count for context, count in chosen["contexts"].items()}
-        shown["interactive agents"] = {"each": chosen["count"], **partners, "too few vehicles": chosen["too_few"]}
+        shown["interactive agents"] = {
+            "each": chosen["count"],
+            **partners,
+            "too few vehicles": chosen["too_few"],
+        }
     shown |= {"routes": found["routes"]} if "routes" in found else {}
     shown |= {"MiB on disk": found["bytes"] / 2**20, "checksum": found["checksum"]}
     shown |= {"excluded": sum(excluded.values()), **_excluded(excluded)}

@@ -216,7 +216,9 @@ def print_metrics(
             console.print(line, style="dim", markup=False)
     if details:
         for row in rows:
-            print_facts({name: value for name, value in row.items() if name != "agent"}, row["agent"], aside=aside)
+            print_facts(
+                {name: value for name, value in row.items() if name != "agent"}, row["agent"], aside=aside
+            )
     first, most = rows[0], max(row["rollouts"] for row in rows)
     driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
     if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has those that there are

@@ -81,8 +81,8 @@ class SimulationConfig:
     temperature: float = 0.0
     """Temperature of rule `systematic`; 0: as the agent was trained."""
     threshold: float | None = None
-    """Highest total of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained, and
-    0 where a score is 1 for each agent that is bad (`flags`, `rule`)."""
+    """Highest total of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
+    and 0 where a score is 1 for each agent that is bad (`flags`, `rule`)."""
     goals: Goals = "agent"
     """Branches that draw goals together: all of a `tree` (the paper), or each `branch` alone; `agent`: as the agent
     is meant to."""

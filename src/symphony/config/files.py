@@ -111,7 +111,6 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
     """A value as its annotation wants it."""
     origin, options = get_origin(hint), get_args(hint)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and isinstance(value, dict):
         return from_dict(hint, value, where=f"{where}{name}.")
     if origin in (Union, types.UnionType):
@@ -125,6 +124,11 @@ def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
             known = f"{', '.join(options)}, not '{value}'{_nearest(value, options)}"
             raise ConfigError(f"{where}{name} is one of {known}")
         return value
+    return _plain(hint, value, where, name)
+
+
+def _plain(hint: Any, value: Any, where: str, name: str) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if hint is Path and isinstance(value, str):
         return Path(value)
     if hint is float and number:

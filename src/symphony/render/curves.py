@@ -87,7 +87,9 @@ def plot_curves(
         for run, found in curves.items():
             for name, dashes in zip(names, DASHES, strict=False):
                 if name in found:
-                    _draw_curve(axes, *found[name], window, f"{name}-{run}", color=colors[run], linestyle=dashes)
+                    _draw_curve(
+                        axes, *found[name], window, f"{name}-{run}", color=colors[run], linestyle=dashes
+                    )
         axes.grid(color=LANE, linewidth=0.4, alpha=0.6)
         axes.set_axisbelow(True)
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
@@ -172,7 +174,7 @@ def plot_curvature(
     if len({len(shares) for shares in every}) > 1:
         raise DataError("counts differ in their number of bins")
     centres, width = np.linspace(-1, 1, len(every[0])), 2 / (len(every[0]) - 1)
-    reach = max(LEAST_REACH, max(np.abs(centres[shares > 0]).max() for shares in every)) + 2 * width
+    reach = max(LEAST_REACH, *(np.abs(centres[shares > 0]).max() for shares in every)) + 2 * width
     columns = min(columns, len(panels))
     figure, slots = _grid(len(panels), columns, 4.2, 2.9)
     for axes, title, policy, log in zip(slots, panels, every[::2], every[1::2], strict=True):

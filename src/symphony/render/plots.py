@@ -185,9 +185,11 @@ def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None
     """The first so many of the saved rollouts of a run segment, all by default, to be drawn or animated."""
     # The first state is the log's.
     state = saved.state[:count, 1:].swapaxes(1, 2)
-    flags = (part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad))
+    valid, collision, offroad = (
+        part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad)
+    )
     place = state[..., :2], state[..., 2], saved.agents, saved.start + 1
-    return Clip(saved.segment, *place, *flags, title=title)
+    return Clip(saved.segment, *place, valid, collision, offroad, title=title)
 
 
 def plot_rollout(clip: Clip, target: Target) -> Axes:
@@ -232,7 +234,13 @@ def plot_rollout(clip: Clip, target: Target) -> Axes:
 
 
 def plot_routes(
-    segment: RunSegment, agent: int, lines: Sequence[NDArray[Any]], logged: int, target: Target, *, step: int = 0
+    segment: RunSegment,
+    agent: int,
+    lines: Sequence[NDArray[Any]],
+    logged: int,
+    target: Target,
+    *,
+    step: int = 0,
 ) -> Axes:
     """Draw the routes of an agent, a dot for each of their points, the one that it took on top, and its log.
 
@@ -304,7 +312,14 @@ def _own_view(trails: NDArray[Any], target: Target) -> View:
 
 
 def draw_ways(
-    axes: Axes, clip: Clip, rank: int, color: str, *, width: float, until: int | None = None, gid: str | None = None
+    axes: Axes,
+    clip: Clip,
+    rank: int,
+    color: str,
+    *,
+    width: float,
+    until: int | None = None,
+    gid: str | None = None,
 ) -> None:
     """Draw the way of one of the agents in every rollout, up to a step."""
     past = slice(None if until is None else until + 1)
