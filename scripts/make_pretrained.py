@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from symphony.cli.tables import COLUMNS
+from symphony.cli.shared import COLUMNS
 
 from symphony.agents import build_agent
 from symphony.agents.agent import FILE, read_spec

@@ -30,7 +30,6 @@ from symphony.learning import SearchReplay
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.logged import logged
 from symphony.recipes import train
-from symphony.render import curves
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
@@ -108,13 +107,6 @@ def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
     # Who searches learns from the survivors.
     assert ("policy_nll_rollout" in records[0]) == ("search_offroad_kept" in records[0]) == ("ts" in method)
     assert {name.removeprefix("loss_") for name in records[0] if name.startswith("loss_")} == NETWORKS[method]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
-    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
-    recorded = {name for record in read_metrics(trained(method)) for name in record}
-    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from made import Case, segment_of
 from scenes import car, ego
 from scipy import stats
-from symphony.cli.tables import number_cell
+from symphony.cli.shared import number_cell
 
 from helpers_saved import played
 from helpers_store import fill

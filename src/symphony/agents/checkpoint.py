@@ -142,7 +142,7 @@ def load_checkpoint(
         if isinstance(item, nn.Module):
             states[part] = _widened(item, states[part]) if widen else states[part]
             _match(path / f"{part}.safetensors", item.state_dict(), states[part])
-    for part, item in asked.items():
+    for part, item in reversed(asked.items()):  # optimizers first, of which one may still dislike its state
         try:
             item.load_state_dict(states[part])
         except Exception as error:  # each kind of optimizer has its own

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         TableFormat,
     )
     from symphony.config.files import FORMAT, from_dict, read_json, to_json
-    from symphony.config.profiles import PROFILES, Profile
+    from symphony.config.profiles import Profile
     from symphony.config.training import (
         METHODS,
         Method,
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 __all__ = [
     "FORMAT",
     "METHODS",
-    "PROFILES",
     "AgentConfig",
     "AgentSpec",
     "DiscriminatorConfig",
