@@ -398,7 +398,6 @@ def _load_checkpoint(folder: Path, _: str) -> tuple[str, str]:
     from symphony.agents.checkpoint import checkpoints, load_checkpoint
     from symphony.agents.choice import Best
     from symphony.errors import DataError
-    from symphony.training.alarms import Skips
 
     own = _networks_as_new()
     try:
@@ -406,7 +405,6 @@ def _load_checkpoint(folder: Path, _: str) -> tuple[str, str]:
             # As of a stranger's agent: what a run goes on from is its own.
             loaded = load_checkpoint(place, modules=own["modules"], partial=True, restore_rng=False)
             Best.of(loaded.extra)
-            Skips.of(loaded.extra)
     except DataError:
         return REFUSED, ""
     import torch

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from helpers_segments import straight_road
 from helpers_store import fill
 from symphony.bench import run as bench
+from symphony.bench.criticality import hardest
 from symphony.bench.measures import estimate, needed_groups
 from symphony.bench.run import run_suite
 from symphony.bench.suite import read_suite
@@ -131,6 +132,7 @@ def test_as_many_groups_as_needed_and_no_more(limit: float, confidence: float) -
         ("confidence = 0.9", "confidence = 95", 5, "confidence", "95"),
         ("confidence = 0.9", "segments = 7", 5, "segments", "6 segments"),
         ("confidence = 0.9", 'segments = ["x"]', 5, "segments", "'x'"),
+        ("confidence = 0.9", "hardest = 9", 5, "hardest", "6 segments"),
         ("confidence = 0.9", 'baseline = "other"', 5, "baseline", "no planner"),
         ('planner = "log"', 'planner = "logs"', 8, "planner", "logs"),
         ("planners.py:fast", "planners.py:slow", 12, "planner", "slow"),
@@ -177,6 +179,8 @@ def test_log_playback_passes_and_a_wild_planner_is_judged(suite: Path, tmp_path:
     log, fast = found["pairs"]
     assert log["numbers"]["log_distance"] == pytest.approx(0, abs=1e-3)
     assert fast["numbers"]["log_distance"] > 1
+    assert log["numbers"]["pdm_score"] == 100
+    assert fast["numbers"]["pdm_score"] == 0  # it leaves the road
     assert len(log["per_run"]) == log["planned"] == 12
     assert "passes" in capsys.readouterr().out
     tree = ET.fromstring(junit.read_text())  # noqa: S314 - ours
@@ -187,6 +191,12 @@ def test_log_playback_passes_and_a_wild_planner_is_judged(suite: Path, tmp_path:
     assert main(["test", str(suite), "--out", str(out)]) == 0
     again = json.loads((out / "result.json").read_text())
     assert again["verdicts"] == found["verdicts"]
+
+
+def test_a_suite_of_the_hardest_segments(suite: Path) -> None:
+    suite.write_text(SUITE.replace("rollouts = 2", "rollouts = 2\nhardest = 4"))
+    chosen = read_suite(suite)
+    assert list(chosen.items) == [row for row, _ in hardest(chosen.store, 4)]
 
 
 def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:

@@ -365,10 +365,14 @@ def test_what_users_type_changes_on_purpose_only() -> None:
 
 
 @pytest.mark.parametrize("gone", GONE)
-def test_what_is_gone_is_told_with_what_takes_its_place(gone: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_gone_is_told_with_what_takes_its_place(
+    gone: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([*gone.split(), "x"]) == 2
     assert f"`symphony {gone}` is gone: {GONE[gone]}" in capsys.readouterr().err
-    assert not any(line.startswith(gone) for line in (Path(__file__).parent / "cli.txt").read_text().splitlines())
+    assert not any(
+        line.startswith(gone) for line in (Path(__file__).parent / "cli.txt").read_text().splitlines()
+    )
 
 
 LIGHT = """

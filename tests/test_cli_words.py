@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 from rich.table import Table
-from symphony.cli.shared import print_metrics, print_table
 
 from helpers_runs import tiny
 from helpers_segments import straight_road
 from helpers_store import fill
 from symphony.cli import main
+from symphony.cli.shared import print_metrics, print_table
 from symphony.cli.train import last_words
 from symphony.config import ValidationConfig
 from symphony.errors import ConfigError

@@ -406,9 +406,7 @@ def test_rollouts_are_drawn_over_the_log() -> None:
 
 def test_padding_changes_nothing() -> None:
     segment = straight_road(4)
-    plain, padded = (
-        plot_rollout(rollouts(segment, agents), blank()) for agents in ([0, 2], [0, -1, 2])
-    )
+    plain, padded = (plot_rollout(rollouts(segment, agents), blank()) for agents in ([0, 2], [0, -1, 2]))
     assert gids(plain) == gids(padded)
     assert plain.get_xlim() == padded.get_xlim()
     assert labels(plain) == labels(padded)

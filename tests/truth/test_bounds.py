@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from made import Case, segment_of
 from scenes import car, ego
 from scipy import stats
-from symphony.cli.shared import number_cell
 
 from helpers_saved import played
 from helpers_store import fill
 from symphony.cli import main
 from symphony.cli.planners import table_text
+from symphony.cli.shared import number_cell
 from symphony.config import EvaluateConfig
 from symphony.evaluation import evaluate
 from symphony.evaluation.planners import winners

@@ -58,6 +58,7 @@ MEASURES: dict[str, Measure] = {
     "blocking_rate": Measure(_happens("blocking_time"), "% of runs", "runs that block traffic", "rate"),
     "failed_rate": Measure(lambda run: 100.0 * bool(run["failed"]), "% of runs", "runs that failed", "rate"),
     "score": Measure(run_score, "of 100", "score"),
+    "pdm_score": Measure(lambda run: run["pdm_score"], "of 100", "PDM score"),
     "progress_ratio": Measure(_number("progress_ratio"), "", "progress relative to the log's"),
     "offroad_time": Measure(_number("offroad_time"), "% of time", "time off the road"),
     "wrong_way_time": Measure(_number("wrong_way_time"), "% of time", "time against the traffic"),

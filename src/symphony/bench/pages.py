@@ -18,6 +18,7 @@ LEAD = 2.0
 """Seconds before the first event of a run at which its replay begins."""
 SHOWN = (
     "score",
+    "pdm_score",
     "at_fault_collision_rate",
     "collision_rate",
     "red_light_rate",

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from symphony.agents.agent import load_agent
 from symphony.bench.measures import MEASURES, Estimate, estimate, paired
+from symphony.bench.published import pdm
 from symphony.bench.suite import Crowd, Suite, SuitePlanner, Threshold
 from symphony.errors import AllFailedError, DataError
 from symphony.evaluation.planners import run_score
@@ -224,12 +225,24 @@ def _drive(
             progress=tell,
         ).only(suite.store.ids[i] for i in items)
         found = report(folder, "ego")
-        pair.report.rows += found.rows
+        pair.report.rows += _with_pdm(found, folder)
         pair.report.events |= found.events
         if pair.planner.name != suite.baseline and _lost(suite, pair):
             break
     pair.report.agent = name
     pair.seconds = time.perf_counter() - began
+
+
+def _with_pdm(found: Report, folder: RolloutFolder) -> list[dict[str, Any]]:
+    """The rows of a report with the PDM score of each run."""
+    rows = {(row["segment"], row["rollout"]): row for row in found.rows}
+    for saved in folder:
+        name = saved.segment.segment_id
+        for k in range(saved.rollouts):
+            events = [one for one in found.events[name] if one.rollout == k and one.kind == "collision"]
+            terms = pdm(rows[name, k], saved, [one.other for one in events if one.fault])
+            rows[name, k]["pdm_score"] = None if terms is None else terms.score
+    return [{"pdm_score": 0.0 if row["failed"] else None, **row} for row in found.rows]
 
 
 def _lost(suite: Suite, pair: Pair) -> bool:

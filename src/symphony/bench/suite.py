@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from symphony.agents.agent import load_agent
+from symphony.bench.criticality import hardest
 from symphony.bench.measures import MEASURES, needed_groups
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import check_planner_seconds
@@ -33,6 +34,7 @@ _SUITE = {
     "name": str,
     "data": str,
     "segments": (int, list),
+    "hardest": int,
     "rollouts": int,
     "seed": int,
     "confidence": float,
@@ -165,6 +167,12 @@ class _Reader:
         planners, crowds = self._planners(), self._crowds(shared | {"rollouts": rollouts, "seed": seed})
         with self._at("suite", None, "segments"):
             items = self._items(store, top.get("segments", 0))
+        if "hardest" in top:
+            if not 0 < top["hardest"] <= len(items):
+                raise self._wrong(
+                    "suite", None, "hardest", f"is of {len(items)} segments, not {top['hardest']}"
+                )
+            items = tuple(row for row, _ in hardest(store, top["hardest"], items))
         thresholds = self._thresholds(planners, crowds, sure)
         baseline = self._baseline(top.get("baseline", ""), planners)
         known = store.groups

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -9,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from symphony.cli.shared import ResultFile, at_least, print_facts, progress, say, warn, write_numbers
+from symphony.cli.shared import (
+    ResultFile,
+    at_least,
+    print_facts,
+    print_table,
+    progress,
+    say,
+    warn,
+    write_numbers,
+)
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -43,9 +53,10 @@ class Generate:
     seed: int = 0
     """Seed of the networks: another one gives other networks."""
     split: Literal["train", "validation", "test"] = "train"
-    """Use of the run segments: the three splits never share a network, whatever their seeds."""
+    """Use of the run segments: the three splits never share a network, except for roads of your own."""
     kinds: str = "town"
-    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), random (no grid)."""
+    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), random (no grid), or files
+    with roads of your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml)."""
     duration: Literal[10, 20, 30] = 10
     """Seconds of a run segment."""
     interactive: int = 2
@@ -127,6 +138,48 @@ class Quality:
         for missed in shortfalls(quality):
             sys.stderr.write(f"below what generated sets must reach: {missed}\n")
         write_numbers(self.json, quality)
+
+
+@app.command(name="hardest")
+@dataclass(frozen=True)
+class Hardest:
+    """List the run segments of a store that are most critical for the ego, the hardest first.
+
+    Four things make a segment critical, each with up to one point: a short time to collision, a short time between
+    the ego and another who crosses its way, hard braking, and a small distance to the road's boundary.
+    """
+
+    data: Store
+    """Folder of the store."""
+    count: int = 20
+    """Number of run segments that are listed."""
+    ids: bool = False
+    """Print only their ids, for the option --segments of other commands."""
+    json: ResultFile = None
+    """File to write the list to; - for standard output, in place of the table."""
+
+    def __post_init__(self) -> None:
+        at_least(1, count=self.count)
+
+    def run(self) -> None:
+        """Look at every run segment and print the hardest."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from symphony.bench.criticality import hardest
+        from symphony.data.store import SegmentStore
+
+        with progress("looking at the log") as advance:
+            found = [one for _, one in hardest(SegmentStore(self.data), self.count, progress=advance)]
+        write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
+        if self.ids:
+            say("\n".join(one.segment for one in found))
+        elif str(self.json) != "-":
+            table = Table("segment", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m")
+            for one in found:
+                numbers = (one.score, one.time_to_collision, one.encroachment, one.braking, one.margin)
+                table.add_row(one.segment, *("–" if math.isinf(n) else f"{n:.2f}" for n in numbers))
+            print_table(table, Console())
 
 
 @app.command(name="convert")

@@ -41,7 +41,8 @@ class Simulate:
     planner: str = ""
     """Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
     own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as
-    the agent all others play back the log."""
+    the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say so: a
+    search asks the planner once for each branch."""
     planner_seconds: float = 60.0
     """Seconds that a planner has for one answer; a longer one fails the run."""
     goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID=PLACE ...")] = ()
@@ -65,11 +66,13 @@ class Simulate:
         from symphony.data.store import SegmentStore
         from symphony.learning.demonstrations import evenly_spaced
         from symphony.rollouts.crowd import crowd_dataset
-        from symphony.rollouts.driving import spread_runs
+        from symphony.rollouts.driving import beside_planner, spread_runs
         from symphony.saved.saving import save_simulation
 
         agent = load_agent(self.agent, self.config.device, trust_code=self.trust_code)
         store, config = SegmentStore(self.data), self.config
+        if self.planner:
+            config = beside_planner(config)
         # Beside log playback nobody else is simulated.
         others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = segment_indices(store, self.segments)

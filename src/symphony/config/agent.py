@@ -110,8 +110,7 @@ class SearchConfig:
     threshold: float = 1.0
     """Of rule `replace`: the highest total, in logits of the discriminator, that a branch goes on with."""
     goals: Literal["tree", "branch"] = "tree"
-    """Who draws goals together in evaluation: all branches of a `tree` (the paper), or each `branch` alone. In
-    training all follow the routes of the log."""
+    """Who draws goals together: all branches of a `tree` (the paper), or each `branch` alone."""
     updates: int = 10
     """Updates made from the results of one search before the next."""
     states: int = 256

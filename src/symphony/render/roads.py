@@ -15,8 +15,8 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
-from symphony.render.viewer.pack import BIKE_WIDTH, DEFAULT_WIDTH
 from symphony.render.style import BOUNDARY, CAUTION, GO, INK, LANE, MARK, ROAD, STOP, View
+from symphony.render.viewer.pack import BIKE_WIDTH, DEFAULT_WIDTH
 
 SLIT = 0.4
 ARROW_SPACING = 14.0

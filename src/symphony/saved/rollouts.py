@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # who only reads rollouts waits for no torch
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
 BACKGROUND = "background:"
-"""What the names of drivers begin with whose agents nobody evaluates."""
+"""The begin of the names of drivers whose agents nobody evaluates."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The one trainer: loop, resume, validation, previews, alarms, logging, processes."""
+"""The one trainer: loop, resume, alarms, logging, processes, and hooks that validate and show."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.training.phases import Phase, Updates, cosine
     from symphony.training.processes import Processes
-    from symphony.training.trainer import Trainer
+    from symphony.training.trainer import Phase, Trainer, Updates, cosine
 
 __all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine"]
 
