@@ -448,16 +448,11 @@ def describe(path: Path, plan: Plan, made: Generation) -> dict[str, Any]:
     if quality is None:
         quality = measured(path, plan.interactive)
         add_to_report(path, "quality", quality)
-    minutes = max(made.seconds, 1e-9) / 60
     return {
         "path": str(path),
         "settings": store.report["settings"],
         "segments": len(store),
-        "maps": store.num_maps,
-        "bytes_per_segment": round(store.summary()["bytes"] / len(store)),
         "checksum": store.checksum(),
         "generation": asdict(made),
-        "per_minute_and_core": round(len(store) / minutes, 1),
-        "accepted_per_minute_and_core": round(made.accepted / minutes, 1),
         "quality": quality,
     }

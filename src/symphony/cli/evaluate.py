@@ -56,7 +56,7 @@ class Evaluate:
     figure: ResultFile = None
     """Picture of some of the rollouts (.png, .pdf or .svg), or animation of them (.gif)."""
     save_rollouts: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder to keep the very rollouts in that are evaluated (see `symphony view`, `report` and `export`)."""
+    """Folder for the rollouts that are evaluated (see `symphony view`, `report` and `export`)."""
     details: bool = False
     """Print every number of each agent, not only the table: kinds of collision, what the divergence owes to sampling,
     where agents stand at the end, what a search made of the goals, and what becomes of single agents."""

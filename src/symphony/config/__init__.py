@@ -16,12 +16,11 @@ if TYPE_CHECKING:
         EvaluateConfig,
         PaperData,
         Score,
-        Search,
         Setting,
         TableColumns,
         TableFormat,
     )
-    from symphony.config.files import FORMAT, from_dict, read_json, to_json
+    from symphony.config.files import read_json, to_json
     from symphony.config.profiles import Profile
     from symphony.config.training import (
         METHODS,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from symphony.config.wosac import WosacSettings
 
 __all__ = [
-    "FORMAT",
     "METHODS",
     "AgentConfig",
     "AgentSpec",
@@ -50,7 +48,6 @@ __all__ = [
     "Profile",
     "RunConfig",
     "Score",
-    "Search",
     "SearchConfig",
     "Setting",
     "TableColumns",
@@ -58,7 +55,6 @@ __all__ = [
     "TrainConfig",
     "ValidationConfig",
     "WosacSettings",
-    "from_dict",
     "read_json",
     "to_json",
 ]

@@ -79,13 +79,10 @@ class DiscriminatorConfig:
     network: str = "paper"
     """Discriminator: `paper`, or the import path of a function from an `AgentSpec` to a module that writes one logit
     per agent."""
-    GONE: ClassVar[dict[str, Any]] = {"radius": 20.0, "head": lambda values: 2 * values.get("hidden", 32)}
-    GONE_IN_TRAINING: ClassVar[dict[str, Any]] = {
-        "states": 256,
-        "learning_rate": 1e-3,
-        "gradient_penalty": 0.0,
-        "instance_noise": 0.0,
-    }
+    GONE: ClassVar[dict[str, Any]] = {
+        "radius": 20.0,
+        "head": lambda values: 2 * values.get("hidden", 32),
+    } | dict.fromkeys(("states", "learning_rate", "gradient_penalty", "instance_noise"), ...)
 
     def __post_init__(self) -> None:
         one_of(self, "features", get_args(Features))
@@ -119,8 +116,10 @@ class SearchConfig:
     states: int = 256
     """States per update of the surviving rollouts for the policy, and of the simulated and the logged ones each for
     the discriminator; every state is of all its interactive agents."""
-    GONE: ClassVar[dict[str, Any]] = {"keep": 0.5, "aggregate": "max_then_sum"}
-    GONE_IN_TRAINING: ClassVar[dict[str, Any]] = {"segments": 16, "weight": 1.0, "survivors": "all"}
+    GONE: ClassVar[dict[str, Any]] = {
+        "keep": 0.5,
+        "aggregate": "max_then_sum",
+    } | dict.fromkeys(("segments", "weight", "survivors"), ...)
 
     def __post_init__(self) -> None:
         positive(self, "branches", "test_branches", "prune_every", "temperature", "updates", "states")
@@ -152,7 +151,6 @@ class AgentSpec:
     discriminator: DiscriminatorConfig | None = None
     searches: bool = False
     search: SearchConfig = field(default_factory=SearchConfig)
-    TRAINS: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         one_of(self, "action_space", get_args(ActionSpace))

@@ -38,28 +38,24 @@ def read_json(kind: type[Any], file: Path) -> Any:
         raise ConfigError(f"{file}: not a JSON object")
     if values.pop("format", None) != FORMAT:
         raise ConfigError(f"{file}: configuration of another version, expected format {FORMAT}")
-    _adapt(kind, values, f"{file}: ", trains=getattr(kind, "TRAINS", True))
+    _adapt(kind, values, f"{file}: ")
     return from_dict(kind, values, where=f"{file}: ")
 
 
-def _adapt(kind: Any, values: dict[str, Any], where: str, *, trains: bool) -> None:
-    """Make of an older file's settings today's.
+def _adapt(kind: Any, values: dict[str, Any], where: str) -> None:
+    """Make of an older agent's settings today's.
 
     Settings that the file is too old to have, and that meant something else then than by default now, are added.
     Settings that are gone are left out where they said what always holds now: ``GONE`` of a class has these values
-    by name, ``...`` for a setting that changed no result, and a function where the value follows from the others.
-    ``GONE_IN_TRAINING`` has those that matter to a training only, so that an agent can be read whatever they were.
+    by name, ``...`` for what mattered to the training only, and a function where the value follows from the others.
 
     Raises:
         ConfigError: a setting that is gone said something else.
     """
-    gone, of_training = (getattr(kind, name, {}) for name in ("GONE", "GONE_IN_TRAINING"))
-    for name, held in (gone | of_training).items():
+    for name, held in getattr(kind, "GONE", {}).items():
         meant = held(values) if callable(held) else held
         found = values.pop(name, meant)
-        # Of settings that went together, a file may be too old to have all.
-        same = found.items() <= meant.items() if isinstance(found, dict) else meant is ... or found == meant
-        if not same and (trains or name in gone):
+        if meant is not ... and found != meant:
             raise ConfigError(f"{where}setting '{name}' is gone: this version reads only {meant!r}")
     for field in dataclasses.fields(kind):
         hint, value = _hints(kind)[field.name], values.get(field.name)
@@ -67,7 +63,7 @@ def _adapt(kind: Any, values: dict[str, Any], where: str, *, trains: bool) -> No
             values.setdefault(field.name, field.metadata["before"])
         for nested in (hint, *get_args(hint)):
             if isinstance(nested, type) and dataclasses.is_dataclass(nested) and isinstance(value, dict):
-                _adapt(nested, value, f"{where}{field.name}.", trains=trains)
+                _adapt(nested, value, f"{where}{field.name}.")
 
 
 def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> Any:

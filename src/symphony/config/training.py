@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import Positional, Suppress, arg
 
@@ -43,8 +43,8 @@ class MGAILConfig:
     learning_rate: float = 2e-4
     """Learning rate of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
     cost: Cost = "non_saturating"
-    """Cost that the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient vanishes
-    in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
+    """Cost that the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient
+    vanishes in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
     expert_weight: float = 0.2
     """Weight of the regression to the log beside that cost (the paper: 0, which here ends in standing still)."""
     discriminator_updates: int = 2
@@ -53,7 +53,6 @@ class MGAILConfig:
     """Let the gradient also pass through the policy's reactions to what earlier actions changed."""
     truncate: int = 0
     """Steps after which the gradient is cut (0: never)."""
-    GONE: ClassVar[dict[str, Any]] = {"checkpoint": ...}
 
     def __post_init__(self) -> None:
         one_of(self, "cost", get_args(Cost))
@@ -80,7 +79,6 @@ class ValidationConfig:
     """Run segments of that store, evenly spaced (all, if there are fewer)."""
     rollouts: int = 4
     """Rollouts of each run segment."""
-    GONE: ClassVar[dict[str, Any]] = {"every": ...}
 
     def __post_init__(self) -> None:
         positive(self, "segments", "rollouts")
@@ -94,7 +92,6 @@ class PerturbConfig:
     """Share of the expert states of an update that are displaced (0: none, as in the paper)."""
     begin: int = 0
     """Updates before the first with displaced states, from which a policy learns more when it drives already."""
-    GONE: ClassVar[dict[str, Any]] = {"along": 1.5, "across": 0.5, "heading": 0.1, "speed": 1.5}
 
     def __post_init__(self) -> None:
         not_negative(self, "share", "begin")
@@ -113,7 +110,6 @@ class PreviewConfig:
     every: int = 2000
     """Updates between previews, and one at the end of a run that has so many (0: never); by default this takes about
     a hundredth of the time on a CPU, or less."""
-    GONE: ClassVar[dict[str, Any]] = {"segments": ...}
 
     def __post_init__(self) -> None:
         not_negative(self, "every")
@@ -149,12 +145,6 @@ class RunConfig:
     WANDB_RUN_GROUP, WANDB_TAGS) name project, group and tags."""
     device: str = "cpu"
     """Device that learns: `cpu`, `cuda` or `cuda:N`."""
-    GONE: ClassVar[dict[str, Any]] = {
-        "clip": 1.0,
-        "wandb_project": ...,
-        "wandb_group": ...,
-        "wandb_tags": ...,
-    }
 
     def __post_init__(self) -> None:
         positive(self, "steps", "checkpoint_every", "log_every")
@@ -186,11 +176,6 @@ class TrainConfig(RunConfig):
     """The discriminator (methods with TS, and MGAIL)."""
     mgail: MGAILConfig = field(default_factory=MGAILConfig)
     """Adversarial learning (methods mgail*)."""
-    GONE: ClassVar[dict[str, Any]] = RunConfig.GONE | {
-        "most_interactive": 0,
-        "goals": GOALS,
-        "sampling": {"interactive": 1.0, "standing": 1.0, "hard": None, "even_sources": False, "share": 0.5},
-    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
