@@ -11,7 +11,7 @@ from symphony.config.checks import not_negative, one_of, positive
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "backtrack", "best"]
-Score = Literal["discriminator", "flags", "rule"]
+ScoreName = Literal["agent", "discriminator", "flags", "rule"]
 Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 Engine = Literal["local", "ray"]
@@ -69,9 +69,10 @@ class SimulationConfig:
     """Search that the rollouts come from. `agent`: as the agent was trained; `none`; `tree`: beam search;
     `backtrack`: independent rollouts, each of which goes back and tries again where it is bad; `best`: independent
     rollouts, of which that with the best score counts."""
-    score: Score = "discriminator"
-    """Score that a search lowers. `discriminator`: what the agent's own calls unreal; `flags`: collisions and time
-    off the road; `rule`: the same, and collisions within half a second, were everyone to keep speed and course."""
+    score: ScoreName = "agent"
+    """Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
+    something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the road; `rule`: the
+    same, and collisions within half a second, were everyone to keep speed and course."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: str = "agent"
@@ -97,7 +98,7 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         one_of(self, "search", get_args(Search))
-        one_of(self, "score", get_args(Score))
+        one_of(self, "score", get_args(ScoreName))
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         positive(self, "workers", "action_temperature")
@@ -110,10 +111,12 @@ class SimulationConfig:
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
         """The search: as in training, but for what is set here."""
+        score = trained.score if self.score == "agent" else self.score
         # A threshold of logits says nothing of flags: with one of them a branch is bad.
-        threshold = {"discriminator": trained.threshold}.get(self.score, 0.0)
+        threshold = trained.threshold if score == "discriminator" else 0.0
         return dataclasses.replace(
             trained,
+            score=score,
             test_branches=self.branches or trained.test_branches,
             rule=trained.rule if self.rule == "agent" else self.rule,
             prune_every=self.prune_every or trained.prune_every,

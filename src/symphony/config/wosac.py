@@ -9,7 +9,7 @@ from symphony.config.checks import not_negative, one_of
 from symphony.config.evaluation import EvaluateConfig, SimulationConfig
 from symphony.errors import ConfigError
 
-WosacScore = Literal["discriminator", "rule"]
+WosacScore = Literal["agent", "discriminator", "rule"]
 """Scores without the true flags: what is simulated must not know beforehand what it is scored by."""
 FUTURE, DT = 80, 0.1
 """Steps that the challenge asks for, and the seconds between them."""
@@ -19,9 +19,10 @@ FUTURE, DT = 80, 0.1
 class WosacSettings(SimulationConfig):
     """How the agent is simulated; each of the 32 rollouts of a search comes from a tree of its own."""
 
-    score: WosacScore = "discriminator"
-    """Score that a search lowers: what the `discriminator` calls unreal, or collisions, also those within half a
-    second, were everyone to keep speed and course, and time off the road (`rule`)."""
+    score: WosacScore = "agent"
+    """Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what the agent's own calls
+    unreal; `rule`: collisions, also those within half a second, were everyone to keep speed and course, and time off
+    the road."""
     logged_goals: bool = False
     """Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the
     future."""

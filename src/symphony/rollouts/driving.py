@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -99,8 +99,7 @@ def simulation(
     policy = _placeholder(scenes) if agent.policy is None else agent.policy
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
-    kind = search_kind(agent, config)
+    kind, trees, branches, taken, settings = agent.plan(config)
     searches = kind not in ("none", "log")
     guards = [NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")]
     actor = acting(guards[0], env, config)
@@ -156,7 +155,7 @@ def simulation(
                 seed=config.seed,
                 rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
-                score=config.score,
+                score=settings.score,
                 leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
@@ -170,8 +169,13 @@ def simulation(
     chosen = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1)
     if kind == "best" and result is not None:
         chosen = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
+    goal = ends.get(keys.GOAL)
+    if kind == "backtrack" and result is not None:
+        # Lines are trees of one branch each; to be filled from each other they are the branches of one.
+        chosen = filled_lines(result.totals.squeeze(-1), settings.threshold)[:, None]
+        found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
     rollouts = Rollouts(*(_branches(part, chosen).flatten(1, 2) for part in found))
-    goal = _branches(ends.get(keys.GOAL), chosen).flatten(1, 2)
+    goal = _branches(goal, chosen).flatten(1, 2)
     tree = result if kind == "tree" else None
     drawn = None if tree is None else start.get(keys.GOAL)
     whole = Simulation(rollouts, goal, tree, at_states=rollouts.collision, steps=steps, drawn=drawn)
@@ -294,43 +298,12 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
     return found._replace(rollouts=kept, failed=failed)
 
 
-def search_kind(agent: Agent, config: EvaluateConfig) -> str:
-    """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
-    if agent.policy is None:
-        return "log"
-    blind = config.score == "discriminator" and agent.discriminator is None
-    if config.search == "agent":
-        return "tree" if agent.searches and not blind else "none"
-    if config.search != "none" and blind:
-        raise ConfigError(
-            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
-            "score: --score flags or rule"
-        )
-    return config.search
-
-
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
     planner once for each branch.
     """
     asked = config.search != "agent" or config.branches or config.trees > 1
     return config if asked else dataclasses.replace(config, search="none")
-
-
-def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
-    """Trees per segment, branches per tree, and rollouts taken from each tree."""
-    kind = search_kind(agent, config)
-    if kind in ("none", "log", "backtrack"):
-        return config.rollouts, 1, 1
-    branches = config.pruning(agent.search).test_branches
-    if kind == "best":
-        return config.rollouts, branches, 1
-    taken = config.rollouts // config.trees
-    if taken > branches:
-        raise ConfigError(
-            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-        )
-    return config.trees, branches, taken
 
 
 def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
@@ -340,17 +313,32 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
     rollouts than a tree has branches come from as few trees as that takes.
     """
-    kind, least = search_kind(agent, config), -(-runs // segments)
-    branches = config.pruning(agent.search).test_branches
+    plan, least = agent.plan(dataclasses.replace(config, rollouts=config.trees)), -(-runs // segments)
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
-        trees = max(config.trees, -(-each // branches)) if kind == "tree" else 1
+        trees = max(config.trees, -(-each // plan.branches)) if plan.kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
     exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
     each, trees = whole(next((each for each in exact if whole(each)[0] == each), least))
     return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
+
+
+def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor, "B K"]:
+    """Which line stands in each place after backtracking: its own, but a good one of its scene where it stayed bad.
+
+    The places of bad lines take the good ones in turn, so that none is copied much more often than another.
+
+    Args:
+        totals: of the periods of every line.
+        threshold: the highest one of a good period.
+    """
+    good = (totals <= threshold).all(-1)
+    count, place = good.sum(-1, keepdim=True), torch.arange(good.shape[-1], device=good.device)
+    good_first = (~good).to(torch.int8).argsort(dim=-1, stable=True)
+    turn = ((~good).cumsum(-1) - 1) % count.clamp_min(1)
+    return torch.where(good | (count == 0), place, good_first.gather(-1, turn.clamp_min(0)))
 
 
 def _branches(part: Tensor, order: Tensor) -> Tensor:
