@@ -71,8 +71,8 @@ class SimulationConfig:
     rollouts, of which that with the best score counts."""
     score: ScoreName = "agent"
     """Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
-    something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the road; `rule`: the
-    same, and collisions within half a second, were everyone to keep speed and course."""
+    something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the road;
+    `rule`: the same, and collisions within half a second, were everyone to keep speed and course."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: str = "agent"
