@@ -126,11 +126,12 @@ class Agent:
         """
         search = config.pruning(self.search)
         blind = search.score == "discriminator" and self.discriminator is None
-        trained = search.way if self.searches and not blind else "none"
-        kind = trained if config.search == "agent" else config.search
-        if self.policy is None:
-            kind = "log"
-        elif kind != "none" and blind:
+        kind: Literal["log", "none", "tree", "backtrack", "best"] = "log"
+        if self.policy is not None and config.search == "agent":
+            kind = search.way if self.searches and not blind else "none"
+        elif self.policy is not None:
+            kind = config.search
+        if kind not in ("log", "none") and blind:
             raise ConfigError(
                 f"search '{kind}' needs an agent with a discriminator, {self.name} has none, or another "
                 "score: --score flags or rule"

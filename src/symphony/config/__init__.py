@@ -11,15 +11,8 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
-    from symphony.config.evaluation import (
-        EvaluateConfig,
-        PaperData,
-        Score,
-        Setting,
-        TableColumns,
-        TableFormat,
-    )
+    from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, Score, SearchConfig
+    from symphony.config.evaluation import EvaluateConfig, PaperData, Setting, TableColumns, TableFormat
     from symphony.config.files import read_json, to_json
     from symphony.config.profiles import Profile
     from symphony.config.training import (
