@@ -127,10 +127,10 @@ class Agent:
         search = config.pruning(self.search)
         blind = search.score == "discriminator" and self.discriminator is None
         kind: Literal["log", "none", "tree", "backtrack", "best"] = "log"
-        if self.policy is not None and config.search == "agent":
-            kind = search.way if self.searches and not blind else "none"
-        elif self.policy is not None:
+        if self.policy is not None and config.search != "agent":
             kind = config.search
+        elif self.policy is not None:
+            kind = search.way if self.searches and not blind else "none"
         if kind not in ("log", "none") and blind:
             raise ConfigError(
                 f"search '{kind}' needs an agent with a discriminator, {self.name} has none, or another "

@@ -134,7 +134,10 @@ class Clip:
     def __post_init__(self) -> None:
         agents = np.asarray(self.agents, np.int64)
         kept, shape = agents >= 0, self.heading.shape
-        self.agents, self.position, self.heading = agents[kept], self.position[:, kept], self.heading[:, kept]
+        self.agents = agents[kept]
+        self.position, self.heading = (
+            np.asarray(part, np.float64)[:, kept] for part in (self.position, self.heading)
+        )
         self.valid, self.collision, self.offroad = (
             np.broadcast_to(flags, shape)[:, kept] for flags in (self.valid, self.collision, self.offroad)
         )
