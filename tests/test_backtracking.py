@@ -164,7 +164,7 @@ def test_what_is_searched_for_is_on_record(store: SegmentStore) -> None:
 def test_agents_without_a_discriminator_are_searched_by_what_they_do(store: SegmentStore) -> None:
     blind = replace(make_agent(), discriminator=None)
     assert blind.plan(EvaluateConfig()).kind == "none"
-    assert blind.plan(EvaluateConfig(score="rule")).kind == "tree"
+    assert blind.plan(EvaluateConfig(rollouts=1, score="rule")).kind == "tree"
     assert evaluate(blind, store, replace(LINES, rollouts=2)).search == "backtrack"
     assert evaluate("constant_velocity", store, replace(LINES, rollouts=1)).search == "backtrack"
     with pytest.raises(ConfigError, match="another score: --score flags or rule"):
@@ -194,5 +194,5 @@ def test_included_agents_go_back_by_the_rule_and_others_search_as_they_learned()
         assert EvaluateConfig().pruning(agent.search).threshold == 0
         assert agent.plan(EvaluateConfig(search="tree")).kind == "tree"
         assert agent.plan(EvaluateConfig(score="discriminator")).search.score == "discriminator"
-    assert make_agent().plan(EvaluateConfig()).kind == "tree"
-    assert make_agent().plan(EvaluateConfig()).search.score == "discriminator"
+    plan = make_agent().plan(EvaluateConfig(rollouts=4))
+    assert (plan.kind, plan.trees, plan.taken, plan.search.score) == ("tree", 1, 4, "discriminator")

@@ -22,7 +22,7 @@ from symphony.cli import main
 from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.evaluation.comparison import COLUMNS, Comparison, compare
 from symphony.evaluation.entries import ROWS, SETTINGS, Entry, family, method_name
