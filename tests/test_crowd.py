@@ -28,9 +28,7 @@ from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
-from symphony.evaluation.pictures import search_tree
 from symphony.learning.demonstrations import SceneDataset
-from symphony.render import plot_search
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.crowd import Crowd, CrowdDataset, crowd_dataset
@@ -363,10 +361,6 @@ def test_a_saved_tree_shows_who_is_there(store: SegmentStore, tmp_path: Path) ->
     for k in range(saved.rollouts):
         history = trees.slots[0, steps // trees.prune_every, k]
         np.testing.assert_array_equal(trees.there[0, history, steps], saved.counted[k])
-    drawn = search_tree(tiny(), dataset, 0, config)
-    np.testing.assert_array_equal(np.isfinite(drawn.position).all(-1)[..., drawn.real], trees.there[0])
-    plot_search(dataset.segment(0), drawn, tmp_path / "tree.png")
-    assert (tmp_path / "tree.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

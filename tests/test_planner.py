@@ -36,7 +36,7 @@ from symphony.planners.interface import (
     Traffic,
     planner_maker,
 )
-from symphony.rollouts.driving import planned_trees, simulation, spread_runs
+from symphony.rollouts.driving import simulation, spread_runs
 from symphony.saved.folder import RolloutFolder, load_rollouts
 from symphony.saved.saving import save_simulation
 
@@ -353,9 +353,9 @@ def test_runs_are_spread_over_as_many_segments_as_there_are(
     agent = loaded()
     config = EvaluateConfig(search=search, trees=trees, rule="systematic")  # type: ignore[arg-type]
     count, how = spread_runs(agent, config, runs, segments)
-    trees_of, _, taken = planned_trees(agent, how)  # refuses what can't be simulated
+    plan = agent.plan(how)  # refuses what can't be simulated
     assert 1 <= count <= segments
-    assert trees_of * taken == how.rollouts
+    assert plan.trees * plan.taken == how.rollouts
     assert runs <= count * how.rollouts
     if search == "none" or trees == 1:
         # No fewer rollouts of each would do, but for runs that come out exactly: less than twice as many.

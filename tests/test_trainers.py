@@ -23,10 +23,10 @@ from symphony.config import (
     AgentConfig,
     AgentSpec,
     TrainConfig,
-    from_dict,
     read_json,
     to_json,
 )
+from symphony.config.files import from_dict
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig

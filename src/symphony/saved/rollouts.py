@@ -10,18 +10,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from symphony import keys
-from symphony.collectors import BeamSearchResult
 from symphony.data.levels import agent_heights
 from symphony.data.segment import Polylines, RunSegment
-from symphony.envs.scene import SceneBatch
-from symphony.rollouts.unroll import Rollouts
+
+if TYPE_CHECKING:  # who only reads rollouts waits for no torch
+    from torch import Tensor
+
+    from symphony.collectors import BeamSearchResult
+    from symphony.envs.scene import SceneBatch
+    from symphony.rollouts.unroll import Rollouts
 
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
