@@ -117,11 +117,6 @@ def test_painted_lines_are_marks_and_shared_ones_count_once(path: Path) -> None:
     assert sorted(road.marks.points[:, 1].tolist()) == [2, 2, 6, 6]
 
 
-def test_lanelets_of_one_point_go_with_all_that_refers_to_them(path: Path) -> None:
-    dot = lanelet(12, [(100, 2)], [(100, -2)], '<predecessor ref="11"/>')
-    assert convert(path, ROAD, dot, driver(7)).road.successors.tolist() == [[0, 1]]
-
-
 def test_boundary_rings_have_the_drivable_side_on_their_left(path: Path) -> None:
     corners = [(-20, -20), (20, -20), (20, 20), (-20, 20), (-20, -20)]
     inner = [(0.8 * x, 0.8 * y) for x, y in corners]
@@ -182,13 +177,6 @@ def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:
     assert union.difference(rebuilt.buffer(0.05)).area < 0.05
 
 
-def test_slits_between_lanelets_are_no_boundary() -> None:
-    low = np.array([[0, 0], [50, 0], [50, 4], [0, 4], [0, 0.0]])
-    near, far = (low + np.array([0, 4 + gap * SLIT]) for gap in (1.5, 3))
-    assert len(drivable_rings([low, near])) == 1
-    assert len(drivable_rings([low, far])) == 2
-
-
 LIGHT = (
     '<trafficLight id="30"><cycle>'
     "<cycleElement><duration>3</duration><color>green</color></cycleElement>"
@@ -237,18 +225,8 @@ def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: lis
     assert convert(path, FORK, TURNS, light(direction=direction), driver(7)).signal_lane.tolist() == lanes
 
 
-def test_a_light_at_the_end_of_the_map_holds_for_its_own_lanelet(path: Path) -> None:
-    segment = convert(path, APPROACH, light(), driver(7))
-    assert segment.signal_lane.tolist() == [0]
-
-
 def test_stop_lines_that_are_drawn_count(path: Path) -> None:
     line = "<stopLine><point><x>47</x><y>2</y></point><point><x>47</x><y>-2</y></point></stopLine>"
     marked = APPROACH.replace("<trafficLightRef", line + "<trafficLightRef", 1)
     segment = convert(path, marked, light(), driver(7))
     np.testing.assert_allclose(segment.signal_point + segment.origin, [[47, 0, 0]], atol=1e-5)
-
-
-def test_switched_off_and_dangling_lights(path: Path) -> None:
-    assert not convert(path, FORK, light(active="false"), driver(7)).signal_state.any()
-    assert len(convert(path, FORK, driver(7)).signal_lane) == 0

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from helpers_convert import FakeReader, scene
-from helpers_segments import hide
 from symphony.data.convert import Report, convert, expand, info
 from symphony.data.resample import resample, smooth
-from symphony.data.segment import RunSegment, content_hash
-from symphony.data.selection import usable
-from symphony.data.sources.base import Item
+from symphony.data.segment import content_hash
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 
@@ -59,13 +55,6 @@ def test_segments_are_smoothed_resampled_and_kept_in_order(logs: Write, out: Pat
     store.verify()
 
 
-def test_the_default_is_5_hz_without_smoothing(logs: Write, out: Path) -> None:
-    convert(FakeReader(), [logs("a.scene", "crossing 2")], out)
-    segment = SegmentStore(out)[0]
-    assert (segment.dt, segment.num_steps) == (0.2, 46)
-    np.testing.assert_allclose(segment.position, scene("crossing", 2).position[:, ::2], atol=1e-5)
-
-
 def test_bad_records_and_files_are_told_and_passed_over(logs: Write, out: Path) -> None:
     files = [
         logs("a.scene", "straight 1", "broken 5", "broken 6", "lonely 7", "straight 1", "straight 2"),
@@ -86,16 +75,6 @@ def test_bad_records_and_files_are_told_and_passed_over(logs: Write, out: Path) 
     assert report.reasons["tracks: # is not #"] == 2
     assert sum(report.reasons.values()) == len(report.skipped) == 5
     assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
-
-
-def test_exclusions_depend_on_the_number_of_interactive_agents(logs: Write, out: Path) -> None:
-    path = logs("a.scene", "lonely 7", "straight 1", "crossing 1")
-    for count, ids in ((1, 3), (2, 2), (4, 1)):
-        convert(FakeReader(), [path], out.with_name(f"for{count}"), interactive=count)
-        found = list(SegmentStore(out.with_name(f"for{count}")))
-        assert len(found) == ids
-        for segment in found:
-            usable(segment, count)
 
 
 @pytest.mark.parametrize("parents", [0, 1])
@@ -264,14 +243,3 @@ def test_info_of_something_else_is_refused(logs: Write, out: Path) -> None:
     (out / "report.json").write_text('{"skipped": [{"why": 1}]}')
     with pytest.raises(DataError, match="not a conversion report"):
         info(out)
-
-
-def test_late_agents_do_not_count_at_the_first_step(logs: Write, out: Path) -> None:
-    class LateReader(FakeReader):
-        def _read(self, path: Path) -> Iterator[Item]:
-            for segment in super()._read(path):
-                assert isinstance(segment, RunSegment)
-                yield hide(hide(segment, 1, slice(0, 9)), 2, slice(0, 1))
-
-    with pytest.raises(DataError, match="has 1"):
-        convert(LateReader(), [logs("a.scene", "straight 1")], out)

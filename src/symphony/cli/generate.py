@@ -41,7 +41,7 @@ class Generate:
     split: Literal["train", "validation", "test"] = "train"
     """What the segments are for: the three never share a network, whatever their seeds."""
     kinds: str = "town"
-    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), random (no grid)."""
+    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways)."""
     duration: Literal[10, 20, 30] = 10
     """Seconds of a segment."""
     interactive: int = 2

@@ -13,8 +13,7 @@ import numpy as np
 from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.demand import write_demand
 from symphony.data.sources.sumo.extract import DT, STATES, CropRule, crop_rule, cut_segments
-from symphony.data.sources.sumo.freeways import RAMP_RADIUS, ramp
-from symphony.data.sources.sumo.networks import NETWORKS
+from symphony.data.sources.sumo.networks import NETWORKS, RAMP_RADIUS, freeway
 from symphony.data.sources.sumo.process import scratch, sumo_home, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.simulate import simulate_traffic
@@ -27,14 +26,13 @@ __all__ = [
     "CropRule",
     "Generated",
     "crop_rule",
-    "generate",
     "generate_run",
     "sumo_home",
     "sumo_version",
 ]
 
 KINDS = tuple(NETWORKS)
-"""Kinds of network that :func:`generate` knows."""
+"""Kinds of network that :func:`generate_run` knows."""
 WARM_UP = 30.0
 """Simulated seconds before the first segment starts, at least."""
 SUBLANE_SHARE = 1 / 3
@@ -55,31 +53,6 @@ class Generated:
     reasons: Counter[str] = field(default_factory=Counter)
 
 
-def generate(
-    kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None
-) -> list[RunSegment]:
-    """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
-
-    The light of a movement is attached to the connector lane inside the junction, which only that movement
-    takes; its stop point is the end of the lane before. Equal arguments give equal segments.
-
-    Args:
-        kind: one of :data:`KINDS`.
-        seed: of every random choice; another seed is another network.
-        duration: recorded seconds, after a warm-up.
-        rule: how maps and egos are chosen, and how long segments are (:func:`crop_rule`); the kind's own for
-            10 s where not given.
-
-    Returns:
-        Validated segments; those of one focus share one map object.
-
-    Raises:
-        ConfigError: unknown kind, a bad duration or seed.
-        DataError: SUMO is not installed or failed (with its message).
-    """
-    return generate_run(kind, seed, duration, rule=rule).segments
-
-
 def generate_run(
     kind: str,
     seed: int,
@@ -88,9 +61,23 @@ def generate_run(
     rule: CropRule | None = None,
     straight: float = 1.0,
 ) -> Generated:
-    """As :func:`generate`, with the reasons for which windows were left out.
+    """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
 
-    Routes go straight on at a junction ``straight`` times as likely as they take one of the turns.
+    The light of a movement is attached to the connector lane inside the junction, which only that movement
+    takes; its stop point is the end of the lane before. Equal arguments give equal segments. Segments of one focus
+    share one map object.
+
+    Args:
+        kind: one of :data:`KINDS`.
+        seed: of every random choice; another seed is another network.
+        duration: recorded seconds, after a warm-up.
+        rule: how maps and egos are chosen, and how long segments are (:func:`crop_rule`); the kind's own for
+            10 s where not given.
+        straight: how many times likelier a route goes straight on at a junction than it takes one of the turns.
+
+    Raises:
+        ConfigError: unknown kind, a bad duration or seed.
+        DataError: SUMO is not installed or failed (with its message).
     """
     if kind not in NETWORKS:
         raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
@@ -105,7 +92,7 @@ def generate_run(
     with scratch() as folder:
         # A freeway must be longer than the map: what its ends do to traffic is not for a segment to show.
         longer = max(0.0, rule.radius - RAMP_RADIUS) if kind == "ramp" else 0.0
-        file = ramp(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
+        file = freeway(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
         network = read_network(file)
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
         warm_up = WARM_UP + longer / _SLOW
