@@ -13,7 +13,6 @@ from helpers_sources import (
     lanelet,
     obstacle,
     off_road,
-    read_error,
     read_one,
     state,
 )
@@ -206,33 +205,3 @@ def test_the_boundary_is_open_where_the_network_is_cut(path: Path) -> None:
 
 
 # Real files.
-
-
-@pytest.mark.samples
-def test_every_sample_reads(samples: Path) -> None:
-    files = sorted((samples / "commonroad").rglob("*.xml"))
-    assert len(files) == 26
-    for file in files:
-        if "Starnberg" in file.name:
-            error = read_error("commonroad", file)
-            assert (error.message, error.segment) == ("has no dynamic obstacles", "DEU_Starnberg-1_1_T-1")
-            continue
-        segment = read_one("commonroad", file)
-        assert segment.segment_id == file.stem
-        assert segment.valid[segment.ego].all()
-        assert_drives_on_its_lanes(segment)
-
-
-def assert_drives_on_its_lanes(segment: RunSegment) -> None:
-    """Moving vehicles are on the drivable side of the boundary and head along a lane near them."""
-    moving = segment.valid & (np.hypot(*np.moveaxis(segment.velocity, -1, 0)) > 3)
-    spots = segment.position[moving][:, :2].astype(float)
-    assert (off_road(segment.road, spots) < 0.3).mean() > 0.97, segment.segment_id
-    lanes = [segment.road.lanes[k][:, :2] for k in range(len(segment.road.lanes))]
-    starts = np.concatenate([(line[:-1] + line[1:]) / 2 for line in lanes])
-    steps = np.concatenate([np.diff(line, axis=0) for line in lanes])
-    some = np.arange(0, len(spots), 37)
-    offset = np.hypot(*np.moveaxis(spots[some, None] - starts, -1, 0))
-    angle = np.arctan2(steps[:, 1], steps[:, 0]) - segment.heading[moving][some, None]
-    aligned = ((offset < 20) & (np.cos(angle) > 0.9)).any(axis=1)
-    assert aligned.mean() > 0.9, segment.segment_id

@@ -93,29 +93,6 @@ def test_nothing_usable_is_an_error_and_leaves_nothing(logs: Write, out: Path, p
     assert out.parent.exists() == (not parents)
 
 
-@pytest.mark.parametrize("before", [False, True])
-def test_an_interrupted_conversion_goes_on_where_it_stopped(logs: Write, out: Path, before: bool) -> None:
-    if before:
-        out.mkdir(parents=True)
-    files = [
-        logs("a.scene", "straight 1", "broken 7"),
-        logs("b.scene", "straight 2", "interrupt", "straight 3"),
-    ]
-    with pytest.raises(KeyboardInterrupt):
-        convert(FakeReader(), files, out)
-    assert left(out) == ["store"] * before + ["store.partial"]
-    assert not out.exists() or not list(out.iterdir())
-    with pytest.raises(DataError, match="unfinished conversion"):
-        SegmentStore(out)
-    reader = FakeReader()
-    reader._stops = False
-    report = convert(reader, files, out)
-    assert left(out) == ["store"]
-    assert SegmentStore(out).ids == ["straight-1", "straight-2", "straight-3"]
-    assert (report.converted, report.present, report.files) == (3, 0, 2)
-    assert [skip.message for skip in report.skipped] == ["13 is not 7"]
-
-
 def test_appending_skips_what_is_there(logs: Write, out: Path) -> None:
     one, two = logs("a.scene", "straight 1", "broken 5"), logs("b.scene", "crossing 2", "straight 1")
     convert(FakeReader(), [one], out, append=True)

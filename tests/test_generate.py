@@ -241,11 +241,11 @@ def test_routes_go_straight_on_as_often_as_asked(tmp_path: Path) -> None:
     shares = []
     for straight in (0.05, 1.0, 20.0):
         rng = np.random.default_rng(0)
-        made = demand.write_demand(
+        routes, _ = demand.write_demand(
             network, rng, tmp_path, 120.0, through=False, sublane=False, straight=straight
         )
         turns: list[float] = []
-        for route in ET.parse(made.file).getroot().iter("route"):  # noqa: S314
+        for route in ET.parse(routes).getroot().iter("route"):  # noqa: S314
             edges = np.array([number[name] for name in route.attrib["edges"].split()])
             turns += np.abs(np.angle(np.exp(1j * (first[edges[1:]] - last[edges[:-1]])))).tolist()
         shares.append(np.mean(np.array(turns) < 0.6))

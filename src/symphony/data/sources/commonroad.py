@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,6 +48,8 @@ _TYPES = {
     "pedestrian": AgentType.PEDESTRIAN,
     "bicycle": AgentType.CYCLIST,
 }
+Box = tuple[tuple[float, float], Doubles, float]
+"""(length, width) of the box around an obstacle's shape, its centre in the obstacle's frame [2], its turn."""
 _SCENERY = frozenset({"roadBoundary", "building", "pillar", "median_strip"})
 
 
@@ -124,16 +125,6 @@ class CommonRoadReader(Reader):
             yield first.replace(ego=ego, segment_id=f"{name}_ego{first.agent_id[ego]}")
 
 
-@dataclass(frozen=True)
-class _Obstacle:
-    """An obstacle: its id, type, states [N, 6] (see :func:`_state`) and box (see :func:`_shape`)."""
-
-    name: int
-    kind: int
-    log: Doubles
-    shape: tuple[tuple[float, float], Doubles, float]
-
-
 def _read_tracks(root: ET.Element, dt: float, odd: dict[str, str]) -> tuple[dict[str, Any], Bools, int]:
     """All obstacles of either version of the format, over the steps any dynamic one is present at.
 
@@ -148,7 +139,7 @@ def _read_tracks(root: ET.Element, dt: float, odd: dict[str, str]) -> tuple[dict
     found = [
         (each, moves) for node, moves in nodes for each in readable(NO_OBSTACLE, odd, _obstacle, node, moves)
     ]
-    logs = [obstacle.log for obstacle, moves in found if moves]
+    logs = [log for (_, _, log, _), moves in found if moves]
     if not logs:
         raise DataError(odd.get(NO_OBSTACLE, "has no dynamic obstacles"), field="dynamicObstacle")
     first = min(int(log[:, 0].min()) for log in logs)
@@ -158,11 +149,11 @@ def _read_tracks(root: ET.Element, dt: float, odd: dict[str, str]) -> tuple[dict
     table = np.full((agents, steps, 6), np.nan)
     valid = np.zeros((agents, steps), np.bool_)
     size = np.zeros((agents, 3))
-    for row, (obstacle, moves) in enumerate(found):
-        where = obstacle.log[:, 0].astype(np.int64) - first if moves else np.arange(steps)
-        table[row, where] = obstacle.log
+    for row, ((_, _, log, shape), moves) in enumerate(found):
+        where = log[:, 0].astype(np.int64) - first if moves else np.arange(steps)
+        table[row, where] = log
         valid[row, where] = True
-        size[row, :2], offset, turn = obstacle.shape
+        size[row, :2], offset, turn = shape
         table[row, :, 1:3] += _rotated(np.broadcast_to(offset, (steps, 2)), table[row, :, 3])
         velocity = _rotated(table[row, :, 4:6], table[row, :, 3])
         unknown = valid[row] & np.isnan(velocity[:, 0])
@@ -171,8 +162,8 @@ def _read_tracks(root: ET.Element, dt: float, odd: dict[str, str]) -> tuple[dict
         table[row, :, 3] += turn
     table[~valid] = 0
     fields = {
-        "agent_id": np.array([obstacle.name for obstacle, _ in found], np.int64),
-        "agent_type": np.array([obstacle.kind for obstacle, _ in found], np.uint8),
+        "agent_id": np.array([name for (name, *_), _ in found], np.int64),
+        "agent_type": np.array([kind for (_, kind, *_), _ in found], np.uint8),
         "size": to_float32(size),
         "position": table[..., 1:3],
         "heading": to_float32(table[..., 3]),
@@ -186,7 +177,8 @@ def _text(node: ET.Element, tag: str) -> str:
     return (node.findtext(tag) or "").strip()
 
 
-def _obstacle(node: ET.Element, moves: bool) -> _Obstacle:
+def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
+    """An obstacle: its id, type, states [N, 6] (see :func:`_state`) and box."""
     name = f"obstacle {node.get('id')}"
     if node.tag == "obstacle" and _text(node, "role") not in {"dynamic", "static"}:
         raise DataError(f"unknown role {_text(node, 'role')!r}", field=f"{name}: role")
@@ -204,7 +196,7 @@ def _obstacle(node: ET.Element, moves: bool) -> _Obstacle:
     else:  # at rest whatever its file says
         log = np.array([[0, *_state(initial, name, static=True)[1:4], 0, 0]], np.float64)
     kind = _TYPES.get(_text(node, "type"), AgentType.OTHER)
-    return _Obstacle(integer(node.get("id"), "obstacle id"), kind, log, _shape(node, f"{name}: shape"))
+    return integer(node.get("id"), "obstacle id"), kind, log, _shape(node, f"{name}: shape")
 
 
 def _state(node: ET.Element, name: str, static: bool = False) -> tuple[float, ...]:
@@ -261,8 +253,7 @@ def _rotated(vectors: Doubles, angle: Doubles | float) -> Doubles:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _shape(node: ET.Element, field: str) -> tuple[tuple[float, float], Doubles, float]:
-    """((length, width), box centre in the obstacle's frame [2], turn of the box) of the bounding box."""
+def _shape(node: ET.Element, field: str) -> Box:
     shape = node.find("shape")
     parts = [part for part in shape if part.tag in _CORNERS] if shape is not None else []
     if not parts:
@@ -275,7 +266,7 @@ def _shape(node: ET.Element, field: str) -> tuple[tuple[float, float], Doubles, 
     return (length, width), (low + high) / 2, 0.0
 
 
-def _rectangle(node: ET.Element, field: str) -> tuple[tuple[float, float], Doubles, float]:
+def _rectangle(node: ET.Element, field: str) -> Box:
     size = number(node.findtext("length"), field), number(node.findtext("width"), field)
     turn = node.findtext("orientation")
     return size, _middle(node, field), 0.0 if turn is None else number(turn, field)

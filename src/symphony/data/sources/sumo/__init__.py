@@ -97,9 +97,9 @@ def generate_run(
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
         warm_up = WARM_UP + longer / _SLOW
         end = warm_up + duration
-        demand = write_demand(
+        routes, size = write_demand(
             network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane, straight=straight
         )
-        traffic = simulate_traffic(file, network, demand, drive_rng, end, warm_up, sublane=sublane)
+        traffic = simulate_traffic(file, network, routes, size, drive_rng, end, warm_up, sublane=sublane)
     segments, reasons = cut_segments(f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule)
     return Generated(segments, reasons)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +25,6 @@ _STRAIGHT = 0.6
 """Radians between two streets up to which one goes on as the other."""
 DEPART_WITHIN = 15.0
 """Seconds in which the vehicles of a closed network enter it."""
-
-
-@dataclass(frozen=True)
-class Demand:
-    """What was asked of SUMO: vehicle k (its id in SUMO) has the box ``size[k]`` (length, width, height)."""
-
-    file: Path
-    size: NDArray[np.float32]
 
 
 def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], NDArray[np.float32], Doubles]:
@@ -99,12 +90,12 @@ def write_demand(
     through: bool,
     sublane: bool,
     straight: float = 1.0,
-) -> Demand:
+) -> tuple[Path, NDArray[np.float32]]:
     """Write vehicle types and vehicles, with routes that last for so many seconds, into ``traffic.rou.xml``.
 
     If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; else a
     fixed number of vehicles starts everywhere and circulates. A route goes straight on at a junction so many times
-    likelier than it takes one of the turns.
+    likelier than it takes one of the turns. Gives the file, and of vehicle k (its id in SUMO) the box ``size[k]``.
     """
     types, sizes, shares = _types(rng, sublane)
     following, length, lanes = network.edge_graph()
@@ -140,4 +131,4 @@ def write_demand(
         )
     file = folder / "traffic.rou.xml"
     file.write_text("\n".join([*lines, "</routes>"]))
-    return Demand(file, sizes[kinds])
+    return file, sizes[kinds]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import SignalState
-from symphony.data.sources.sumo.demand import Demand
 from symphony.data.sources.sumo.process import run_program
 from symphony.data.sources.sumo.roads import Network
 from symphony.errors import DataError
@@ -64,7 +63,8 @@ class Traffic:
 def simulate_traffic(
     network_file: Path,
     network: Network,
-    demand: Demand,
+    routes: Path,
+    size: NDArray[np.float32],
     rng: np.random.Generator,
     duration: float,
     warm_up: float,
@@ -75,14 +75,14 @@ def simulate_traffic(
 
     Vehicles keep a lateral offset of their own from the centre of the lane that drifts with the distance driven.
     """
-    folder = demand.file.parent
+    folder = routes.parent
     events = [
         f'<timedEvent type="SaveTLSSwitchStates" source="{light}" dest="lights{k}.xml"/>'
         for k, light in enumerate(network.connectors)
     ]
     (folder / "lights.add.xml").write_text("\n".join(["<additional>", *events, "</additional>"]))
     arguments = (
-        f"--net-file {network_file.name} --route-files {demand.file.name} --additional-files lights.add.xml "
+        f"--net-file {network_file.name} --route-files {routes.name} --additional-files lights.add.xml "
         f"--end {duration:.1f} --step-length {STEP} --step-method.ballistic true --seed {rng.integers(2**30)} "
         "--extrapolate-departpos true --time-to-teleport -1 --precision 4 --collision.action warn "
         "--collision.check-junctions true --collision.mingap-factor 0 --no-step-log true --no-warnings true "
@@ -92,15 +92,15 @@ def simulate_traffic(
     arguments += "--lateral-resolution 0.5" if sublane else "--lanechange.duration 3"
     run_program("sumo", arguments, folder)
     time = warm_up + STEP * np.arange(round((duration - warm_up) / STEP), dtype=np.float64)
-    front, angle = _read_tracks(folder / "tracks.csv", time, len(demand.size))
-    position, heading = _smooth(front, angle, demand.size[:, 0], _wander(rng, len(demand.size)))
+    front, angle = _read_tracks(folder / "tracks.csv", time, len(size))
+    position, heading = _smooth(front, angle, size[:, 0], _wander(rng, len(size)))
     velocity = np.gradient(position, STEP, axis=1)
     # At both ends of a track the difference is with an absent neighbour.
     present = np.isfinite(velocity[..., 0]) & np.isfinite(velocity[..., 1])
     lights = {
         light: _read_lights(folder / f"lights{k}.xml", time) for k, light in enumerate(network.connectors)
     }
-    return Traffic(time, demand.size, position, heading, velocity, present, lights)
+    return Traffic(time, size, position, heading, velocity, present, lights)
 
 
 def _read_tracks(file: Path, time: Doubles, count: int) -> tuple[Doubles, Doubles]:
