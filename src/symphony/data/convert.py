@@ -262,7 +262,7 @@ class _Draft:
             try:
                 self.done = self._collected(tasks, workers, engine, progress)
             except (ConfigError, DataError):
-                if not any(self.parts.iterdir()):
+                if all(part.suffix for part in self.parts.iterdir()):  # none is complete
                     self._remove(discard=True)
                 raise
             if not (self.done.converted or self.done.present):

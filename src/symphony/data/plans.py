@@ -52,7 +52,7 @@ class Plan:
             (self.segments < 1, f"segments must be at least 1, is {self.segments}"),
             (not 0 <= self.seed <= MAX_SEED, f"seed must be between 0 and {MAX_SEED}, is {self.seed}"),
             (self.split not in SPLITS, f"unknown split {self.split!r} (known: {', '.join(SPLITS)})"),
-            (unknown, f"kinds: unknown kind of network {unknown[:1]} (known: {', '.join(KINDS)})"),
+            (unknown, f"kinds: unknown kind of network {', '.join(unknown)!r} (known: {', '.join(KINDS)})"),
             (not self.kinds, f"no kinds (known: {', '.join(KINDS)})"),
             (self.duration not in DURATIONS, f"duration must be one of {DURATIONS}, is {self.duration}"),
             (self.interactive < 2, f"interactive must be at least 2, is {self.interactive}"),
