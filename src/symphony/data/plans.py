@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, Literal, get_args
 
-from symphony.data.sources.sumo import KINDS, sumo_version
+from symphony.data.sources.sumo import KINDS, is_own, kind_name, sumo_version
 from symphony.errors import ConfigError
 
 Split = Literal["train", "validation", "test"]
@@ -31,7 +33,8 @@ class Plan:
         segments: how many.
         seed: another seed is another set of networks.
         split: training, validation and test sets never share a network, whatever their seeds.
-        kinds: of networks, which take turns; one named twice comes twice as often.
+        kinds: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
+            kind, too; its roads are the same for every split and seed, the traffic is another.
         duration: seconds of a segment, one of :data:`DURATIONS`.
         interactive: moving vehicles a segment must have at its first step (N_I).
 
@@ -47,15 +50,18 @@ class Plan:
     interactive: int = 2
 
     def __post_init__(self) -> None:
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        unknown = [kind for kind in self.kinds if kind not in KINDS and not is_own(kind)]
+        missing = [kind for kind in self.kinds if is_own(kind) and not Path(kind).is_file()]
+        known = f"(known: {', '.join(KINDS)}, and files of roads: .xodr, .osm, .net.xml)"
         for wrong, message in (
             (self.segments < 1, f"segments must be at least 1, is {self.segments}"),
             (not 0 <= self.seed <= MAX_SEED, f"seed must be between 0 and {MAX_SEED}, is {self.seed}"),
             (self.split not in SPLITS, f"unknown split {self.split!r} (known: {', '.join(SPLITS)})"),
-            (unknown, f"kinds: unknown kind of network {', '.join(unknown)!r} (known: {', '.join(KINDS)})"),
-            (not self.kinds, f"no kinds (known: {', '.join(KINDS)})"),
+            (unknown, f"kinds: unknown kind of network {', '.join(unknown)!r} {known}"),
+            (not self.kinds, f"no kinds {known}"),
             (self.duration not in DURATIONS, f"duration must be one of {DURATIONS}, is {self.duration}"),
             (self.interactive < 2, f"interactive must be at least 2, is {self.interactive}"),
+            (missing, f"kinds: there is no file {', '.join(missing)}"),
         ):
             if wrong:
                 raise ConfigError(message)
@@ -74,8 +80,9 @@ class Plan:
 
     def settings(self) -> dict[str, Any]:
         """As kept with the store: the arguments, and the versions that decide what they give."""
-        versions = {"reader": "generate", "generator": VERSION, "sumo": sumo_version()}
-        return {**asdict(self), "kinds": list(self.kinds), **versions}
+        own = {kind: sha256(Path(kind).read_bytes()).hexdigest() for kind in self.kinds if is_own(kind)}
+        found = {**asdict(self), "kinds": list(self.kinds), **({"roads": own} if own else {})}
+        return found | {"reader": "generate", "generator": VERSION, "sumo": sumo_version()}
 
 
 @dataclass(frozen=True)
@@ -126,4 +133,4 @@ class Task:
     @property
     def name(self) -> str:
         """As in the segments' tags."""
-        return f"{self.kind}-{self.seed}"
+        return f"{kind_name(self.kind)}-{self.seed}"

@@ -5,6 +5,8 @@ All networks are for driving on the right. Every random choice comes from the ge
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.sources.sumo.process import run_program
+from symphony.errors import DataError
 
 Point = NDArray[np.float64]
 """Points [..., 2] in metres."""
@@ -375,6 +378,40 @@ def _carriageway(
     first, last = ramp(f"c{side}on", names[on], shape=start), ramp(names[off], f"c{side}off", shape=end)
     net.connect(first, ids[on], [(0, 0)])
     net.connect(ids[off - 1], last, [(0, 0)])
+
+
+OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
+"""Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
+
+
+def is_own(kind: str) -> bool:
+    """Whether a kind of network is a file of the user's."""
+    return kind.endswith(tuple(OWN_ROADS))
+
+
+def kind_name(kind: str) -> str:
+    """A kind as part of a segment's name: of a file its own name, without folder and ending."""
+    if not is_own(kind):
+        return kind
+    ending = next(ending for ending in OWN_ROADS if kind.endswith(ending))
+    return re.sub(r"[^A-Za-z0-9_]+", "_", Path(kind).name.removesuffix(ending))
+
+
+def own_network(file: Path, folder: Path) -> Path:
+    """Roads of the user's as a SUMO network, with the lanes for cars; a :class:`DataError` names the file."""
+    if not file.is_file():
+        raise DataError("no such file", file=file)
+    ending, option = next(entry for entry in OWN_ROADS.items() if file.name.endswith(entry[0]))
+    shutil.copyfile(file, folder / f"own{ending}")
+    arguments = f"{option} own{ending} --output-file net.net.xml {COMMON}"
+    arguments += " --keep-edges.by-vclass passenger --remove-edges.isolated true"
+    if ending == ".osm":
+        arguments += " --geometry.remove true --junctions.join true --tls.guess-signals true"
+    try:
+        run_program("netconvert", arguments, folder)
+    except DataError as error:
+        raise error.at(file=file) from error
+    return folder / "net.net.xml"
 
 
 NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
