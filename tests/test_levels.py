@@ -18,6 +18,7 @@ from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, stra
 from helpers_store import fill
 from symphony import keys
 from symphony.config import EvaluateConfig
+from symphony.data import levels
 from symphony.data.levels import Levels, agent_heights
 from symphony.data.segment import RunSegment, validate
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
@@ -116,6 +117,10 @@ def test_an_overpass_is_another_world(slope: float, turn: float) -> None:
         np.testing.assert_allclose(np.abs(across), LANE_WIDTH / 2, atol=1e-3)
     road = found.get(("agents", "observation", "road"))[0]
     np.testing.assert_allclose(road[:, 0], -LANE_WIDTH / 2, atol=1e-3)
+
+
+def test_data_and_geometry_agree_on_what_a_level_is() -> None:
+    assert levels.LEVEL == LEVEL
 
 
 def test_at_one_height_all_of_it_counts() -> None:
