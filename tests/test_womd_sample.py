@@ -11,8 +11,6 @@ import pytest
 
 from helpers_sources import read_one
 from symphony.data.segment import MarkType, RunSegment
-from symphony.data.sources import womd_pb2
-from symphony.data.sources.tfrecord import read_records
 
 MPS = 0.44704
 
@@ -28,13 +26,6 @@ def summary(samples: Path) -> dict[str, Any]:
     if not path.is_file():
         pytest.skip(f"no summary at {path}")
     return json.loads(path.read_text())
-
-
-@pytest.fixture(scope="module")
-def record(sample: Path) -> womd_pb2.Scenario:
-    (payload,) = read_records(sample)
-    assert isinstance(payload, bytes)
-    return womd_pb2.Scenario.FromString(payload)
 
 
 @pytest.fixture(scope="module")
