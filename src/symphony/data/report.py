@@ -50,9 +50,14 @@ class Skip:
         found = asdict(self)
         return found if self.exclusion else {k: v for k, v in found.items() if k != "exclusion"}
 
-    def __str__(self) -> str:
+    @property
+    def error(self) -> DataError:
+        """The error it was."""
         places = {"file": self.file or None, "segment": self.segment or None, "field": self.field or None}
-        return str(DataError(self.message, **places))
+        return DataError(self.message, **places)
+
+    def __str__(self) -> str:
+        return str(self.error)
 
 
 @dataclass

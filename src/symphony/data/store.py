@@ -278,7 +278,8 @@ class SegmentStore(Sequence[RunSegment]):
         segments, maps = self._segments, self._maps
         steps, dt = segments["steps"], segments["dt"]
         lanes = maps["count"][:, MAPS.axes["lanes"]]
-        points = sum(maps["count"][:, MAPS.axes[f"{name}.points"]] for name in ("lanes", "boundary", "marks"))
+        axes = [MAPS.axes[f"{name}.points"] for name in ("lanes", "boundary", "marks")]
+        points = maps["count"][:, axes].sum(axis=1)
         return {
             "segments": len(self),
             "agents": int(segments["count"][:, SEGMENTS.axes["agents"]].sum()),

@@ -382,11 +382,11 @@ def _lane(node: dict[str, Any], field: str) -> tuple[Lane, list[Doubles], int]:
         even = matched(left, right, field)
         width = median_width(*even)
         center = center if len(center) else np.mean(even, axis=0)
-    flow = {
+    flow: dict[str, Any] = {
         name: [_integer(ref, f"{field}: {name}") for ref in _list(node, name, field)]
         for name in ("successors", "predecessors")
     }
-    beside = {}
+    beside: dict[str, Any] = {}
     for side in ("left", "right"):
         ref = _get(node, f"{side}_neighbor_id", field)
         beside[side] = [] if ref is None else [_integer(ref, f"{field}: {side}_neighbor_id")]

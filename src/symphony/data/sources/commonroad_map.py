@@ -212,7 +212,7 @@ def _signals(
 
 def _turns(root: ET.Element) -> dict[int, str]:
     """Lanelet id -> left, straight or right, as the intersections tell."""
-    turns = {}
+    turns: dict[int, str] = {}
     for incoming in root.findall("intersection/incoming"):
         for turn in ("Left", "Straight", "Right"):
             turns |= dict.fromkeys(references(incoming, f"successors{turn}", "intersection"), turn.lower())

@@ -193,6 +193,7 @@ class InteractionReader(Reader):
         if not len(candidates):
             raise DataError("no moving vehicle is observed at every step", field="track_id")
         times = np.rint(scene.start + 1000 * scene.dt * (begin + there)).astype(np.int64)
+        shown = {k: (place, states_at(since, s, times)) for k, (place, since, s) in scene.lights.items()}
         segment = RunSegment(
             segment_id=name,
             source=self.name,
@@ -206,11 +207,7 @@ class InteractionReader(Reader):
             velocity=to_float32(state[:, there, 2:4]),
             valid=valid[:, there],
             road=scene.road,
-            **lights(
-                {k: (p, states_at(*s, times)) for k, (p, *s) in scene.lights.items()},
-                len(there),
-                scene.origin,
-            ),
+            **lights(shown, len(there), scene.origin),
             origin=np.array([*scene.origin, 0.0]),
             current_step=min(int(np.searchsorted(there, current)), len(there) - 1),
             predict=np.unique(row[rows.marks[:, 0]]).astype(np.int32),

@@ -61,8 +61,10 @@ class WomdReader(Reader):
 
     def _read(self, path: Path) -> Iterator[Item]:
         for index, payload in enumerate(read_records(path)):
-            bad = isinstance(payload, DataError)
-            yield payload if bad else self._convert(payload, path, f"record {index}")
+            if isinstance(payload, DataError):
+                yield payload
+            else:
+                yield self._convert(payload, path, f"record {index}")
 
     def _convert(self, payload: bytes, path: Path, record: str) -> Item:
         name = None
