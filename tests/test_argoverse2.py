@@ -24,8 +24,6 @@ from helpers_argoverse2 import (
     write,
 )
 from helpers_sources import off_road, read_error, read_one
-from symphony.cli import main
-from symphony.data.convert import convert
 from symphony.data.odd import WILD
 from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment
 from symphony.data.sources import get_reader
@@ -38,7 +36,6 @@ from symphony.data.sources.argoverse2 import (
     NOMINAL_SIZES,
     map_path,
 )
-from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
 
 IN_FOLDER = settings(
@@ -148,17 +145,6 @@ def test_marks(tmp_path: Path) -> None:
         map_["lane_segments"]["20"]["right_lane_boundary"] = shared
         found = read_one("argoverse2", write(tmp_path, map_=map_)).road
         assert found.mark_type.tolist() == [MarkType.ROAD_LINE] * 2 + [MarkType.CROSSWALK]
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_a_crossing_is_a_simple_ring(turned: bool, tmp_path: Path) -> None:
-    map_ = city()
-    if turned:
-        map_["pedestrian_crossings"]["5"]["edge2"].reverse()
-    ring = read_one("argoverse2", write(tmp_path, map_=map_)).road.marks[3][:, :2]
-    np.testing.assert_array_equal(ring[0], ring[-1])
-    assert shapely.Polygon(ring).is_valid
-    assert shapely.Polygon(ring).area == pytest.approx(4 * 13.5, rel=1e-4)
 
 
 def test_the_boundary_is_open_where_the_map_is_cut(tmp_path: Path) -> None:
@@ -359,25 +345,7 @@ def test_an_unknown_type_of_agent(tmp_path: Path) -> None:
     assert set(found.agent_type.tolist()) == {AgentType.OTHER}
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, "\xff", "NaN"])
-def test_maps_that_are_none(text: str, tmp_path: Path) -> None:
-    path = write(tmp_path)
-    map_path(path).write_bytes(text.encode("latin-1"))
-    error = read_error("argoverse2", path)
-    assert (error.file, error.segment) == (map_path(path), NAME)
-
-
 # The command, and the real sample
-
-
-def test_convert_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write(tmp_path)
-    assert main(["data", "convert", "argoverse2", str(path), "--out", str(tmp_path / "store")]) == 0
-    (segment,) = SegmentStore(tmp_path / "store")
-    assert (segment.segment_id, segment.dt, segment.num_steps) == (NAME, 0.2, 10)
-    # A folder is searched for scenarios, and a map alone is none.
-    found = convert("argoverse2", [tmp_path], tmp_path / "again")
-    assert (found.converted, found.files) == (1, 1)
 
 
 @pytest.fixture(scope="module")

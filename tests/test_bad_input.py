@@ -130,15 +130,6 @@ def test_womd_no_flipped_bit_goes_unnoticed(data: st.DataObject, shard: bytes, t
     assert found[broken + 1 :] == ([] if bit // 8 < start + 12 else whole[broken + 1 :])
 
 
-@IN_FOLDER
-@given(payload=st.binary(max_size=200))
-def test_womd_records_of_something_else(payload: bytes, tmp_path: Path) -> None:
-    write_records(tmp_path / "a", [payload])
-    error = read_error("womd", tmp_path / "a")
-    assert error.field is not None
-    assert error.field.startswith("record 0")
-
-
 def test_womd_one_bad_record_among_good_ones(tmp_path: Path) -> None:
     bad = womd_scenario("bad")
     bad.tracks[2].states[0].center_x = float("nan")  # of the ego, from whose first place all is counted

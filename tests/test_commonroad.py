@@ -17,7 +17,7 @@ from helpers_sources import (
     state,
 )
 from helpers_sources import convert_xml as convert
-from symphony.data.segment import AgentType, RunSegment, content_hash
+from symphony.data.segment import RunSegment, content_hash
 from symphony.data.sources import get_reader
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -67,23 +67,6 @@ def test_static_obstacles_rest_at_every_step(path: Path) -> None:
     assert not segment.velocity[1].any()
     np.testing.assert_allclose(segment.heading[1], 0.3)
     np.testing.assert_allclose(segment.position[1], [[20, -1, 0]] * 5, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("kind", "expected"),
-    [
-        ("car", AgentType.VEHICLE),
-        ("bus", AgentType.VEHICLE),
-        ("motorcycle", AgentType.VEHICLE),
-        ("pedestrian", AgentType.PEDESTRIAN),
-        ("bicycle", AgentType.CYCLIST),
-        ("unknown", AgentType.OTHER),
-        ("spaceship", AgentType.OTHER),
-    ],
-)
-def test_types(path: Path, kind: str, expected: AgentType) -> None:
-    other = obstacle(8, [state(k, 20.0, 0) for k in range(5)], kind=kind)
-    assert convert(path, ROAD, driver(7), other).agent_type.tolist() == [AgentType.VEHICLE, expected]
 
 
 def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from helpers_sources import ROAD, bound, driver, lanelet, off_road, signed_area
 from helpers_sources import convert_xml as convert
-from symphony.data.segment import LaneType, MarkType, SignalState
+from symphony.data.segment import MarkType, SignalState
 from symphony.data.sources.lines import SLIT, drivable_rings
 
 
@@ -59,23 +59,6 @@ def test_speed_limits_of_either_version(path: Path) -> None:
     for kind, expected in (("274", 13.5), ("R2-1", 13.5), ("206", None)):
         (found,) = convert(path, driver(7), lane, sign.format(kind)).road.speed_limit.tolist()
         assert found == expected or (expected is None and np.isnan(found))
-
-
-@pytest.mark.parametrize(
-    ("inner", "tags", "expected"),
-    [
-        ("<laneletType>highway</laneletType>", "", LaneType.FREEWAY),
-        ("<laneletType>urban</laneletType>", "highway", LaneType.SURFACE_STREET),
-        ("<laneletType>urban</laneletType><laneletType>bicycleLane</laneletType>", "", LaneType.BIKE_LANE),
-        ("<laneletType>unknown</laneletType>", "", LaneType.UNDEFINED),
-        ("", "multi_lane highway comfort", LaneType.FREEWAY),
-        ("", "urban", LaneType.SURFACE_STREET),
-        ("", "", LaneType.UNDEFINED),
-    ],
-)
-def test_lane_types(path: Path, inner: str, tags: str, expected: LaneType) -> None:
-    lane = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], inner)
-    assert convert(path, lane, driver(7), tags=tags).road.lane_type.tolist() == [expected]
 
 
 def test_walkways_are_no_lanes(path: Path) -> None:
@@ -223,10 +206,3 @@ def test_a_light_repeats_its_cycle_from_the_offset(path: Path, offset: int) -> N
 )
 def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: list[int]) -> None:
     assert convert(path, FORK, TURNS, light(direction=direction), driver(7)).signal_lane.tolist() == lanes
-
-
-def test_stop_lines_that_are_drawn_count(path: Path) -> None:
-    line = "<stopLine><point><x>47</x><y>2</y></point><point><x>47</x><y>-2</y></point></stopLine>"
-    marked = APPROACH.replace("<trafficLightRef", line + "<trafficLightRef", 1)
-    segment = convert(path, marked, light(), driver(7))
-    np.testing.assert_allclose(segment.signal_point + segment.origin, [[47, 0, 0]], atol=1e-5)

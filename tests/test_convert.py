@@ -210,13 +210,3 @@ def test_info_counts_what_is_there(logs: Write, out: Path) -> None:
         "message": "13 is not 7",
     }
     assert found["version"] == 1
-
-
-def test_info_of_something_else_is_refused(logs: Write, out: Path) -> None:
-    path = logs("a.scene", "straight 1")
-    with pytest.raises(DataError, match="not a segment store"):
-        info(path.parent)
-    convert(FakeReader(), [path], out)
-    (out / "report.json").write_text('{"skipped": [{"why": 1}]}')
-    with pytest.raises(DataError, match="not a conversion report"):
-        info(out)

@@ -208,32 +208,6 @@ def test_broken_tracks_are_refused_by_name(name: str, tmp_path: Path) -> None:
     assert error.file == path
 
 
-@pytest.mark.parametrize("row", [2, 5, 9])
-@pytest.mark.parametrize(
-    ("here", "wrong"),
-    [
-        (",2.0000,", ",two,"),
-        (",2.0000,", ",inf,"),
-        (",car", "x,car"),
-        (",car", ",cow"),
-        (",car", ",autó"),
-        ("\n", ""),
-    ],
-)
-def test_errors_name_the_line(
-    row: int, here: str, wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("symphony.data.sources.interaction_tracks.CHUNK", 4)
-    lines = [COLUMNS + "\n", *(line + "\n" for line in CARS)][: row if wrong == "" else None]
-    assert here in lines[row - 1]
-    lines[row - 1] = lines[row - 1].replace(here, wrong)
-    path = public(tmp_path)
-    path.write_text("".join(lines), encoding="utf-8")
-    field = read_error("interaction", path).field
-    assert field is not None
-    assert field.split(":")[0] == f"line {row}"
-
-
 COMPANIONS: dict[str, tuple[str, str | None, str]] = {
     "no map": ("../../maps/k1.osm", None, "the map is missing"),
     "a map that is none": ("../../maps/k1.osm", "<osm/>", "has no lanelets"),

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
+from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.geodesy import mercator, utm
@@ -156,17 +156,6 @@ def test_speed_limits(text: str, expected: float, tmp_path: Path) -> None:
     )
 
 
-def test_oncoming_lanes_are_no_neighbours(tmp_path: Path) -> None:
-    nodes = NODES | {3: (0, 4), 5: (0, 8)}
-    # Bounds named the other way round: this lane comes towards the first.
-    lanelets = LANELETS | {102: (22, 23, ROAD, ())}
-    road = road_of(tmp_path, osm(nodes=nodes, lanelets=lanelets))
-    line = road.lanes[1]
-    assert line[0, 0] > line[-1, 0]
-    assert [0, 1] not in road.left_neighbors.tolist()
-    assert [1, 0] not in road.left_neighbors.tolist()
-
-
 @settings(max_examples=20)
 @given(turned=st.tuples(*[st.booleans()] * 5), first=st.integers(0, 2))
 def test_areas_belong_to_the_road_but_for_their_holes(turned: tuple[bool, ...], first: int) -> None:
@@ -179,22 +168,6 @@ def test_areas_belong_to_the_road_but_for_their_holes(turned: tuple[bool, ...], 
     assert (off_road(road, spots) < 0).tolist() == [True, True, True, False, False, False]
     assert not (off_road(plain, spots[:2]) < 0).any()
     assert road.lane_id.tolist() == plain.lane_id.tolist()
-
-
-@pytest.mark.parametrize(
-    ("tags", "drivable"),
-    [
-        ({"subtype": "freespace"}, True),
-        ({"subtype": "keepout"}, False),
-        ({"subtype": "building"}, False),
-        ({}, False),
-        ({"subtype": "walkway", "participant:vehicle:taxi": "yes"}, True),
-        ({"subtype": "parking", "participant:bicycle": "yes"}, False),
-    ],
-)
-def test_areas_that_vehicles_may_use(tags: dict[str, str], drivable: bool, tmp_path: Path) -> None:
-    road = road_of(tmp_path, with_area(tags))
-    assert (off_road(road, np.array([(55, 20)])) < 0).tolist() == [drivable]
 
 
 BROKEN: dict[str, tuple[str, str]] = {

@@ -43,15 +43,6 @@ def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
     assert not (tmp_path / "all.merging").exists()
 
 
-def test_a_folder_of_somebodys_own_is_not_taken_for_a_merge(tmp_path: Path) -> None:
-    notes = tmp_path / "all.merging" / "notes.txt"
-    notes.parent.mkdir()
-    notes.write_text("mine")
-    with pytest.raises(DataError, match="refusing to write"):
-        merge(PARTS[1:], tmp_path / "all")
-    assert notes.read_text() == "mine"
-
-
 def test_a_conversion_to_the_same_name_is_left_alone(tmp_path: Path) -> None:
     logs = [tmp_path / name for name in ("a.scene", "b.scene")]
     logs[0].write_text("straight 1")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,31 +59,6 @@ def test_agrees_with_shapely(seed: int) -> None:
                     sure |= {(a, b)} if shapes[a].intersection(shapes[b]).area > 1e-3 else set()
     found = {tuple(pair) for pair in overlapping(segment).tolist()}
     assert sure <= found <= possible
-
-
-def test_long_logs_of_many_agents_take_little_memory() -> None:
-    """All agents with all at all steps at once, those of INTERACTION's ten minutes would take gigabytes."""
-    lanes, steps = np.arange(100), 400
-    position = np.zeros((100, steps, 3), np.float32)
-    position[..., 0] = np.arange(steps)
-    position[..., 1] = 3.5 * lanes[:, None]
-    position[7] = position[3]
-    some = straight_road(2)
-    segment = some.replace(
-        agent_id=lanes,
-        agent_type=np.full(100, AgentType.VEHICLE, np.uint8),
-        size=np.tile(some.size[:1], (100, 1)),
-        position=position,
-        heading=np.zeros((100, steps), np.float32),
-        velocity=np.zeros((100, steps, 2), np.float32),
-        valid=np.ones((100, steps), np.bool_),
-    )
-    tracemalloc.start()
-    try:
-        assert overlapping(segment).tolist() == [[3, 7]]
-        assert tracemalloc.get_traced_memory()[1] < 60e6
-    finally:
-        tracemalloc.stop()
 
 
 def overlapped(seed: int = 0) -> RunSegment:

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,22 +8,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_convert import FakeReader
 from helpers_segments import crossing, hide, segments, straight_road
 from symphony.data import resample as resampling
-from symphony.data.convert import convert
 from symphony.data.resample import hold_lights, resample, smooth
 from symphony.data.segment import RunSegment, SignalState, content_hash, validate
-from symphony.data.sources.base import Item
-from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 
 PER_STEP = ("position", "heading", "velocity", "valid", "signal_state")
-
-
-@pytest.mark.parametrize(("step", "expected"), [(0, 0), (1, 0), (2, 1), (3, 1), (90, 45)])
-def test_current_step_becomes_the_latest_kept_one(step: int, expected: int) -> None:
-    assert resample(straight_road(steps=91, dt=0.1, current_step=step), 0.2).current_step == expected
 
 
 @settings(max_examples=40, deadline=None)
@@ -106,34 +95,6 @@ def test_held_lights_are_never_unknown_if_they_were_ever_known(state: NDArray[np
     assert content_hash(held.replace(signal_state=state)) == content_hash(log)
 
 
-class FlashOfLight(FakeReader):
-    """Crossings that show their lights at one step that 5 Hz does not keep."""
-
-    name = "flash"
-
-    def _read(self, path: Path) -> Iterator[Item]:
-        log = crossing(steps=91, dt=0.1)
-        state = np.zeros_like(log.signal_state)
-        state[:, 7] = SignalState.GO
-        yield log.replace(signal_state=state)
-
-
-def test_a_conversion_can_hold_lights_and_says_where_they_are_hardly_known(tmp_path: Path) -> None:
-    (tmp_path / "a.scene").touch()
-    stores = {hold: tmp_path / str(hold) for hold in (False, True)}
-    reports = {
-        hold: convert(FlashOfLight(), [tmp_path], out, hold_lights=hold) for hold, out in stores.items()
-    }
-    states = {hold: SegmentStore(out)[0].signal_state for hold, out in stores.items()}
-    assert (states[True] == SignalState.GO).all()
-    assert (states[False] == SignalState.GO).sum(1).tolist() == [1] * len(states[False])
-    assert reports[True].settings["hold_lights"] is True
-    assert "hold_lights" not in reports[False].settings
-    told = {hold: " ".join(report.odd) for hold, report in reports.items()}
-    assert "--hold-lights" in told[False]
-    assert not told[True]
-
-
 def noisy(log: RunSegment, sigma: float, seed: int = 0) -> RunSegment:
     noise = np.random.default_rng(seed).normal(0, sigma, (*log.valid.shape, 2)).astype(np.float32)
     position = log.position.copy()
@@ -198,14 +159,6 @@ def test_headings_stay_on_the_logged_branch() -> None:
     log = along_x(np.full(40, 5.0), 0.0)
     new = smooth(log.replace(heading=log.heading + np.float32(4 * np.pi)), 0.3)
     np.testing.assert_allclose(new.heading, 4 * np.pi, atol=1e-5)
-
-
-@settings(max_examples=30, deadline=None)
-@given(segments(), st.floats(0.01, 5))
-def test_whatever_is_valid_stays_valid(log: RunSegment, sigma: float) -> None:
-    new = validate(smooth(log, sigma))
-    np.testing.assert_array_equal(new.valid, log.valid)
-    assert not new.position[~log.valid].any()
 
 
 @pytest.mark.parametrize("every", [1, 2, 3, 5])

@@ -158,36 +158,6 @@ def test_faults_are_named(changes: dict[str, Any], field: str) -> None:
     assert refused(full().replace(**changes)).field == field
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("speed_limit", 0), ("speed_limit", -3), ("lane_width", -1), ("lane_id", None)],
-)
-def test_road_faults_are_named(name: str, value: float | None) -> None:
-    segment = full()
-    array = getattr(segment.road, name)
-    changed = put(array, array[0] if value is None else value)
-    assert refused(change_road(segment, **{name: changed})).field == f"road.{name}"
-
-
-def test_a_map_and_two_steps_are_needed() -> None:
-    none = np.zeros((0, 2), np.int32)
-    bare = change_road(
-        full(),
-        lanes=Polylines.of([]),
-        lane_id=np.zeros(0, np.int64),
-        lane_type=np.zeros(0, np.uint8),
-        speed_limit=np.zeros(0, np.float32),
-        lane_width=np.zeros(0, np.float32),
-        successors=none,
-        left_neighbors=none,
-        right_neighbors=none,
-    )
-    assert refused(bare).field == "road.lanes"
-    one = full()
-    cut = {n: getattr(one, n)[:, :1] for n in ("position", "heading", "velocity", "valid", "signal_state")}
-    assert refused(one.replace(**cut, current_step=0)).field == "valid"
-
-
 # --- polylines ---------------------------------------------------------------------------------------------
 
 

@@ -53,15 +53,6 @@ def test_round_trip(found: list[RunSegment], split: int) -> None:
                 store[past]
 
 
-def test_tags_come_back(folder: Path) -> None:
-    with StoreWriter(folder) as writer:
-        writer.append(straight_road(seed=1), tags={"split": "test", "stadt": "Köln", "n": [1, 2]})
-        writer.append(straight_road(seed=2))
-    store = SegmentStore(folder)
-    assert store.tags(0) == {"split": "test", "stadt": "Köln", "n": [1, 2]}
-    assert store.tags(1) == {}
-
-
 def test_groups_come_back_and_change_no_hash(folder: Path, tmp_path: Path) -> None:
     with StoreWriter(folder) as writer:
         writer.append(straight_road(seed=1).replace(group="drive 1/ö"), tags={"n": 1})

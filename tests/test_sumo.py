@@ -17,7 +17,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash, validate
 from symphony.data.selection import MOVING, interactive_agents, travel, usable
 from symphony.data.sources import sumo
-from symphony.data.sources.sumo import extract, process, simulate
+from symphony.data.sources.sumo import extract, process
 from symphony.data.store import SegmentStore
 from symphony.envs.routes import route_table
 from symphony.errors import DataError
@@ -285,22 +285,6 @@ def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DataError, match=r"symphony-traffic\[sumo\]"):
         sumo.generate_run("town", 0)
     process.sumo_home.cache_clear()
-
-
-def test_smoothing_keeps_a_straight_drive_and_recovers_the_box_centre() -> None:
-    """With no wander, a constant drive comes out exactly, half a length behind the front bumper."""
-    time = np.arange(60) * simulate.STEP
-    heading = np.full((1, 60), 0.7)
-    along = np.array([np.cos(0.7), np.sin(0.7)])
-    front = (8.0 * time[:, None] * along)[None]
-    front[0, :5] = heading[0, :5] = np.nan
-    center, angle = simulate._smooth(front, heading, np.array([4.5], np.float32), np.zeros((4, 1, 4)))
-    seen = np.isfinite(angle[0])
-    assert seen[13:52].all()
-    assert not seen[:13].any()
-    assert not seen[52:].any()
-    np.testing.assert_allclose(center[0, seen], front[0, seen] - 2.25 * along, atol=1e-9)
-    np.testing.assert_allclose(angle[0, seen], 0.7, atol=1e-9)
 
 
 # The built-in set -----------------------------------------------------------------------------------------------

@@ -146,17 +146,6 @@ def test_lanes_without_points_and_edges_of_one_go_with_all_that_refers_to_them(p
     assert len(segment.signal_lane) == 0
 
 
-def test_repeated_links_count_once_and_unknown_ones_not_at_all(path: Path) -> None:
-    scenario = womd_scenario()
-    lane = scenario.map_features[0].lane
-    lane.exit_lanes.extend([11, 999, 21])
-    lane.left_neighbors.add(feature_id=20)
-    lane.left_neighbors.add(feature_id=998)
-    segment = convert(path, scenario)
-    np.testing.assert_array_equal(segment.road.successors, [[0, 1], [0, 3], [2, 3]])
-    np.testing.assert_array_equal(segment.road.left_neighbors, [[0, 2], [1, 3]])
-
-
 @pytest.mark.parametrize("rate", [10, 15, 30, 60])
 def test_the_time_step_is_that_of_the_whole_log(path: Path, rate: int) -> None:
     """Rounded to milliseconds, steps of 1/30 s would take a hundredth off the time."""
