@@ -230,6 +230,7 @@ class _Draft:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = store_format.lock(self.folder)
         try:
+            self.done: Report | None
             begun, self.done = read_job(self.folder) or (None, None)
             if begun is None:
                 # Else what is left of a process that died before it had begun; it is about to be cleared.
