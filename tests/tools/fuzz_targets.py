@@ -328,10 +328,10 @@ def _rehash(place: Path) -> None:
     from symphony.data.store import SegmentStore
     from symphony.data.store_format import SEGMENTS
 
-    store = SegmentStore(place, check=False)
+    store = SegmentStore(place)
     records = np.fromfile(SEGMENTS.index_path(place), SEGMENTS.record, len(store))
     for k in range(len(store)):
-        records[k]["hash"] = np.frombuffer(bytes.fromhex(content_hash(store[k])), np.uint8)
+        records[k]["hash"] = np.frombuffer(bytes.fromhex(content_hash(store._read(k))), np.uint8)
     SEGMENTS.index_path(place).write_bytes(records.tobytes())
 
 
