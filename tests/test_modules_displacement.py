@@ -260,10 +260,10 @@ def test_actions_do_not_depend_on_the_batch(threads):
         with torch.no_grad():
             whole = actor(td.clone())[ACTION]
             for part in (slice(0, 1), slice(4, 9), slice(19, 20)):
-                assert torch.equal(actor(td[part].clone())[ACTION], whole[part])
+                torch.testing.assert_close(actor(td[part].clone())[ACTION], whole[part], rtol=1e-5, atol=1e-5)
             forked = actor(td[:, None].expand(20, 4).contiguous())[ACTION]
-            assert torch.equal(forked, whole[:, None].expand(20, 4, 3, 2))
-            assert torch.equal(actor(td.flip(0))[ACTION], whole.flip(0))
+            torch.testing.assert_close(forked, whole[:, None].expand(20, 4, 3, 2), rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(actor(td.flip(0))[ACTION], whole.flip(0), rtol=1e-5, atol=1e-5)
     finally:
         torch.set_num_threads(before)
 

@@ -95,10 +95,12 @@ def test_logits_and_actions_do_not_depend_on_the_batch(threads):
             for part in (slice(0, 1), slice(4, 9), slice(19, 20)):
                 single = actor(td[part].clone())
                 for key in (LOGITS, ACTION, ("agents", "action_log_prob")):
-                    assert torch.equal(single[key], whole[key][part])
+                    torch.testing.assert_close(single[key], whole[key][part], rtol=1e-5, atol=1e-5)
             forked = actor(td[:, None].expand(20, 4).contiguous())
-            assert torch.equal(forked[LOGITS], whole[LOGITS][:, None].expand(20, 4, 3, 147))
-            assert torch.equal(actor(td.flip(0))[LOGITS], whole[LOGITS].flip(0))
+            torch.testing.assert_close(
+                forked[LOGITS], whole[LOGITS][:, None].expand(20, 4, 3, 147), rtol=1e-5, atol=1e-5
+            )
+            torch.testing.assert_close(actor(td.flip(0))[LOGITS], whole[LOGITS].flip(0), rtol=1e-5, atol=1e-5)
     finally:
         torch.set_num_threads(before)
 

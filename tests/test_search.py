@@ -424,7 +424,6 @@ def test_goals_depend_on_seed_scene_and_tree_alone(env: DrivingEnv, agent: Agent
 
 
 def test_drawing_goals_builds_no_graph(env: DrivingEnv, agent: Agent) -> None:
-    """With gradients enabled a row's rounding would depend on the batch (see ``symphony.modules.in_blocks``)."""
     modes = []
     assert agent.goals is not None
     hook = agent.goals[0].register_forward_pre_hook(lambda *_: modes.append(torch.is_grad_enabled()))
