@@ -19,7 +19,6 @@ from torch import Tensor
 from symphony.errors import ConfigError
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
-from symphony.geometry.nearest import first_smallest
 
 WHEELBASE = 0.6
 """Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""
@@ -245,7 +244,7 @@ class Bicycle:
                 + (self.speed_weight * (after[..., 3] - target[..., None, 3])).square()
                 + effort
             )
-            action = first_smallest(error).masked_fill(~known, self.num_actions // 2)
+            action = error.argmin(-1).masked_fill(~known, self.num_actions // 2)
             index = action[..., None, None].expand(*action.shape, 1, 4)
             return action, after.gather(-2, index).squeeze(-2)
 

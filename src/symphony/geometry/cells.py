@@ -11,22 +11,24 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
-from symphony.geometry.nearest import kth_smallest, smallest
+from symphony.geometry.nearest import smallest
 from symphony.geometry.spans import spans
+
+Reals = NDArray[np.floating[Any]]
+Indices = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 POINT_CELL = 8.0
 """Metres of a cell's side, for points."""
 EDGE_CELL = 4.0
 """Metres of a cell's side, for the edges of the road."""
-REPAID = 2
-"""Positions in a cell that repay a list of its points."""
 ROWS = 64
 """Positions whose candidates are looked at together, so that they stay in the cache."""
 
@@ -96,7 +98,8 @@ class Cells(ABC):
         self.first, cells = np.concatenate([[0], ends[:-1]]), int(ends[-1]) if len(ends) else 0
         # Where a cell's list begins; -1 while it has none.
         self.begin, self.count = np.full(cells, -1), np.zeros(cells, np.int64)
-        self.sign, self._asked = np.zeros(cells, np.int8), np.zeros(cells, np.int64)
+        # One more, that is always 0, for positions in no cell, which is number -1.
+        self.sign, self._asked = np.zeros(cells + 1, np.int8), np.zeros(cells, np.int64)
         self.items, self._used = np.zeros(1 << 12, np.int32), 0
 
     @abstractmethod
@@ -110,7 +113,7 @@ class Cells(ABC):
         for a in range(0, len(scene), step):
             rows = slice(a, a + step)
             squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
-            last = kth_smallest(squared, self.wanted)
+            last = np.partition(squared, self.wanted - 1, axis=1)[:, self.wanted - 1, None]
             near = squared <= np.square(np.sqrt(last) + reach[rows])
             counts.append(np.count_nonzero(near, axis=1))
             # From places in the block to numbers among all elements.
@@ -132,6 +135,15 @@ class Cells(ABC):
         row = np.floor((y - self.y.take(scene)) * per_metre)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < self.rows.take(scene))
         return np.where(inside, row * columns + column + self.first.take(scene), -1.0).astype(np.int64)
+
+    def at(self, scene: Indices, x: Reals, y: Reals, repaid: int = 1) -> Indices:
+        """What :meth:`locate` gives, and -1 for cells that have no list: those have one that so many positions [R]
+        have been in by now.
+        """
+        cell = self.locate(scene, x, y)
+        inside = np.flatnonzero(cell >= 0)
+        cell[inside[~self.listed(scene[inside], cell[inside], repaid)]] = -1
+        return cell
 
     def listed(self, scene: Indices, cell: Indices, repaid: int = 1) -> Bools:
         """Whether the cells [R] of maps [R] have lists: those do that so many positions have been in by now."""
@@ -212,36 +224,37 @@ class PointCells(Cells):
 
 
 class EdgeCells(Cells):
-    """Cells for the nearest edge of the road.
+    """Cells for the nearest edge of the road, and the side of it on which whole cells lie.
 
     Args:
-        edges: of all maps.
-        exists: [B, E] which of them there are.
+        start: [B * E, 2] of the directed edges of all maps.
+        end: [B * E, 2].
+        exists: [B, E] which of them there are and have a length.
+        previous: [B * E] number of the edge that ends where this one starts, -1 if none.
+        following: [B * E] number of the edge that starts where this one ends, likewise.
     """
 
-    def __init__(self, edges: Edges, exists: Bools) -> None:
-        shape = exists.shape
-        ends = [
-            (v, v + 2 * edges.half * unit) for v, unit in ((edges.x, edges.unit_x), (edges.y, edges.unit_y))
-        ]
+    def __init__(
+        self, start: Reals, end: Reals, exists: Bools, previous: Indices, following: Indices
+    ) -> None:
+        along = end - start
+        length = np.hypot(along[:, 0], along[:, 1])
+        unit = along / np.where(length > 0, length, 1)[:, None]
+        # x and y of the start, those of the direction, and half the length: for one edge side by side, and of all.
+        parts = (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
+        self.edges = np.stack(parts, dtype=start.dtype, casting="same_kind")
+        self.of_edge = np.ascontiguousarray(self.edges.T)
+        self.exists, there = exists, exists.ravel()
+        self.links = [np.where((link >= 0) & there[link], link, -1) for link in (previous, following)]
         low, high = (
-            np.stack(
-                [bound(of_two(*two).reshape(shape), 1, where=exists, initial=start) for two in ends],
-                -1,
-            )
-            for bound, of_two, start in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
+            bound(of_two(start, end).reshape(*exists.shape, 2), 1, where=exists[..., None], initial=begin)
+            for bound, of_two, begin in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
         )
-        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1])
-        self.edges, self.exists = edges, exists
+        super().__init__(low, high, exists.any(1), EDGE_CELL, total=exists.shape[1])
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
-        edges = self.edges
         # Column by column, so that each lies in one piece.
-        columns = [
-            column.reshape(-1, self.total).take(scene, 0)
-            for column in (edges.x, edges.y, edges.unit_x, edges.unit_y, edges.half)
-        ]
-        squared = squared_to(columns, x, y)
+        squared = _squared_to([part.reshape(-1, self.total).take(scene, 0) for part in self.edges], x, y)
         squared[~self.exists[scene]] = np.inf
         return squared
 
@@ -254,8 +267,8 @@ class EdgeCells(Cells):
         cell = np.repeat(np.arange(len(x)), count)
         side, before, past = self._sides(x[cell], y[cell], item, half[cell])
         lowest, highest = side.copy(), side.copy()
-        for neighbor, decides in ((self.edges.previous, before), (self.edges.following, past)):
-            other = neighbor[item]
+        for link, decides in zip(self.links, (before, past), strict=True):
+            other = link[item]
             pair = np.flatnonzero(decides & (other >= 0))
             at = cell[pair]
             beside, _, _ = self._sides(x[at], y[at], other[pair], half[at])
@@ -267,14 +280,13 @@ class EdgeCells(Cells):
 
     def _sides(self, x: Reals, y: Reals, edge: Indices, half: Reals) -> tuple[NDArray[np.int8], Bools, Bools]:
         """Side of an edge on which a whole cell lies (0: on both), and whether any of it lies before or past it."""
-        edges = self.edges
-        away_x, away_y = x - edges.x[edge], y - edges.y[edge]
-        unit_x, unit_y = edges.unit_x[edge], edges.unit_y[edge]
+        start_x, start_y, unit_x, unit_y, half_length = self.edges[:, edge]
+        away_x, away_y = x - start_x, y - start_y
         along, across = away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x
         # The normal has the same components as the direction, so the cell spreads as far across as along.
         spread = half * (np.abs(unit_x) + np.abs(unit_y)) + _SLACK
         side = (across > spread).astype(np.int8) - (across < -spread)
-        return side, along < spread, along > 2 * edges.half[edge] - spread
+        return side, along < spread, along > 2 * half_length - spread
 
     def nearest_edge(self, cell: Indices, x: Reals, y: Reals) -> Indices:
         """Number [R] of the edge nearest to each position [R] in a cell that has a list."""
@@ -282,10 +294,27 @@ class EdgeCells(Cells):
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
         candidate = self.items.take(spans(self.begin.take(cell), held))
-        rows = self.edges.rows.take(candidate, axis=0)
-        squared = squared_to(np.moveaxis(rows, -1, 0), np.repeat(x, held), np.repeat(y, held))
+        squared = _squared_to(
+            np.moveaxis(self.of_edge.take(candidate, axis=0), -1, 0), np.repeat(x, held), np.repeat(y, held)
+        )
         hit = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), held))[::-1]
         nearest = candidate[first]
         # Written from the last to the first, so the first of equally near ones stays.
         nearest[np.repeat(np.arange(len(cell)), held)[hit]] = candidate[hit]
         return nearest.astype(np.int64)
+
+
+def _squared_to(edges: Sequence[Reals] | Reals, x: Reals, y: Reals) -> Reals:
+    """Squared metres from positions to edges [5, ...] as :class:`EdgeCells` keeps them."""
+    start_x, start_y, unit_x, unit_y, half = edges
+    away_x, away_y = x - start_x, y - start_y
+    beyond = away_x * unit_x
+    beyond += away_y * unit_y
+    beyond -= half
+    np.abs(beyond, out=beyond)
+    beyond -= half
+    np.maximum(beyond, 0, out=beyond)
+    away_x *= unit_y
+    away_y *= unit_x
+    away_x -= away_y
+    return np.square(beyond, out=beyond) + np.square(away_x, out=away_x)

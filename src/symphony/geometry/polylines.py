@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.geometry.nearest import first_smallest, on_host
+from symphony.geometry.nearest import on_host
 
 NO_BOUNDARY = -1e6
 """Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
@@ -182,7 +182,7 @@ def _nearest_segment(
             beyond.abs_().sub_(half).clamp_(min=0).square_()
             torch.addcmul(across, x[rows], unit_y, out=side).addcmul_(y[rows], unit_x, value=-1)
             distance = beyond.addcmul_(side, side)
-            index = first_smallest(distance)
+            index = distance.argmin(-1)
             smallest = distance.gather(-1, index[..., None])[..., 0]
             better = smallest < best
             result[rows] = torch.where(better, index + e, result[rows] if e else index)
