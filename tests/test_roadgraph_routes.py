@@ -29,10 +29,10 @@ from symphony.roadgraph import (
     LaneGraph,
     Route,
     blend,
-    feasible_routes,
     route_line,
     route_lines,
     routes,
+    starting_lanes,
 )
 from symphony.roadgraph import ground_truth_routes as ground_truth
 from symphony.roadgraph.paths import arc_lengths, at, beside, own_sharpest, sharpest
@@ -185,13 +185,12 @@ def test_a_neighbour_that_has_ended_or_leads_elsewhere_is_no_lane_to_change_to()
             assert found[1].begins == max(100.0, other[0][0])
 
 
-def test_feasible_routes_inside_a_junction_start_on_every_connector():
+def test_routes_inside_a_junction_start_on_every_connector():
     road, name = crossing()
     graph = LaneGraph(road)
-    found = lanes_of(feasible_routes(graph, np.array([2.0, -8.0]), np.pi / 2))
+    found = lanes_of(routes(graph, starting_lanes(graph, np.array([2.0, -8.0]), np.pi / 2)))
     assert {route[0] for route in found} == {name["left0"], name["ahead0"], name["right0"]}
     assert found[0][0] == name["ahead0"]
-    assert feasible_routes(graph, np.array([40.0, 40.0]), 0.0) == []
 
 
 @pytest.mark.parametrize("degrees", [0, 73])

@@ -147,7 +147,7 @@ class Bicycle:
         max_acceleration: m/s^2, the grid is symmetric.
         num_acceleration: size of the acceleration grid (odd, so that 0 is in it, and at least 3).
         max_steering: radians.
-        num_steering: size of the steering grid (likewise).
+        num_steering: size of the steering grid (odd and at least 3, too).
         heading_weight: metres that one radian of heading error counts for in the greedy fit.
         speed_weight: metres that one m/s of speed error counts for in the greedy fit.
         effort: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of

@@ -127,8 +127,8 @@ class Cells(ABC):
 
         Args:
             scene: any shape that broadcasts against the positions.
-            x: of the positions.
-            y: likewise.
+            x: metres of the positions.
+            y: metres of the positions.
         """
         per_metre, columns = self.per_metre.take(scene), self.columns.take(scene)
         column = np.floor((x - self.x.take(scene)) * per_metre)
@@ -231,7 +231,7 @@ class EdgeCells(Cells):
         end: [B * E, 2].
         exists: [B, E] which of them there are and have a length.
         previous: [B * E] number of the edge that ends where this one starts, -1 if none.
-        following: [B * E] number of the edge that starts where this one ends, likewise.
+        following: [B * E] number of the edge that starts where this one ends, -1 if none.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class EdgeCells(Cells):
             bound(of_two(start, end).reshape(*exists.shape, 2), 1, where=exists[..., None], initial=begin)
             for bound, of_two, begin in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
         )
-        super().__init__(low, high, exists.any(1), EDGE_CELL, total=exists.shape[1])
+        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=exists.shape[1])
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
         # Column by column, so that each lies in one piece.

@@ -34,7 +34,7 @@ class Discriminator(nn.Module):
     Args:
         own_features: of the agent itself, its route included where it is given one.
         object_features: of one object; the first two are its position in the agent's frame.
-        point_features: of one map or light point; likewise.
+        point_features: of one map or light point; the first two are its position in the agent's frame.
         radius: how far it observes, in the units of those positions.
         hidden: width of the encoders.
         head: widths of the head's hidden layers.

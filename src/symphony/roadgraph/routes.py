@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from symphony.geometry.stations import stations_along, to_pieces
-from symphony.roadgraph.assign import starting_lanes
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Reals, turn_between
 from symphony.roadgraph.paths import (
@@ -70,23 +69,6 @@ class Route(NamedTuple):
 
 Path = tuple[float, Route]
 """How far a route reaches ahead of the vehicle, in metres, and the route."""
-
-
-def feasible_routes(
-    graph: LaneGraph,
-    position: NDArray[Any],
-    heading: float,
-    *,
-    horizon: float = HORIZON,
-    limit: int = LIMIT,
-    lane_change: bool = True,
-) -> list[Route]:
-    """Routes of one vehicle from every lane it may be on; empty if it is on none.
-
-    See :func:`routes` for the order and :func:`symphony.roadgraph.assign.starting_lanes` for the lanes.
-    """
-    starts = starting_lanes(graph, position, heading)
-    return routes(graph, starts, horizon=horizon, limit=limit, lane_change=lane_change)
 
 
 def routes(
