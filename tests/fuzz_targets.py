@@ -398,14 +398,12 @@ def _load_checkpoint(folder: Path, _: str) -> tuple[str, str]:
     from symphony.agents.checkpoint import checkpoints, load_checkpoint
     from symphony.agents.choice import Best
     from symphony.errors import DataError
-    from symphony.training.alarms import Skips
 
     own = _networks_as_new()
     try:
         for place in checkpoints(folder):
             loaded = load_checkpoint(place, **own)
             Best.of(loaded.extra)
-            Skips.of(loaded.extra)
     except DataError:
         return REFUSED, ""
     import torch

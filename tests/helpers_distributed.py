@@ -141,7 +141,7 @@ def main(rank: int, store: Path, out: Path) -> None:
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     found: dict[str, Any] = {}
     with processes(CPU) as world:
-        found["world"] = [world.rank, world.count, world.leads]
+        found["world"] = [world.rank, world.count, world.is_main]
         found["mean"] = {
             name: value.item()
             for name, value in world.mean(

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from helpers_segments import crossing, straight_road
-from symphony import keys
+from symphony import keys, load_agent
 from symphony.collectors import Backtrack
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
@@ -22,7 +24,7 @@ from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.records import evaluation_record, simulation_way
 from symphony.rollouts.crowd import crowd_dataset
-from symphony.rollouts.driving import Simulation, search_kind, simulation
+from symphony.rollouts.driving import Simulation, filled_lines, search_kind, simulation
 from symphony.rollouts.search import rule_score
 from symphony.rollouts.unroll import Rollouts
 from test_search import SEGMENTS, blocked, make_agent
@@ -167,3 +169,30 @@ def test_agents_without_a_discriminator_are_searched_by_what_they_do(store: Segm
     assert evaluate("constant_velocity", store, replace(LINES, rollouts=1)).search == "backtrack"
     with pytest.raises(ConfigError, match="another score: --score flags or rule"):
         search_kind(blind, EvaluateConfig(search="backtrack"))
+
+
+@given(st.integers(1, 6), st.integers(1, 9), st.integers(0, 1000))
+def test_bad_lines_are_filled_from_good_ones_in_turn(scenes: int, lines: int, seed: int) -> None:
+    totals = torch.rand(scenes, lines, 3, generator=torch.Generator().manual_seed(seed))
+    found = filled_lines(totals, 0.8)
+    good = (totals <= 0.8).all(-1)
+    for row, is_good in zip(found, good, strict=True):
+        if not is_good.any():
+            assert row.tolist() == list(range(lines))
+            continue
+        assert bool(is_good[row].all())
+        assert row[is_good].tolist() == is_good.nonzero().flatten().tolist()
+        copies = torch.bincount(row, minlength=lines)[is_good]
+        assert copies.max() - copies.min() <= 1
+
+
+def test_included_agents_go_back_by_the_rule_and_others_search_as_they_learned() -> None:
+    for name in ("bc_ts_h", "mgail_ts_h"):
+        agent = load_agent(f"pretrained:{name}")
+        assert search_kind(agent, EvaluateConfig()) == "backtrack"
+        assert EvaluateConfig().looks_for(agent.search) == "rule"
+        assert EvaluateConfig().pruning(agent.search).threshold == 0
+        assert search_kind(agent, EvaluateConfig(search="tree")) == "tree"
+        assert EvaluateConfig(score="discriminator").looks_for(agent.search) == "discriminator"
+    assert search_kind(make_agent(), EvaluateConfig()) == "tree"
+    assert EvaluateConfig().looks_for(make_agent().search) == "discriminator"

@@ -346,11 +346,31 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
     stepped = env.step(env.at(before).set(keys.ACTION, before[keys.ACTION]))["next"]
     assert torch.equal(stepped[keys.STATE], after[keys.STATE])
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
-    rows = env.scenes.route_logged[:, None, None].expand(*lived.shape, 2)
-    assert torch.equal(lived[keys.GOAL], rows)
     rank = replay.leaves["collector", "beam_rank"]
     assert sorted(rank[0, :, 0].tolist()) == [0, 1]
     assert (rank == rank[..., :1]).all()
+
+
+@pytest.mark.parametrize(("method", "per"), [("bc_ts_h", "tree"), ("bc_ts_h", "branch"), ("mgail_h", "tree")])
+def test_searches_follow_routes_that_the_goal_policy_draws(
+    store: Path, tmp_path: Path, method: Any, per: Any
+) -> None:
+    """As in evaluation: new ones at every search, feasible, those of a tree together unless branches draw alone."""
+    wide = SearchConfig(branches=8, prune_every=99, updates=2, states=8, goals=per)
+    trainer = build(tiny(method, store, tmp_path, segments=3, search=wide))
+    replay, drawn = pieces(trainer)["replay"], []
+    for _ in range(3):
+        start = replay.collector.rollout()["tree"][..., 0]
+        goal, env = start[keys.GOAL], replay.env
+        assert (
+            goal[start[keys.VALID]] < env.choices(start)[keys.ROUTES_MASK].sum(-1)[start[keys.VALID]]
+        ).all()
+        assert (goal == goal[:, :1]).all() == (per == "tree")
+        logged = env.scenes.route_logged[start[keys.SCENE].squeeze(-1)]
+        drawn.append((goal == logged).float().mean().item())
+        assert ((goal >= 0) == (logged >= 0)).all()
+    assert min(drawn) < 1
+    assert len(set(drawn)) > 1
 
 
 def test_leaves_are_ranked_by_their_whole_history(store: Path, tmp_path: Path) -> None:

@@ -385,6 +385,17 @@ def test_a_hundred_runs_are_a_hundred(store: Path, tmp_path: Path) -> None:
     assert [entry.rollouts for entry in (*found.entries, *found.failures)] == [8, 8, 8]
 
 
+def test_beside_a_planner_nothing_is_searched_unless_asked_for(store: Path, tmp_path: Path) -> None:
+    """A search asks the planner once for each branch."""
+    agent = small()
+    data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=2)
+    for changes, kind in (({}, "none"), ({"search": "tree"}, "tree"), ({"branches": 3}, "agent")):
+        config = EvaluateConfig(rollouts=2, **changes)
+        folder = save_simulation(tmp_path / kind, agent, data, config, planner=f"{__name__}:Wanderer")
+        assert folder.about.settings["search"] == kind
+        assert (folder[0].trees is None) == (kind == "none")
+
+
 def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> None:
     words = ["--data", str(store), "--rollouts", "1", "--planner", "idm"]
     assert main(["simulate", "playback", "--out", str(tmp_path / "one"), *words]) == 0
@@ -436,14 +447,3 @@ def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
     assert set(found.failed[0].values()) == {found.failed[0][0]}
     assert "reset: RuntimeError: not today" in found.failed[0][0]
     assert not found.rollouts.counted.any()
-
-
-def test_without_a_planner_nothing_changes() -> None:
-    """A search scores the first agent, too."""
-    agent = small()
-    data = dataset(agent, 1)
-    config = EvaluateConfig(rollouts=2, branches=4)
-    found = simulation(agent, data.scenes([0]), config)
-    assert found.failed == ()
-    assert found.search is not None
-    assert (found.search.simulated_scores[..., 0] != 0).any()

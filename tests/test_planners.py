@@ -160,10 +160,14 @@ def test_log_playback_reproduces_the_log(segment: RunSegment) -> None:
     np.testing.assert_allclose(found[:, 3], speed, atol=1e-4)
 
 
-def test_a_gap_in_the_log_fails_the_run() -> None:
-    found = driven(hide(straight_road(3, steps=21), 0, slice(8, 10)), "log")
-    assert "step 7: ValueError: the log has no ego" in found.failed[0][0]
-    assert found.rollouts.counted[0, 0].all(-1).tolist() == [True] * 7 + [False] * 13
+def test_holes_of_the_log_are_filled_and_its_end_is_told() -> None:
+    whole = straight_road(3, steps=21)
+    found = driven(hide(hide(whole, 0, slice(8, 10)), 0, slice(16, 21)), "log")
+    assert "step 15: ValueError: the log of the ego ends at step 15" in found.failed[0][0]
+    assert found.rollouts.counted[0, 0].all(-1).tolist() == [True] * 15 + [False] * 5
+    path = found.rollouts.state[0, 0, :16, 0].numpy()
+    np.testing.assert_allclose(path[:, :2], whole.position[0, :16, :2], atol=0.1)
+    np.testing.assert_allclose(path[[7, 10], :2], whole.position[0, [7, 10], :2], atol=1e-4)
 
 
 @given(

@@ -32,7 +32,7 @@ from symphony.render import SearchTree, plot_genealogy, plot_search, plot_tree
 from symphony.render.genealogy import rows
 from symphony.render.style import AGENT_COLORS, new_figure
 from symphony.render.tree import FATES, STROKES, score_colors
-from symphony.rollouts.driving import simulated
+from symphony.rollouts.driving import simulate_batch
 
 EVERY, BRANCHES, STEPS = 2, 4, 5
 PARENTS = np.array([[0, 1, 0, 1], [2, 0, 2, 3], [3, 3, 2, 2]])
@@ -412,7 +412,7 @@ def test_command_line_shows_the_tree_that_an_evaluation_searches(
     agent = load_agent(str(run))
     scenes = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True).scenes([0, 1])
     config = EvaluateConfig(rollouts=4, search="tree", branches=4, seed=3)
-    evaluated = simulated(agent, scenes, config).state[1, :, 1:, :, :2].numpy()
+    evaluated = simulate_batch(agent, scenes, config).rollouts.state[1, :, 1:, :, :2].numpy()
     slots = lineage(torch.from_numpy(tree.parents)).numpy()
     paths = [np.stack([tree.position[slots[t // 4, leaf], t] for t in range(10)]) for leaf in range(4)]
     # The evaluation takes the best leaf first.

@@ -34,7 +34,7 @@ from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
-from symphony.learning.experts import experts
+from symphony.learning.experts import fit_experts
 from symphony.metrics import collisions, offroad
 from symphony.objectives import GoalLoss
 from symphony.recipes import train
@@ -200,33 +200,13 @@ def test_constant_velocity_is_right_on_the_straight_and_wrong_in_turns(store: Pa
     assert rows[f"crossing-{bend.index(max(bend))}"]["ade"] > 0.5
 
 
-def test_evaluation_does_not_depend_on_the_batch(run: Path, store: Path) -> None:
-    one, three = (
-        evaluate(str(run), store, EvaluateConfig(rollouts=3, batch=b)).metrics.rows() for b in (1, 4)
-    )
-    assert one == three
-
-
-def test_evaluation_follows_its_seed(run: Path, store: Path) -> None:
-    a, b, c = (
-        evaluate(str(run), store, EvaluateConfig(rollouts=2, seed=s)).metrics.rows() for s in (0, 0, 1)
-    )
-    assert a == b != c
-
-
-def test_more_rollouts_keep_the_first_ones(run: Path, store: Path) -> None:
-    few, many = (evaluate(str(run), store, EvaluateConfig(rollouts=k)).metrics.segments for k in (2, 5))
-    for name, result in few.items():
-        assert result.error.tolist() == many[name].error[:2].tolist()
-
-
 def test_experts_drive_or_wait_in_a_lane_and_are_not_parked() -> None:
     segment = straight_road(4)
     position, velocity = segment.position.copy(), segment.velocity.copy()
     position[1:3] = position[1:3, :1]
     velocity[1:3] = 0
     position[2, :, 1] += 1.5  # beside its lane
-    found = experts(segment.replace(position=position, velocity=velocity), Bicycle())
+    (found,) = fit_experts([segment.replace(position=position, velocity=velocity)], Bicycle())
     assert found.agent.tolist() == [0, 1, 3]
     assert found.error.max() < 0.15
     assert (found.actions[1] == 73).all()  # who waits neither steers nor brakes

@@ -33,19 +33,27 @@ from symphony.cli import (
     report,
     simulate,
     table,
+    test,
     train,
     view,
     wosac,
 )
 from symphony.cli.helps import PARAGRAPHS
-from symphony.errors import AllFailedError, ConfigError, DataWarning, SymphonyError, printable
+from symphony.errors import (
+    AllFailedError,
+    ConfigError,
+    CouldNotRunError,
+    DataWarning,
+    SymphonyError,
+    printable,
+)
 from symphony.files import check_writable, lock_file
 
 __all__ = ["main"]
 
 FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
 
-RESULTS = ("json", "figure", "out")
+RESULTS = ("json", "figure", "out", "junit")
 """Fields of commands: files that are written once everything is done, those whose metavar is FILE."""
 
 RENAMED: dict[str, str] = {}
@@ -69,6 +77,7 @@ app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
 app.command(name="planners")(planners.Planners)
+app.command(name="test")(test.Test)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="agents")(agents.Agents)
 app.command(name="demo")(demo.Demo)
@@ -191,6 +200,8 @@ def guarded(action: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except (SymphonyError, OSError) as error:
+        if isinstance(error, CouldNotRunError):
+            return _complain(error, USAGE)
         return _complain(error, ALL_FAILED if isinstance(error, AllFailedError) else FAILED)
     return 0
 

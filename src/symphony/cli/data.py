@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from symphony.cli.generate import Generate, Quality
+from symphony.cli.hardest import Hardest
 from symphony.cli.tables import print_table, write_numbers
 from symphony.errors import ConfigError, printable
 
@@ -18,6 +19,7 @@ _WINDOWS = ("window", "stride", "motion")
 app = tyro.extras.SubcommandApp()
 app.command(name="generate")(Generate)
 app.command(name="quality")(Quality)
+app.command(name="hardest")(Hardest)
 
 
 @app.command(name="convert")

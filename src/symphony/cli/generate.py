@@ -39,9 +39,10 @@ class Generate:
     seed: int = 0
     """Another seed gives other networks."""
     split: Literal["train", "validation", "test"] = "train"
-    """What the segments are for: the three never share a network, whatever their seeds."""
+    """What the segments are for: the three never share a network, except for roads of your own."""
     kinds: str = "town"
-    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), random (no grid)."""
+    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), random (no grid), or files
+    with roads of your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml)."""
     duration: Literal[10, 20, 30] = 10
     """Seconds of a segment."""
     interactive: int = 2

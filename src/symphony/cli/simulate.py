@@ -43,7 +43,8 @@ class Simulate:
     planner: str = ""
     """What drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your own: a
     file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as the
-    agent all others play back the log."""
+    agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say so: a
+    search asks the planner once for each branch."""
     planner_seconds: float = 60.0
     """Seconds that a planner has for one answer; a longer one fails the run."""
     goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID=PLACE ...")] = ()
@@ -71,7 +72,7 @@ class Simulate:
         from symphony.data.store import SegmentStore
         from symphony.learning.demonstrations import evenly_spaced
         from symphony.rollouts.crowd import crowd_dataset
-        from symphony.rollouts.driving import spread_runs
+        from symphony.rollouts.driving import beside_planner, spread_runs
         from symphony.saved.saving import save_simulation
 
         agent, store, config = (
@@ -79,6 +80,8 @@ class Simulate:
             SegmentStore(self.data),
             self.config,
         )
+        if self.planner:
+            config = beside_planner(config)
         # Beside log playback nobody else is simulated.
         others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = segment_indices(store, self.segments)

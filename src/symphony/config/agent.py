@@ -12,6 +12,7 @@ from symphony.errors import ConfigError
 
 ActionSpace = Literal["bicycle", "displacement"]
 Features = Literal["clearance", "paper", "foresight"]
+Score = Literal["discriminator", "flags", "rule"]
 RULES = ("best", "systematic", "replace")
 
 
@@ -110,8 +111,11 @@ class SearchConfig:
     threshold: float = 1.0
     """Of rule `replace`: the highest total, in logits of the discriminator, that a branch goes on with."""
     goals: Literal["tree", "branch"] = "tree"
-    """Who draws goals together in evaluation: all branches of a `tree` (the paper), or each `branch` alone. In
-    training all follow the routes of the log."""
+    """Who draws goals together: all branches of a `tree` (the paper), or each `branch` alone."""
+    way: Annotated[Literal["tree", "backtrack"], Fixed, Suppress] = "tree"
+    """How the agent is simulated unless something else is asked for: `tree` (the paper), or `backtrack`."""
+    score: Annotated[Score, Fixed, Suppress] = "discriminator"
+    """What that search looks for."""
     updates: int = 10
     """Updates made from the results of one search before the next."""
     states: int = 256
@@ -125,6 +129,8 @@ class SearchConfig:
         at_most(self, 10_000, "branches", "test_branches")
         one_of(self, "goals", ["tree", "branch"])
         one_of(self, "rule", RULES, path=True)
+        one_of(self, "way", ["tree", "backtrack"])
+        one_of(self, "score", get_args(Score))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +162,7 @@ class AgentSpec:
         one_of(self, "action_space", get_args(ActionSpace))
         positive(self, "dt")
         not_negative(self, "duration")
-        if self.searches and self.discriminator is None:
+        if self.searches and self.discriminator is None and self.search.score == "discriminator":
             raise ConfigError("an agent that searches needs a discriminator")
         if self.agent.cells and self.action_space != "displacement":
             raise ConfigError(

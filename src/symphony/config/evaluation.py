@@ -6,12 +6,12 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from symphony.config.agent import RULES, SearchConfig
+from symphony.config.agent import RULES, Score, SearchConfig
 from symphony.config.checks import not_negative, one_of, positive
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "backtrack", "best"]
-Score = Literal["discriminator", "flags", "rule"]
+ScoreName = Literal["agent", "discriminator", "flags", "rule"]
 Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 MOST = 128
@@ -76,8 +76,9 @@ class EvaluateConfig:
     search: Search = "agent"
     """`agent`: as it was trained; `none`; `tree`: beam search; `backtrack`: independent rollouts, each of which goes
     back and tries again where it is bad; `best`: independent rollouts, of which that with the best score counts."""
-    score: Score = "discriminator"
-    """What a search looks for. `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off
+    score: ScoreName = "agent"
+    """What a search looks for. `agent`: as is best for it (the discriminator, unless its card says something else);
+    `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off
     the road; `rule`: the same, and collisions within half a second, were everyone to keep speed and course."""
     trees: int = 1
     """Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
@@ -134,7 +135,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         one_of(self, "search", get_args(Search))
-        one_of(self, "score", get_args(Score))
+        one_of(self, "score", get_args(ScoreName))
         one_of(self, "goals", get_args(Goals))
         one_of(self, "rule", ["agent", *RULES], path=True)
         one_of(self, "engine", get_args(Engine))
@@ -152,10 +153,14 @@ class EvaluateConfig:
             if ":" not in path:
                 raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")
 
+    def looks_for(self, trained: SearchConfig) -> Score:
+        """What a search looks for, of an agent with such a search."""
+        return trained.score if self.score == "agent" else self.score
+
     def pruning(self, trained: SearchConfig) -> SearchConfig:
         """The search: as in training, but for what is set here."""
         # A threshold of logits says nothing of flags: with one of them a branch is bad.
-        threshold = {"discriminator": trained.threshold}.get(self.score, 0.0)
+        threshold = {"discriminator": trained.threshold}.get(self.looks_for(trained), 0.0)
         return dataclasses.replace(
             trained,
             test_branches=self.branches or trained.test_branches,

@@ -10,7 +10,7 @@ from symphony.config.checks import not_negative, one_of, positive
 from symphony.config.evaluation import EvaluateConfig, Goals, Search
 from symphony.errors import ConfigError
 
-WosacScore = Literal["discriminator", "rule"]
+WosacScore = Literal["agent", "discriminator", "rule"]
 """Without the true flags: what is simulated must not know beforehand what it is scored by."""
 FUTURE, DT = 80, 0.1
 """Steps that the challenge asks for, and the seconds between them."""
@@ -23,9 +23,9 @@ class WosacSettings:
     search: Search = "agent"
     """`agent`: as it was trained; `none`; `tree`: beam search; `backtrack`: rollouts that go back where they are bad;
     `best`: the best of independent rollouts. Each of the 32 rollouts of a search comes from a tree of its own."""
-    score: WosacScore = "discriminator"
-    """What a search looks for: what the `discriminator` calls unreal, or collisions, also those within half a second,
-    were everyone to keep speed and course, and time off the road (`rule`)."""
+    score: WosacScore = "agent"
+    """What a search looks for: as is best for the `agent`, what the `discriminator` calls unreal, or by a `rule`:
+    collisions, also those within half a second, were everyone to keep speed and course, and time off the road."""
     branches: int = 0
     """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
     rule: str = "agent"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, Literal, get_args
 
-from symphony.data.sources.sumo import KINDS, sumo_version
+from symphony.data.sources.sumo import KINDS, is_own, kind_name, sumo_version
 from symphony.errors import ConfigError
 
 Split = Literal["train", "validation", "test"]
@@ -31,7 +33,8 @@ class Plan:
         segments: how many.
         seed: another seed is another set of networks.
         split: training, validation and test sets never share a network, whatever their seeds.
-        kinds: of networks, which take turns; one named twice comes twice as often.
+        kinds: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
+            kind, too; its roads are the same for every split and seed, the traffic is another.
         duration: seconds of a segment, one of :data:`DURATIONS`.
         interactive: moving vehicles a segment must have at its first step (N_I).
 
@@ -53,9 +56,9 @@ class Plan:
             raise ConfigError(f"seed must be between 0 and {MAX_SEED}, is {self.seed}")
         if self.split not in SPLITS:
             raise ConfigError(f"unknown split {self.split!r} (known: {', '.join(SPLITS)})")
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        unknown = [kind for kind in self.kinds if kind not in KINDS and not is_own(kind)]
         if unknown or not self.kinds:
-            known = f"(known: {', '.join(KINDS)})"
+            known = f"(known: {', '.join(KINDS)}, and files of roads: .xodr, .osm, .net.xml)"
             raise ConfigError(
                 f"kinds: unknown kind of network {unknown[0]!r} {known}" if unknown else f"no kinds {known}"
             )
@@ -63,6 +66,9 @@ class Plan:
             raise ConfigError(f"duration must be one of {DURATIONS}, is {self.duration}")
         if self.interactive < 2:
             raise ConfigError(f"interactive must be at least 2, is {self.interactive}")
+        for kind in self.kinds:
+            if is_own(kind) and not Path(kind).is_file():
+                raise ConfigError(f"kinds: there is no file {kind}")
 
     def network(self, number: int) -> Task:
         """The plan's network of that number, counted from 0.
@@ -86,9 +92,11 @@ class Plan:
 
     def settings(self) -> dict[str, Any]:
         """As kept with the store: the arguments, and the versions that decide what they give."""
+        own = {kind: sha256(Path(kind).read_bytes()).hexdigest() for kind in self.kinds if is_own(kind)}
         return {
             **asdict(self),
             "kinds": list(self.kinds),
+            **({"roads": own} if own else {}),
             "reader": "generate",
             "generator": VERSION,
             "sumo": sumo_version(),
@@ -150,4 +158,4 @@ class Task:
     @property
     def name(self) -> str:
         """As in the segments' tags."""
-        return f"{self.kind}-{self.seed}"
+        return f"{kind_name(self.kind)}-{self.seed}"

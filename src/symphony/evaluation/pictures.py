@@ -22,7 +22,7 @@ from symphony.evaluation.evaluator import EvaluatedBatch
 from symphony.learning.demonstrations import SceneDataset
 from symphony.render import Clip, SearchTree, animate_rollouts, plot_grid, plot_rollout
 from symphony.render.style import ANIMATIONS, FORMATS, picture_path
-from symphony.rollouts.driving import driven_by, search_kind
+from symphony.rollouts.driving import search_kind, simulate_batch
 from symphony.rollouts.unroll import Rollouts
 from symphony.saved.folder import RolloutWriter
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts
@@ -183,7 +183,7 @@ def search_tree(agent: Agent, dataset: SceneDataset, item: int, config: Evaluate
     most = config.trees * settings.test_branches
     config = dataclasses.replace(config, rollouts=min(config.rollouts, most))
     scene = dataset.scene(item).to(torch.device(config.device))
-    found = driven_by(agent, scene, config, keep_tree=True)
+    found = simulate_batch(agent, scene, config, keep_tree=True)
     result = found.search
     if result is None or result.tree is None or found.drawn is None:
         raise RuntimeError("the search kept no tree")

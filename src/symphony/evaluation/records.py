@@ -129,7 +129,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "threshold": None,
     }
     if result.search not in ("none", "log"):
-        filled["score"] = config.score
+        filled["score"] = config.looks_for(agent.search)
     if result.search in ("tree", "best"):
         filled["branches"] = used.test_branches
     if result.search == "backtrack":

@@ -184,7 +184,7 @@ class EgoPolicy(TensorDictModuleBase):
         return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
 
     def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
-        """Of the planners with these numbers, flattened."""
+        """The failures of the planners with these numbers, flattened; None for those that drive on."""
         found = (self._held[n] for n in number.flatten().tolist())
         return [planner if isinstance(planner, Failure) else None for planner in found]
 

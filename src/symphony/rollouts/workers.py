@@ -29,7 +29,7 @@ NAMED = 8
 T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T], R]
-"""What is done with a task, such as a batch of items; a picklable object, with the dataset and the agent inside."""
+"""The work on a task, such as a batch of items: a picklable object, with the dataset and the agent inside."""
 
 
 def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:

@@ -27,7 +27,7 @@ from symphony.rollouts.unroll import Rollouts
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
 BACKGROUND = "background:"
-"""What the names of drivers begin with whose agents nobody evaluates."""
+"""The begin of the names of drivers whose agents nobody evaluates."""
 
 
 @dataclass(frozen=True)

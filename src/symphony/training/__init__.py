@@ -1,4 +1,4 @@
-"""The one trainer: loop, resume, validation, previews, alarms, logging, processes."""
+"""The one trainer: loop, resume, alarms, logging, processes, and hooks that validate and show."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from symphony.imports import lazily
 from symphony.training.processes import Processes, processes
 
 if TYPE_CHECKING:
-    from symphony.training.phases import Phase, Updates, cosine
-    from symphony.training.trainer import Trainer
+    from symphony.training.trainer import Phase, Trainer, Updates, cosine
 
 __all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine", "processes"]
 

@@ -155,8 +155,8 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
         found["logged_goals"] = settings.logged_goals
     if settings.action_temperature != 1.0:
         found["action_temperature"] = settings.action_temperature
-    if kind != "none" and settings.score != "discriminator":
-        found["score"] = settings.score
+    if kind != "none" and (score := config.looks_for(agent.search)) != "discriminator":
+        found["score"] = score
     if kind == "backtrack":
         found |= {"prune_every": pruning.prune_every, "threshold": pruning.threshold}
     if kind in ("tree", "best"):

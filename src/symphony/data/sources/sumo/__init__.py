@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.demand import write_demand
 from symphony.data.sources.sumo.extract import DT, STATES, CropRule, crop_rule, cut_segments
 from symphony.data.sources.sumo.freeways import RAMP_RADIUS, ramp
-from symphony.data.sources.sumo.networks import NETWORKS
+from symphony.data.sources.sumo.networks import NETWORKS, is_own, kind_name, own_network
 from symphony.data.sources.sumo.process import scratch, sumo_home, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.simulate import simulate_traffic
@@ -29,6 +30,8 @@ __all__ = [
     "crop_rule",
     "generate",
     "generate_run",
+    "is_own",
+    "kind_name",
     "sumo_home",
     "sumo_version",
 ]
@@ -37,6 +40,8 @@ KINDS = tuple(NETWORKS)
 """Kinds of network that :func:`generate` knows."""
 WARM_UP = 30.0
 """Simulated seconds before the first segment starts, at least."""
+_OWN_FILLS = 3
+"""Times as long a warm-up for roads of one's own, which may be larger."""
 SUBLANE_SHARE = 1 / 3
 _SLOW = 10.0
 """m/s at which a longer freeway fills during a longer warm-up."""
@@ -64,7 +69,7 @@ def generate(
     takes; its stop point is the end of the lane before. Equal arguments give equal segments.
 
     Args:
-        kind: one of :data:`KINDS`.
+        kind: one of :data:`KINDS`, or a file of roads of one's own (:data:`networks.OWN_ROADS`).
         seed: of every random choice; another seed is another network.
         duration: recorded seconds, after a warm-up.
         rule: how maps and egos are chosen, and how long segments are (:func:`crop_rule`); the kind's own for
@@ -92,7 +97,8 @@ def generate_run(
 
     Routes go straight on at a junction ``straight`` times as likely as they take one of the turns.
     """
-    if kind not in NETWORKS:
+    own = is_own(kind)
+    if kind not in NETWORKS and not own:
         raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
     rule = rule or crop_rule(kind)
     if not duration >= rule.steps * DT:
@@ -100,19 +106,25 @@ def generate_run(
     if seed < 0:
         raise ConfigError(f"seed must not be negative, is {seed}")
     roads_rng, demand_rng, drive_rng, cut_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence([seed, KINDS.index(kind)]).spawn(4)
+        np.random.default_rng(s)
+        for s in np.random.SeedSequence([seed, len(KINDS) if own else KINDS.index(kind)]).spawn(4)
     )
     with scratch() as folder:
         # A freeway must be longer than the map: what its ends do to traffic is not for a segment to show.
         longer = max(0.0, rule.radius - RAMP_RADIUS) if kind == "ramp" else 0.0
-        file = ramp(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
+        if own:
+            file = own_network(Path(kind), folder)
+        else:
+            file = ramp(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
         network = read_network(file)
+        # Where streets end at the edge of the map, traffic comes from there; else it circulates.
+        through = kind == "ramp" or (own and bool(network.sources()))
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
-        warm_up = WARM_UP + longer / _SLOW
+        warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration
         demand = write_demand(
-            network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane, straight=straight
+            network, demand_rng, folder, end, through=through, sublane=sublane, straight=straight
         )
         traffic = simulate_traffic(file, network, demand, drive_rng, end, warm_up, sublane=sublane)
-    segments, reasons = cut_segments(f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule)
+    segments, reasons = cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)
     return Generated(segments, reasons)

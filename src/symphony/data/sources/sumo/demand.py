@@ -119,11 +119,9 @@ def write_demand(
     speed = network.edge_speed()
     chance = None if straight == 1.0 else _chances(network, following, straight)
     if through:
-        # Sources are edges nothing leads into; each lane carries 600-1 300 vehicles per hour.
-        entered = {edge for edges in following for edge in edges}
-        sources = [edge for edge in range(len(length)) if lanes[edge] > 0 and edge not in entered]
+        # Each lane carries 600-1 300 vehicles per hour.
         departs, starts = [], []
-        for edge in sources:
+        for edge in network.sources():
             flow = lanes[edge] * rng.uniform(600, 1300) / 3600
             times = np.cumsum(rng.exponential(1 / flow, int(flow * duration * 1.5) + 5))
             departs += times[times < duration].tolist()

@@ -73,7 +73,7 @@ def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRul
     Longer segments get larger maps, so that a vehicle which drives on has road ahead of it to the end, and from
     fewer points of the network, as those maps overlap more.
     """
-    rule = RULES[kind]
+    rule = RULES.get(kind, CropRule())
     more = max(0.0, seconds - 10.0)
     grown = more * _GROWTH.get(kind, _TOWN_GROWTH)
     return replace(

@@ -5,6 +5,7 @@ All networks are for driving on the right. Every random choice comes from the ge
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET  # files are our own
 from collections import Counter
 from collections.abc import Callable
@@ -328,6 +329,43 @@ def _through_road(
             road.add(pair)
             before, here = here, end  # noqa: PLW2901
     return road
+
+
+OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
+"""Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
+
+
+def is_own(kind: str) -> bool:
+    """Whether a kind of network is a file of the user's."""
+    return kind.endswith(tuple(OWN_ROADS))
+
+
+def kind_name(kind: str) -> str:
+    """A kind as part of a segment's name: of a file its own name, without folder and ending."""
+    if not is_own(kind):
+        return kind
+    ending = next(ending for ending in OWN_ROADS if kind.endswith(ending))
+    return re.sub(r"[^A-Za-z0-9_]+", "_", Path(kind).name.removesuffix(ending))
+
+
+def own_network(file: Path, folder: Path) -> Path:
+    """Roads of the user's as a SUMO network, with the lanes that cars may use.
+
+    Raises:
+        DataError: there is no such file, or ``netconvert`` can't read it; names the file.
+    """
+    if not file.is_file():
+        raise DataError("no such file", file=file)
+    option = next(option for ending, option in OWN_ROADS.items() if file.name.endswith(ending))
+    arguments = [option, str(file.resolve()), "--output-file", "net.net.xml", *COMMON]
+    arguments += ["--keep-edges.by-vclass", "passenger", "--remove-edges.isolated", "true"]
+    if option == "--osm-files":
+        arguments += ["--geometry.remove", "true", "--junctions.join", "true", "--tls.guess-signals", "true"]
+    try:
+        run_program("netconvert", arguments, folder)
+    except DataError as error:
+        raise error.at(file=file) from error
+    return folder / "net.net.xml"
 
 
 NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {

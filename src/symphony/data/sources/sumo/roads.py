@@ -56,6 +56,12 @@ class Network:
     junction_shapes: list[Line]
     centers: Line
 
+    def sources(self) -> list[int]:
+        """Edges for traffic that nothing leads into."""
+        following, _, lanes = self.edge_graph()
+        entered = {edge for edges in following for edge in edges}
+        return [edge for edge in range(len(lanes)) if lanes[edge] > 0 and edge not in entered]
+
     def edge_graph(self) -> tuple[list[list[int]], NDArray[np.float64], NDArray[np.int64]]:
         """Of the edges outside junctions: those that follow each, its length and its number of lanes.
 
