@@ -13,7 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,20 +45,6 @@ _MANY = 256
 _WORTH = 3
 """Elements of a map for each that is looked for, below which a list saves nothing."""
 _FILLING = Lock()
-
-
-class Lists(NamedTuple):
-    """What can be nearest to a position in each of C cells.
-
-    Attributes:
-        length: [C] elements of each list.
-        items: all lists, one after the other, ascending within each.
-        sign: [C] 1 or -1 where every position of the cell is off or on the road, 0 where it depends on the position.
-    """
-
-    length: Indices
-    items: Indices
-    sign: NDArray[np.int8]
 
 
 class Cells(ABC):
@@ -106,21 +92,9 @@ class Cells(ABC):
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
         """Squared metres [C, elements of a map] from centres x and y [C, 1]; infinity where there is no element."""
 
-    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
-        """Lists of cells with the centres x and y [C], as long as ``side`` [C]."""
-        counts, items, step = [], [], max(1, _BLOCK // self.total)
-        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
-        for a in range(0, len(scene), step):
-            rows = slice(a, a + step)
-            squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
-            last = np.partition(squared, self.wanted - 1, axis=1)[:, self.wanted - 1, None]
-            near = squared <= np.square(np.sqrt(last) + reach[rows])
-            counts.append(np.count_nonzero(near, axis=1))
-            # From places in the block to numbers among all elements.
-            shift = (scene[rows] - np.arange(len(near))) * self.total
-            items.append(np.flatnonzero(near) + np.repeat(shift, counts[-1]))
-        count = np.concatenate(counts)
-        return Lists(count, np.concatenate(items), np.zeros(len(count), np.int8))
+    def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
+        """1 or -1 for cells [C] of which every position is off or on the road, 0 where it depends on the position."""
+        return np.zeros(len(x), np.int8)
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
         """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells.
@@ -155,24 +129,32 @@ class Cells(ABC):
             self._asked[number] += times
             due = (self.begin[number] < 0) & (self._asked[number] >= repaid)
             if due.any():
-                self._write(number[due], self._made(scene[new[place[due]]], number[due]))
+                self._fill(scene[new[place[due]]], number[due])
         return self.begin.take(cell) >= 0
 
-    def _made(self, scene: Indices, number: Indices) -> Lists:
-        column, row = (f(number - self.first[scene], self.columns[scene]) for f in (np.mod, np.floor_divide))
-        side = self.side[scene]
+    def _fill(self, scene: Indices, number: Indices) -> None:
+        """Make the lists of cells [C] of maps [C]."""
+        side, (row, column) = self.side[scene], np.divmod(number - self.first[scene], self.columns[scene])
         x, y = self.x[scene] + (column + 0.5) * side, self.y[scene] + (row + 0.5) * side
-        return self._lists(scene, x, y, side)
-
-    def _write(self, number: Indices, lists: Lists) -> None:
-        end = self._used + len(lists.items)
+        counts, parts, step = [], [], max(1, _BLOCK // self.total)
+        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
+        for a in range(0, len(scene), step):
+            rows = slice(a, a + step)
+            squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
+            last = np.partition(squared, self.wanted - 1, axis=1)[:, self.wanted - 1, None]
+            near = squared <= np.square(np.sqrt(last) + reach[rows])
+            counts.append(np.count_nonzero(near, axis=1))
+            # From places in the block to numbers among all elements.
+            shift = (scene[rows] - np.arange(len(near))) * self.total
+            parts.append(np.flatnonzero(near) + np.repeat(shift, counts[-1]))
+        count, items = np.concatenate(counts), np.concatenate(parts)
+        end = self._used + len(items)
         if end > len(self.items):
             # Never shorter than what somebody may be reading.
-            more = np.zeros(2 * end - len(self.items), np.int32)
-            self.items = np.concatenate([self.items, more])
-        self.items[self._used : end] = lists.items
-        self.count[number], self.sign[number] = lists.length, lists.sign
-        self.begin[number] = self._used + lists.length.cumsum() - lists.length
+            self.items = np.concatenate([self.items, np.zeros(2 * end - len(self.items), np.int32)])
+        self.items[self._used : end] = items
+        self.count[number], self.sign[number] = count, self._signs(x, y, count, items, 0.5 * side)
+        self.begin[number] = self._used + count.cumsum() - count
         self._used = end
 
 
@@ -258,12 +240,8 @@ class EdgeCells(Cells):
         squared[~self.exists[scene]] = np.inf
         return squared
 
-    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
-        lists = super()._lists(scene, x, y, side)
-        return lists._replace(sign=self._signs(x, y, lists.length, lists.items, 0.5 * side))
-
     def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
-        """1 or -1 for cells [C] on one side of every edge listed and of each neighbour that decides at a corner."""
+        # On one side of every edge listed, and of each neighbour that decides at a corner.
         cell = np.repeat(np.arange(len(x)), count)
         side, before, past = self._sides(x[cell], y[cell], item, half[cell])
         lowest, highest = side.copy(), side.copy()
