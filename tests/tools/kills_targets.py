@@ -75,7 +75,7 @@ def _generate(out: Path) -> None:
 
 def _convert(logs: Path, out: Path) -> None:
     # It was done when it was killed, and would be refused, unless it had not tidied up.
-    if (out / "store").exists() and not (out / "store.partial" / "journal.jsonl").exists():
+    if (out / "store").exists() and not (out / "store.partial" / "job.json").exists():
         return
     convert(FakeReader(), sorted(logs.glob("*.scene")), out / "store")
 

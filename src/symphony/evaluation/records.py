@@ -104,11 +104,11 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
-    config, used = result.config, result.config.pruning(agent.search)
+    config, used = result.config, agent.plan(result.config).search
     tree, searched = result.search == "tree", result.search not in ("none", "log")
     filled = dataclasses.asdict(config) | {
         "search": result.search,
-        "score": config.looks_for(agent.search) if searched else "discriminator",
+        "score": used.score if searched else "discriminator",
         "interactive": result.interactive,
         "duration": config.duration or agent.duration,
         "goals": used.goals if tree else "tree",

@@ -1,4 +1,4 @@
-"""Safe XML loading and the value types of CommonRoad files."""
+"""Safe XML loading, and the numbers and points in such files."""
 
 from __future__ import annotations
 
@@ -24,17 +24,9 @@ MAX_NUMBER = 1e8
 def load_xml(path: Path, what: str = "CommonRoad") -> ET.Element:
     """Parse a file that declares no document type, which rules out every kind of entity attack.
 
-    Args:
-        path: the file.
-        what: name of the format, for the error.
-
-    Raises:
-        DataError: the file is empty, too large, is not well-formed XML, or declares a document type.
-        OSError: the file can't be read.
+    ``what`` is the name of the format, for the :class:`DataError` where the file is something else.
     """
     data = read_whole(path)
-    if not data.strip():
-        raise DataError("the file is empty", file=path)
 
     def refuse(*declaration: Any) -> None:
         raise DataError(f"declares a document type, which {what} files never do", file=path, field="DOCTYPE")
@@ -71,15 +63,6 @@ def integer(text: str | None, field: str) -> int:
     return value
 
 
-def midpoint(node: ET.Element, field: str) -> float:
-    """The exact value of a state variable, or the middle of its interval."""
-    exact = node.find("exact")
-    if exact is not None:
-        return number(exact.text, field)
-    low = number(node.findtext("intervalStart"), field)
-    return (low + number(node.findtext("intervalEnd"), field)) / 2
-
-
 def point(node: ET.Element, field: str) -> tuple[float, float]:
     """The x and y children of an element."""
     return number(node.findtext("x"), field), number(node.findtext("y"), field)
@@ -91,37 +74,9 @@ def points(node: ET.Element | None, field: str) -> Doubles:
     return np.array([point(child, field) for child in children], np.float64).reshape(-1, 2)
 
 
-def center(node: ET.Element, field: str) -> tuple[float, float]:
-    """A position: a point, or the centre of the region (rectangle, circle, polygon) it is known to lie in."""
-    exact = node.find("point")
-    if exact is not None:
-        return point(exact, field)
-    corners = points(node.find("polygon"), field)
-    if len(corners):
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        return float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2
-    for shape in ("rectangle", "circle"):
-        middle = node.find(f"{shape}/center")
-        if middle is not None:
-            return point(middle, field)
-    raise DataError("neither a point nor a rectangle, circle or polygon with a centre", field=field)
-
-
-def references(node: ET.Element, tag: str, field: str) -> list[int]:
+def references(node: ET.Element, tag: str, field: str) -> tuple[int, ...]:
     """The ``ref`` attributes of all children of that tag, at most :data:`MAX_REFERENCES`."""
     children = node.findall(tag)
     if len(children) > MAX_REFERENCES:
-        raise DataError(f"{len(children)} references, at most {MAX_REFERENCES}", field=field)
-    return [integer(child.get("ref"), field) for child in children]
-
-
-def rotate(vectors: Doubles, angle: Doubles | float) -> Doubles:
-    """Turn vectors [..., 2] by angles [...] counter-clockwise."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-
-def is_true(text: str | None, default: bool) -> bool:
-    """An XML boolean."""
-    return default if text is None else text.strip() in {"true", "1"}
+        raise DataError(f"{len(children)} references, at most {MAX_REFERENCES}", field=f"{field}: {tag}")
+    return tuple(integer(child.get("ref"), f"{field}: {tag}") for child in children)
