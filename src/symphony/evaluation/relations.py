@@ -83,19 +83,14 @@ STATEMENTS = (
     Statement("times", "collision_rate", "mgail", "mgail_ts_h", 2.2),
     Statement("lower", "collision_rate", "bc", "mgail"),
     Statement("not_higher", "min_sade", "bc_h", "bc_ts_h"),
-    *(
-        Statement("lower", metric, f"{base}_ts", f"{base}_ts_h")
-        for base in ("bc", "mgail")
-        for metric in ("ade", "min_sade")
-    ),
-    *(
-        statement
-        for base in ("bc", "mgail")
-        for statement in (
-            Statement("higher", "curvature_jsd", base, f"{base}_ts", clearly=True),
-            Statement("lower", "curvature_jsd", f"{base}_ts", f"{base}_ts_h", clearly=True),
-        )
-    ),
+    Statement("lower", "ade", "bc_ts", "bc_ts_h"),
+    Statement("lower", "min_sade", "bc_ts", "bc_ts_h"),
+    Statement("lower", "ade", "mgail_ts", "mgail_ts_h"),
+    Statement("lower", "min_sade", "mgail_ts", "mgail_ts_h"),
+    Statement("higher", "curvature_jsd", "bc", "bc_ts", clearly=True),
+    Statement("lower", "curvature_jsd", "bc_ts", "bc_ts_h", clearly=True),
+    Statement("higher", "curvature_jsd", "mgail", "mgail_ts", clearly=True),
+    Statement("lower", "curvature_jsd", "mgail_ts", "mgail_ts_h", clearly=True),
     *(Statement("near_log", "standing", "", method, STANDING_POINTS) for method in ROWS[2:]),
 )
 """What the paper's tables say (and one of the log: agents that have learned to stop are safe)."""
