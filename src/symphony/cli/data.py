@@ -65,7 +65,7 @@ class Convert:
     """Leave out segments in whose log a moving vehicle's box overlaps another box."""
     hold_lights: bool = False
     """Give lights the last state that the log knows (before the first: the first) where it knows none, instead of
-    `unknown`: for scenes that show their lights at a single step (see docs/datasets.md)."""
+    `unknown`: for scenes that show their lights at a single step (see docs/formats.md)."""
     strict: bool = False
     """Skip a record of which something odd would be left out (an agent without a size, a state that no car can have,
     a node that the map lacks), instead of reading the rest of it."""
