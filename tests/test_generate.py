@@ -286,7 +286,7 @@ def test_a_killed_run_is_continued_and_workers_change_nothing(
     assert written["generation"]["reasons"] == state.reasons
     assert store.report["quality"] == written["quality"]
     # Once more, with the measures that are kept.
-    monkeypatch.setattr("symphony.cli.generate.measured", None)
+    monkeypatch.setattr("symphony.cli.data.measured", None)
     assert main(command[3:]) == 0
     assert main([*command[3:], "--interactive", "3"]) == 1
     assert "interactive 2, not 3" in capsys.readouterr().err
@@ -320,7 +320,7 @@ def test_a_preset_makes_three_stores_and_warns_of_other_checksums(
 def test_built_in_set_meets_the_targets(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path, file = builtin_store("test"), tmp_path / "quality.json"
     assert main(["data", "quality", str(path), "--json", str(file)]) == 0
-    assert "choices at branching lanes" in capsys.readouterr().out
+    assert "collision rate" in capsys.readouterr().out
     quality = json.loads(file.read_text())
     assert quality == measure(SegmentStore(path))
     assert shortfalls(quality) == []
