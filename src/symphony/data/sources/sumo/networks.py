@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import xml.etree.ElementTree as ET  # files are our own
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +28,9 @@ COMMON = (
     "--no-warnings true"
 )
 """Options of every network."""
+_THROUGH = 0.75
+"""Cosine of the sharpest bend of an arterial at a junction."""
+_FEWEST_STREETS = 8
 SHARPEST_ANGLE = 1.05
 """Radians between two streets at a junction, at least where one of them is bent."""
 LATERAL_ACCELERATION = 3.0
@@ -201,6 +206,11 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
         main = is_main(a, b)
         lanes, speed = arterial if main else collector
         links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
+    return _build(rng, folder, nodes, links, width)
+
+
+def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Link], width: float) -> Path:
+    """The network of some two-way streets, with lights, roundabouts and other junctions at its nodes."""
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
     for link in links:
@@ -380,6 +390,75 @@ def _carriageway(
     net.connect(ids[off - 1], last, [(0, 0)])
 
 
+def random(rng: np.random.Generator, folder: Path) -> Path:
+    """Streets of all directions and lengths, without a grid: grown by ``netgenerate``, then built like a town's."""
+    nodes, pairs = _grown(rng, folder)
+    main = _through_road(rng, nodes, pairs)
+    width = rng.uniform(3.2, 3.7)
+    arterial = (int(rng.choice([2, 2, 3])), float(rng.choice([13.89, 15.65, 16.67])))
+    collector = (int(rng.choice([1, 1, 2])), float(rng.choice([8.94, 11.18, 13.41])))
+    links: list[_Link] = []
+    for a, b in pairs:
+        line = _street(rng, nodes, links, a, b)
+        lanes, speed = arterial if (a, b) in main else collector
+        links.append(_Link(a, b, line, (a, b) in main, lanes, min(speed, _comfortable_speed(line))))
+    return _build(rng, folder, nodes, links, width)
+
+
+def _grown(rng: np.random.Generator, folder: Path) -> tuple[Point, list[tuple[int, int]]]:
+    """Nodes [N, 2] and the two-way streets between them, from a random network; no street ends nowhere."""
+    nearest = rng.uniform(65, 85)
+    arguments = f"--rand --rand.iterations {rng.integers(25, 50)} --rand.num-tries 60 "
+    arguments += f"--rand.min-distance {nearest:.2f} --rand.max-distance {nearest * 1.8:.2f} "
+    arguments += "--rand.min-angle 65 --rand.connectivity 0.98 "
+    for arms, chance in enumerate((0, 0, 5, 10, 1, 0), start=1):
+        arguments += f"--rand.neighbor-dist{arms} {chance} "
+    arguments += f"--seed {rng.integers(1, 2**30)} --output-file grown.net.xml --plain-output-prefix grown"
+    run_program("netgenerate", arguments, folder)
+    places = {
+        node.attrib["id"]: np.array([float(node.attrib["x"]), float(node.attrib["y"])])
+        for node in ET.parse(folder / "grown.nod.xml").getroot().iter("node")  # noqa: S314
+    }
+    streets = {
+        tuple(sorted((edge.attrib["from"], edge.attrib["to"])))
+        for edge in ET.parse(folder / "grown.edg.xml").getroot().iter("edge")  # noqa: S314
+    }
+    pairs = sorted(streets)
+    while True:
+        meeting = Counter(end for pair in pairs for end in pair)
+        kept = [pair for pair in pairs if min(meeting[end] for end in pair) > 1]
+        if len(kept) == len(pairs):
+            break
+        pairs = kept
+    if len(pairs) < _FEWEST_STREETS:
+        raise DataError(f"a random network came out with {len(pairs)} streets only")
+    names = sorted(meeting)
+    return np.array([places[name] for name in names]), [(names.index(a), names.index(b)) for a, b in pairs]
+
+
+def _through_road(
+    rng: np.random.Generator, nodes: Point, pairs: list[tuple[int, int]]
+) -> set[tuple[int, int]]:
+    """Streets of an arterial: from a random one on both ways, each time into the street that bends least."""
+    first = pairs[int(rng.integers(len(pairs)))]
+    road = {first}
+    for before, here in (first, first[::-1]):
+        while True:
+            options = []
+            for pair in pairs:
+                if here in pair and pair not in road:
+                    end = pair[0] + pair[1] - here
+                    ahead, away = nodes[here] - nodes[before], nodes[end] - nodes[here]
+                    cosine = float(ahead @ away / np.linalg.norm(ahead) / np.linalg.norm(away))
+                    options.append((cosine, pair, end))
+            if not options or max(options)[0] < _THROUGH:
+                break
+            _, pair, end = max(options)
+            road.add(pair)
+            before, here = here, end  # noqa: PLW2901
+    return road
+
+
 OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
 """Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
 
@@ -418,5 +497,6 @@ NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
     "town": town,
     "grid": grid,
     "ramp": freeway,
+    "random": random,
 }
 """Kinds of network; each function writes files into a folder and returns the path of the network."""
