@@ -13,7 +13,8 @@ from pathlib import Path
 
 from symphony.agents.agent import usable_device
 from symphony.config.training import Method, TrainConfig
-from symphony.training import Processes, Trainer, processes
+from symphony.training import Processes, Trainer
+from symphony.training.processes import processes
 
 __all__ = ["Recipe", "recipe_of", "train", "trainer_of"]
 

@@ -73,7 +73,7 @@ def _searched(count: int, rollouts: int, branches: int, duration: int) -> tuple[
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
     indices = range(count)
     dataset = SceneDataset(store, agent.interactive, agent.dynamics, indices, routes=True, duration=duration)
-    config = EvaluateConfig(rollouts=rollouts, branches=branches)
+    config = EvaluateConfig(search="tree", score="discriminator", rollouts=rollouts, branches=branches)
     scenes = dataset.scenes(indices)
     found = simulate_batch(agent, scenes, config, keep_tree=True)
     saved = [

@@ -25,7 +25,6 @@ from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
-from symphony.render import curves
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
@@ -189,13 +188,6 @@ def test_a_run_that_ends_before_its_adversarial_updates_says_so(
     assert "warning: the run ends at update 4, before the first of adversarial" in capsys.readouterr().err
     train(config("mgail", store, tmp_path / "long", steps=5))
     assert "warning" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
-    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
-    recorded = {name for record in read_metrics(trained(method)) for name in record}
-    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize(("method", "dies_at"), [("mgail", 5), ("mgail_ts_h", 3)])

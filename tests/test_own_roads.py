@@ -30,8 +30,8 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The same town as SUMO's network and as OpenDRIVE."""
     folder = tmp_path_factory.mktemp("roads")
     made = town(np.random.default_rng(3), folder)
-    run_program("netconvert", ["--sumo-net-file", str(made), "--opendrive-output", "own town.xodr"], folder)
-    return {"sumo": made, "opendrive": folder / "own town.xodr"}
+    run_program("netconvert", f"--sumo-net-file {made.name} --opendrive-output town.xodr", folder)
+    return {"sumo": made, "opendrive": (folder / "town.xodr").rename(folder / "own town.xodr")}
 
 
 def driven_length(file: Path) -> float:

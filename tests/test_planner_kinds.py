@@ -134,12 +134,9 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
     ("said", "why"),
     [
         ('{"step": 2, "plan": [NaN, 0.0]}', "not finite"),
-        ('{"step": 2, "plan": null}', "step 2: "),
-        ('{"step": 1, "plan": [-1.0, 0.0]}', 'step 2: ValueError: answered .* not {"step": 2, '),
         ("[-1.0, 0.0]", 'step 2: ValueError: answered .* not {"step": 2, '),
         ('{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
         ("what?", "step 2: JSONDecodeError"),
-        ("null", "step 2: "),
     ],
 )
 def test_what_another_process_says_wrong_fails_the_run(
@@ -441,9 +438,6 @@ for line in sys.stdin:
     if step == 2 and kind == "binary":
         sys.stdout.buffer.write(b"\\xff\\x00\\n")
         sys.stdout.flush()
-    if step == 2 and kind == "deep":
-        print("[" * 200_000 + "]" * 200_000, flush=True)
-        continue
     if step == 2 and kind == "debug":
         print([0.0, 0.0], flush=True)
     print(json.dumps({} if step is None else {"step": step, "plan": [-1.0, 0.0]}), flush=True)
@@ -464,7 +458,6 @@ def odd(store: Path, tmp_path: Path, kind: str) -> RolloutFolder:
     [
         ("flood", 2, "an answer of more than 1048576 bytes"),
         ("binary", 2, "UnicodeDecodeError|JSONDecodeError|more than one line"),
-        ("deep", 2, "RecursionError"),
         ("debug", 2, "more than one line for an answer|answered"),
         ("twice", "[23]", "more than one line for an answer|answered"),
     ],

@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
 from symphony.agents import Agent, build_agent
-from symphony.collectors import BeamSearchResult, KeepAll, KeepBest
+from symphony.collectors import BeamSearchResult, KeepBest
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
@@ -144,22 +144,6 @@ def test_one_branch_is_a_plain_rollout(env: DrivingEnv, agent: Agent) -> None:
     assert same(found, plain(env, agent, start))
 
 
-def test_independent_branches_are_plain_rollouts(env: DrivingEnv, agent: Agent) -> None:
-    start = start_of(env, 3)
-    found = rollouts_of(env, start, look(env, agent, start, rule=KeepAll()).trajectories)
-    assert same(found, plain(env, agent, start))
-
-
-def test_if_all_score_alike_the_first_half_goes_on(env: DrivingEnv, agent: Agent) -> None:
-    def alike(td: TensorDictBase) -> TensorDictBase:
-        return td.set(keys.SCORE, torch.full(td.get(keys.VALID).shape, 0.3))
-
-    start = start_of(env, 6)
-    found = rollouts_of(env, start, look(env, replace(agent, discriminator=alike), start).trajectories)
-    first = part(plain(env, agent, start[:, :3]), slice(None), [0, 1, 2, 0, 1, 2])
-    assert same(found, first)
-
-
 def test_the_actions_of_every_leaf_lead_where_it_went(env: DrivingEnv, agent: Agent) -> None:
     start = start_of(env, 4)
     result = look(env, agent, start)
@@ -192,27 +176,6 @@ def test_what_the_search_scored_is_what_the_discriminator_says_of_the_leaves(
         assert (scores[~counted] == ENDED).all()
         assert scores[counted].min() > ENDED / 2
     assert not counted.all()
-
-
-def test_low_scores_survive(env: DrivingEnv, agent: Agent) -> None:
-    result = look(env, agent, start_of(env, 4), keep_tree=True)
-    # Totals by hand: the worst moment of each agent in the period, added up.
-    for period in range(result.totals.shape[1]):
-        steps = slice(EVERY * period, EVERY * (period + 1))
-        total = result.simulated_scores[:, :, steps].amax(2).sum(-1)
-        torch.testing.assert_close(result.totals[:, period], total)
-        kept = total.argsort(dim=-1, stable=True)[:, [0, 1, 0, 1]]
-        assert torch.equal(result.parents[:, period], kept)
-
-
-def test_copies_of_a_branch_part_and_slots_keep_their_random_numbers(env: DrivingEnv, agent: Agent) -> None:
-    result = look(env, agent, start_of(env, 4), keep_tree=True)
-    assert result.tree is not None
-    state, action = result.tree[keys.STATE], result.tree[keys.ACTION]
-    # Slots 0 and 2 go on from one branch: the same state, but then other actions.
-    assert torch.equal(state[:, 0, EVERY], state[:, 2, EVERY])
-    period = slice(EVERY, 2 * EVERY)
-    assert (action[:, 0, period] != action[:, 2, period]).flatten(1).any(1).all()
 
 
 def test_an_agents_goal_is_that_of_its_tree_in_every_branch(env: DrivingEnv, agent: Agent) -> None:

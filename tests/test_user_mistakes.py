@@ -20,8 +20,7 @@ from symphony.agents import load_agent
 from symphony.cli import ALL_FAILED, main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
-from symphony.errors import ConfigError, DataError
-from symphony.evaluation.pictures import search_tree
+from symphony.errors import DataError
 from symphony.evaluation.planners import check_crowds, winners
 from symphony.planners.calls import answer, plans_of
 from symphony.recipes import train
@@ -169,12 +168,6 @@ HELD: dict[str, Any] = {
 def test_whatever_a_planner_holds_is_looked_at_whole(kind: str, bind: Any) -> None:
     one, same, other = (source_of(bind(HELD[kind](gain))) for gain in (1.0, 1.0, 2.0))
     assert one == same != other
-
-
-def test_the_order_of_a_set_is_nothing_of_a_planner() -> None:
-    one, other = {0, 8}, {8, 0}
-    assert list(one) != list(other)  # as of words from one process to the next
-    assert source_of(partial(steady, one)) == source_of(partial(steady, other))
 
 
 @pytest.mark.parametrize("make", [steadily, Shop, lambda gain: Shop(gain).plan])
@@ -382,24 +375,3 @@ def test_of_two_planners_the_better_one_is_better_where_both_drove() -> None:
     (sentence,) = winners([careful, quick])
     assert sentence.startswith("log: careful is first")
     assert "20.0 above quick, in the 1 segments that both drove" in sentence
-
-
-@pytest.mark.parametrize("changes", [{}, {"search": "tree", "score": "flags"}])
-def test_the_tree_that_is_drawn_is_the_one_that_is_simulated(
-    store: Path, run: Path, tmp_path: Path, changes: dict[str, Any]
-) -> None:
-    agent, config = load_agent(str(run)), EvaluateConfig(rollouts=2, branches=2, goals="branch", **changes)
-    dataset = crowd_dataset(SegmentStore(store), agent, config, [1])
-    drawn = search_tree(agent, dataset, 0, config)
-    kept = save_simulation(tmp_path / "sim", agent, dataset, config)[0].trees
-    assert kept is not None
-    np.testing.assert_array_equal(drawn.position, kept.state[0, ..., :2])
-    np.testing.assert_array_equal(drawn.score, kept.score[0])
-    np.testing.assert_array_equal(drawn.parents, kept.parents[0])
-
-
-@pytest.mark.parametrize("search", ["none", "best"])
-def test_without_a_tree_there_is_none_to_draw(store: Path, run: Path, search: Any) -> None:
-    agent, config = load_agent(str(run)), EvaluateConfig(rollouts=2, search=search)
-    with pytest.raises(ConfigError, match="there is no tree to draw"):
-        search_tree(agent, crowd_dataset(SegmentStore(store), agent, config, [1]), 0, config)

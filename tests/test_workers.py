@@ -7,7 +7,6 @@ import pickle
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,6 @@ from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
 from symphony.learning.demonstrations import SceneDataset
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.workers import batches, naming, segments_together, shared
-from symphony.saved import saving
 from symphony.saved.folder import About, RolloutWriter
 from symphony.saved.saving import save_simulation
 from test_engine import gone
@@ -156,28 +154,6 @@ def test_as_many_segments_together_as_see_a_bounded_number_of_points(
     assert agent.observation.num_points == 12  # 2 agents x 1 024 branches x 12 points x 21 are 2^19
     config = EvaluateConfig(**{"search": "tree", "branches": 16} | settings)
     assert segments_together(agent, config, 2) == together
-
-
-@pytest.mark.parametrize(
-    ("planner", "batch", "sizes"), [("idm", 0, [16, 4]), ("idm", 30, [20]), ("", 0, [20])]
-)
-def test_with_planners_fewer_segments_are_simulated_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planner: str, batch: int, sizes: list[int]
-) -> None:
-    with StoreWriter(tmp_path / "store") as writer:
-        for seed in range(20):
-            writer.append(straight_road(3, seed=seed, steps=4))
-    data = SceneDataset(SegmentStore(tmp_path / "store"), 2, Bicycle(), routes=True)
-    given: list[list[int]] = []
-
-    def nothing(_: Any, tasks: list[list[int]], *__: Any) -> Iterator[Any]:
-        given.extend(tasks)
-        yield from ()
-
-    monkeypatch.setattr(saving, "shared", nothing)
-    config = EvaluateConfig(rollouts=2, branches=2, batch=batch)
-    save_simulation(tmp_path / "out", make_agent(), data, config, planner=planner)
-    assert [len(items) for items in given] == sizes
 
 
 def spoiled() -> Any:

@@ -3,7 +3,7 @@
 Source: Dauner et al., "NAVSIM: Data-driven non-reactive autonomous vehicle simulation and benchmarking", NeurIPS
 2024, section 3.2 and its supplement; limits of comfort as in nuPlan (Karnchanachari et al., ICRA 2024). Three things
 differ: progress is relative to the log's, not to that of the planner PDM-Closed; whether the planner is at fault
-is decided by the rules of ``docs/rollouts.md``; derivatives are fitted over 1.5 s of whatever step a segment has.
+is decided by the rules of ``docs/metrics.md``; derivatives are fitted over 1.5 s of whatever step a segment has.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ from symphony.metrics import (
 )
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.rollouts.crowd import crowd_dataset
-from symphony.rollouts.driving import Simulation, search_kind, simulate_batch
+from symphony.rollouts.driving import Simulation, simulate_batch
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.unroll import Rollouts, existing
 from symphony.rollouts.workers import batches, naming, segments_together, shared
@@ -186,7 +186,7 @@ def evaluate_dataset(
     hows = [config] + [once] * (len(everyone) - 1)
     horizon = dataset.decisions * dataset.dt
     found = [
-        Evaluation(one.name, RolloutMetrics(), how, acting, search_kind(one, how), horizon=horizon)
+        Evaluation(one.name, RolloutMetrics(), how, acting, one.plan(how).kind, horizon=horizon)
         for one, how in zip(everyone, hows, strict=True)
     ]
     for path in config.metric:

@@ -99,8 +99,7 @@ def simulation(
     policy = _placeholder(scenes) if agent.policy is None else agent.policy
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
-    kind = search_kind(agent, config)
+    kind, trees, branches, taken, settings = agent.plan(config)
     searches = kind not in ("none", "log")
     guards = [NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")]
     actor = acting(guards[0], env, config)
@@ -129,7 +128,7 @@ def simulation(
     if egos is not None:
         if kind == "backtrack":
             raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
-        planned = egos.begin(env, start, seed=config.seed, forked=searches)
+        planned = EgoPolicy(env, egos, start, config.seed, forked=searches)
         actor = TensorDictSequential(actor, planned)
     if not searches:
         noise = SeededNoise(config.seed, env.dynamics.numbers)
@@ -156,7 +155,7 @@ def simulation(
                 seed=config.seed,
                 rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
-                score=config.looks_for(agent.search),
+                score=settings.score,
                 leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
@@ -299,43 +298,13 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
     return found._replace(rollouts=kept, failed=failed)
 
 
-def search_kind(agent: Agent, config: EvaluateConfig) -> str:
-    """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
-    if agent.policy is None:
-        return "log"
-    blind = config.looks_for(agent.search) == "discriminator" and agent.discriminator is None
-    if config.search == "agent":
-        return agent.search.way if agent.searches and not blind else "none"
-    if config.search != "none" and blind:
-        raise ConfigError(
-            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
-            "score: --score flags or rule"
-        )
-    return config.search
-
-
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
-    planner once for each branch.
+    planner once for each branch; trees where there shall be branches.
     """
-    asked = config.search != "agent" or config.branches or config.trees > 1
-    return config if asked else dataclasses.replace(config, search="none")
-
-
-def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
-    """Trees per segment, branches per tree, and rollouts taken from each tree."""
-    kind = search_kind(agent, config)
-    if kind in ("none", "log", "backtrack"):
-        return config.rollouts, 1, 1
-    branches = config.pruning(agent.search).test_branches
-    if kind == "best":
-        return config.rollouts, branches, 1
-    taken = config.rollouts // config.trees
-    if taken > branches:
-        raise ConfigError(
-            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-        )
-    return config.trees, branches, taken
+    if config.search != "agent":
+        return config
+    return dataclasses.replace(config, search="tree" if config.branches or config.trees > 1 else "none")
 
 
 def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
@@ -345,12 +314,11 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
     rollouts than a tree has branches come from as few trees as that takes.
     """
-    kind, least = search_kind(agent, config), -(-runs // segments)
-    branches = config.pruning(agent.search).test_branches
+    plan, least = agent.plan(dataclasses.replace(config, rollouts=config.trees)), -(-runs // segments)
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
-        trees = max(config.trees, -(-each // branches)) if kind == "tree" else 1
+        trees = max(config.trees, -(-each // plan.branches)) if plan.kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
     exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)

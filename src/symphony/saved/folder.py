@@ -1,4 +1,4 @@
-"""The folder that saved rollouts lie in: ``docs/rollouts.md`` describes the format."""
+"""The folder that saved rollouts lie in: ``docs/formats.md`` describes the format."""
 
 from __future__ import annotations
 

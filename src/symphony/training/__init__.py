@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from symphony.imports import lazily
-from symphony.training.processes import Processes, processes
 
 if TYPE_CHECKING:
+    from symphony.training.processes import Processes
     from symphony.training.trainer import Phase, Trainer, Updates, cosine
 
-__all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine", "processes"]
+__all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine"]
 
 __getattr__, __dir__ = lazily(__name__)
