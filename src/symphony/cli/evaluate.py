@@ -152,7 +152,7 @@ class Evaluate:
         record: dict[str, Any],
     ) -> dict[str, Any]:
         """Parts of the record with the WOSAC score."""
-        from symphony.cli.wosac_evaluate import print_wosac
+        from symphony.cli.wosac import print_wosac
         from symphony.wosac.evaluate import evaluate_wosac, wosac_parts
 
         with segments_bar(f"WOSAC score of {agent.name}") as advance:
