@@ -11,20 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers_agents import small
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig, WosacSettings
-from symphony.data.resample import resample
 from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.comparison import WOSAC, compare
 from symphony.evaluation.entries import Entry
 from symphony.evaluation.formats import as_markdown
-from symphony.wosac.evaluate import THINNED, evaluate_wosac, simulated_how
+from symphony.wosac.evaluate import evaluate_wosac, simulated_how
 from symphony.wosac.passing import order_of, passing_gaps, passing_pairs
 from symphony.wosac.scorer import SimulatedRollouts, score
 from symphony.wosac.scorer.scenario import STATES
@@ -51,17 +49,6 @@ def test_settings_are_those_of_the_evaluation() -> None:
     for wrong in (0.5, 8.1, 2.55, math.nan):
         with pytest.raises(ConfigError, match="horizon is 1 to 8 s"):
             WosacSettings(horizon=wrong)
-
-
-def test_there_is_a_thinned_playback_where_the_store_is_finer_than_the_agent(tmp_path: Path) -> None:
-    segment = straight_road(num_agents=2)
-    fill(tmp_path / "fine", [resample(segment, 0.1)])
-    fill(tmp_path / "coarse", [segment])
-    settings = replace(PLAIN, horizon=2.0)
-    for name, rate, more in (("fine", 10.0, [THINNED]), ("coarse", 5.0, [])):
-        found = evaluate_wosac(small(), SegmentStore(tmp_path / name), [0], settings)
-        assert list(found.results) == ["playback", *more, "constant_velocity", "random", "tiny"]
-        assert (found.rates, found.objects) == ([rate], [2])
 
 
 # --- who goes first ---
@@ -111,7 +98,7 @@ def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert said in capsys.readouterr().out
     record = json.loads(out.read_text())
     assert (record["objects"], record["hertz"]) == (6, [5.0])
-    assert list(record["agents"]) == ["playback", "constant_velocity", "random", AGENT]
+    assert list(record["agents"]) == ["playback", "constant_velocity", "idm", "random", AGENT]
     assert record["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 2.0}
     for numbers in record["agents"].values():
         each = [one["metametric"] for one in numbers["segments"].values()]
@@ -238,10 +225,11 @@ def test_the_table_of_scores(
     assert main(["wosac", "table", str(two), str(one), "--names", "two", "one"]) == 0
     lines = capsys.readouterr().out.splitlines()
     names = [line.split("|")[1].strip() for line in lines if line.startswith("| ")]
-    assert names == ["", "---", "log playback", "constant velocity", "random", "two", "one"]
+    drivers = ["log playback", "constant velocity", "intelligent driver model", "random"]
+    assert names == ["", "---", *drivers, "two", "one"]
     assert "2 run segments of 2 recordings with 4 scored objects" in lines[-1]
     assert "at 5 Hz" in lines[-1]
-    row = wosac_table([read_wosac(one)]).splitlines()[5].split("|")
+    row = wosac_table([read_wosac(one)]).splitlines()[6].split("|")
     assert row[1].strip() == f"{RANDOM}, no search"
     numbers = record["wosac"]["agents"][RANDOM]
     for column, cell in zip(COLUMNS, row[2:], strict=False):

@@ -96,9 +96,10 @@ class Score:
 @app.command(name="evaluate")
 @dataclass(frozen=True)
 class Evaluate:
-    """Simulate 32 rollouts of every run segment and score them, beside log playback, constant velocity and random.
+    """Simulate 32 rollouts of every run segment and score them, beside those of baselines.
 
-    The agent drives all vehicles; pedestrians and cyclists keep their velocity. Standard errors are over recordings.
+    The agent drives all vehicles but those that stand with no green light ahead, which stay; pedestrians and cyclists
+    keep about their velocity. Standard errors are over recordings.
     """
 
     agent: Agent
@@ -170,8 +171,9 @@ class Table:
 class Submit:
     """Simulate 32 rollouts of every scenario of the Waymo Open Motion Dataset and write them as a submission.
 
-    The agent drives all vehicles; pedestrians and cyclists keep their velocity. What happens after the current step
-    of a scenario is not looked at, so the test set will do. See docs/wosac.md.
+    The agent drives all vehicles but those that stand with no green light ahead, which stay; pedestrians and cyclists
+    keep about their velocity. What happens after the current step of a scenario is not looked at, so the test set
+    will do. See docs/wosac.md.
     """
 
     agent: Agent

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,14 +32,13 @@ from symphony.wosac.scorer import (
     check_scored,
     score,
 )
-from symphony.wosac.scorer.config import DT, FUTURE, ROLLOUTS
+from symphony.wosac.scorer.config import FUTURE, ROLLOUTS
 from symphony.wosac.segments import log_playback, wosac_scenario, wosac_window
 from symphony.wosac.simulate import constant_velocity, wosac_rollouts
 
-THINNED = "playback_thinned"
-"""Log playback of the steps at which the agent decides, interpolated between them as its rollouts are."""
-WOSAC_BASELINES = (BASELINES[0], THINNED, BASELINES[1], "random")
-"""Scored beside every agent: log playback, constant velocity, and vehicles that act at random."""
+WOSAC_BASELINES = (*BASELINES, "idm", "random")
+"""Scored beside every agent: log playback, constant velocity, the intelligent driver model along the lanes, and
+vehicles that act at random."""
 
 
 class SegmentResult(NamedTuple):
@@ -179,9 +177,6 @@ def evaluate_wosac(
 ) -> WosacEvaluation:
     """Score an agent on run segments of a store, and beside it :data:`WOSAC_BASELINES`.
 
-    Where the store has shorter steps than the agent decides in, there is also :data:`THINNED`: what the agent's rate
-    costs by itself.
-
     Args:
         agent: drives the vehicles.
         store: of segments with any time step.
@@ -203,10 +198,9 @@ def evaluate_wosac(
     if not items:
         raise DataError("the store holds no run segments", file=store.path)
     how = simulated_how(agent, settings) if agent.policy is not None else {"search": "log"}
-    names = [name for name in WOSAC_BASELINES if baselines and name not in (THINNED, agent.name)]
+    names = [name for name in WOSAC_BASELINES if baselines and name != agent.name]
     agents = [*(load_agent(name, settings.device) for name in names), agent]
-    thinned = _thinned(agent, store, items, settings.future) if baselines else 1
-    scorer = _SegmentScorer(agents, store, settings, config, thinned, strict)
+    scorer = _SegmentScorer(agents, store, settings, config, strict)
     scored: list[tuple[int, _Scored]] = []
     left_out: list[Skip] = []
     with closing(shared(scorer, [[item] for item in items], settings.config(1, 0))) as outcomes:
@@ -218,7 +212,7 @@ def evaluate_wosac(
             progress(done, len(items))
     if not scored:
         raise left_out[0].error
-    order = sorted(scored[0][1].results, key=lambda name: (*WOSAC_BASELINES, name).index(name))
+    order = sorted((one.name for one in agents), key=lambda name: (*WOSAC_BASELINES, name).index(name))
     return WosacEvaluation(
         config=config,
         agent=agent.name,
@@ -258,16 +252,6 @@ def _prepared(segment: RunSegment, future: int, config: WosacConfig) -> tuple[Ru
     return window, scenario
 
 
-def _thinned(agent: Agent, store: SegmentStore, items: Sequence[int], future: int = FUTURE) -> int:
-    """Steps of 0.1 s to a decision of the agent, where the store has all of them and a rollout whole decisions; 1
-    where not.
-    """
-    if agent.spec is None or (store.time_steps[list(items)] > DT + 1e-6).any():
-        return 1
-    every = round(agent.spec.dt / DT)
-    return every if abs(every * DT - agent.spec.dt) < 1e-6 and future % every == 0 else 1
-
-
 class _Scored(NamedTuple):
     """The recording of a run segment, how many of its objects are scored, and the results by agent."""
 
@@ -284,7 +268,6 @@ class _SegmentScorer:
     store: SegmentStore
     settings: WosacSettings
     config: str
-    thinned: int
     strict: bool
 
     def __call__(self, items: list[int]) -> _Scored | Skip:
@@ -298,26 +281,19 @@ class _SegmentScorer:
             return Skip.of(error, segment.file, segment.segment_id)
         pairs = passing_pairs(window)
         found = {}
-        for name, make in self._makers(window).items():
+        for agent in self.agents:
             began = time.process_time()
-            made = make()
+            made = self._made(agent, window)
             seconds = time.process_time() - began
             scores = score(scenario, made, CHALLENGES[self.config])
-            found[name] = SegmentResult(scores, passing_gaps(window, pairs, made), seconds)
+            found[agent.name] = SegmentResult(scores, passing_gaps(window, pairs, made), seconds)
         return _Scored(segment.group or segment.segment_id, len(scenario.evaluated), found)
 
-    def _makers(self, window: RunSegment) -> dict[str, Callable[[], SimulatedRollouts]]:
-        makers: dict[str, Callable[[], SimulatedRollouts]] = {}
-        for agent in self.agents:
-            if agent.policy is None:
-                makers[agent.name] = partial(log_playback, window)
-            elif agent.name == BASELINES[1]:
-                makers[agent.name] = partial(constant_velocity, window, self.settings.future)
-            else:
-                # What a search is told concerns the agent alone: the last one.
-                plain = dataclasses.replace(self.settings, search="none")
-                settings = self.settings if agent is self.agents[-1] else plain
-                makers[agent.name] = partial(wosac_rollouts, agent, window, settings)
-        if self.thinned > 1:
-            makers[THINNED] = partial(log_playback, window, self.thinned)
-        return makers
+    def _made(self, agent: Agent, window: RunSegment) -> SimulatedRollouts:
+        if agent.policy is None:
+            return log_playback(window)
+        if agent.name == BASELINES[1]:
+            return constant_velocity(window, self.settings.future)
+        # What a search is told concerns the agent alone, which is the last one.
+        plain = dataclasses.replace(self.settings, search="none")
+        return wosac_rollouts(agent, window, self.settings if agent is self.agents[-1] else plain)

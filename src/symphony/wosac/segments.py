@@ -11,7 +11,6 @@ from symphony.data.segment import RunSegment, SignalState
 from symphony.errors import DataError
 from symphony.wosac.scorer import SimulatedRollouts, WosacScenario
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
-from symphony.wosac.simulate import between_decisions
 
 _AWAY, _APART = 1e5, 1e3
 """Metres from the origin, and from one another, at which agents do not meet anyone."""
@@ -90,28 +89,12 @@ def wosac_scenario(window: RunSegment) -> WosacScenario:
     )
 
 
-def log_playback(window: RunSegment, every: int = 1) -> SimulatedRollouts:
-    """32 times the log of a :func:`wosac_window`; agents that it does not see are far away from everyone.
-
-    Args:
-        window: the log.
-        every: take one in so many steps, and between valid ones interpolate as in
-            :func:`symphony.wosac.simulate.wosac_rollouts`; a divisor of the number of future steps.
-    """
-    rows = np.flatnonzero(window.valid[:, CURRENT])
-    valid = window.valid[rows, CURRENT:]
-    future = valid.shape[1] - 1
-    place = (window.position[rows, CURRENT:] + window.origin).astype(np.float64)
-    heading = window.heading[rows, CURRENT:].astype(np.float64)
-    if every > 1:
-        states = np.concatenate([place[..., :2], heading[..., None]], -1).swapaxes(0, 1)
-        between = between_decisions(states[None, ::every], every * DT, future)[0]
-        steps = np.arange(1, future + 1)
-        known = valid[:, steps // every * every] & valid[:, -(-steps // every) * every]
-        place[:, 1:, :2] = np.where(known[..., None], between[..., :2], place[:, 1:, :2])
-        heading[:, 1:] = np.where(known, between[..., 2], heading[:, 1:])
+def log_playback(window: RunSegment) -> SimulatedRollouts:
+    """32 times the log of a :func:`wosac_window`; agents that it does not see are far away from everyone."""
+    rows, later = np.flatnonzero(window.valid[:, CURRENT]), slice(CURRENT + 1, None)
+    place = (window.position[rows, later] + window.origin).astype(np.float64)
     away = np.zeros((len(rows), 1, 3))
     away[:, 0, 0] = _AWAY + _APART * np.arange(len(rows))
-    place = np.where(valid[:, 1:, None], place[:, 1:], away + window.origin)
-    states = np.concatenate([place, heading[:, 1:, None]], -1)
+    place = np.where(window.valid[rows, later, None], place, away + window.origin)
+    states = np.concatenate([place, window.heading[rows, later, None].astype(np.float64)], -1)
     return SimulatedRollouts(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))

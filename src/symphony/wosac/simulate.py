@@ -1,8 +1,9 @@
 """Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of everyone, 8 s (or less) at 10 Hz.
 
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
-latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive; everyone
-else goes on at the velocity of the current step.
+latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive. Those that
+stand stay, and people walk on; whoever drives sees the latter at constant velocity. See
+:mod:`symphony.rollouts.bystanders`.
 
 Legend: n agents valid at the current step, N vehicles among them, R rollouts, F future steps (80), U decisions and
 the first state.
@@ -31,6 +32,7 @@ from symphony.envs.routes import route_table
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
+from symphony.rollouts.bystanders import standing, walks
 from symphony.rollouts.driving import planned_trees, search_kind, simulation
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.workers import shared
@@ -66,11 +68,14 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
     """
     if agent.policy is None:
         raise ConfigError("log playback knows the future and can't be simulated")
-    rows = _present(segment)
+    rows, held = _present(segment), standing(segment)
+    segment = segment.replace(velocity=np.where(held[:, None, None], np.float32(0), segment.velocity))
     dt = DT if agent.spec is None else agent.spec.dt
     start = history_only(segment, dt, settings.future)
-    vehicles = np.flatnonzero(start.agent_type == AgentType.VEHICLE)
+    is_vehicle = start.agent_type == AgentType.VEHICLE
+    vehicles, people = np.flatnonzero(is_vehicle & ~held[rows]), np.flatnonzero(~is_vehicle)
     states = _extrapolated(segment, rows, settings.future)
+    states[:, people] = walks(segment, rows[people], ROLLOUTS, settings.future, settings.seed)
     if len(vehicles):
         try:
             log = future_log(segment) if settings.logged_goals else None
@@ -244,7 +249,8 @@ def _driven(
     scenes = scenes.to(torch.device(settings.device))
     one = settings.config(1, 0)
     if search_kind(agent, one) == "none":
-        plans = [settings.config(ROLLOUTS, settings.seed)]
+        # What a rule drives is alike in all of them.
+        plans = [settings.config(1 if agent.rule else ROLLOUTS, settings.seed)]
     else:
         # All branches of all trees together would take gigabytes.
         _, branches, _ = planned_trees(agent, one)
@@ -254,7 +260,8 @@ def _driven(
             for first in range(0, ROLLOUTS, trees)
         ]
     found = [simulation(agent, scenes, plan).rollouts.state[0, ..., :3].cpu() for plan in plans]
-    return torch.cat(found).double().numpy()
+    states = torch.cat(found).double().numpy()
+    return np.repeat(states, ROLLOUTS // len(states), 0)
 
 
 def _rollouts(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> SimulatedRollouts:

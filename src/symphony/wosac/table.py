@@ -32,8 +32,8 @@ HORIZON = 8.0
 """Seconds that the challenge has simulated; a record with others says so."""
 _WORDS = {
     "playback": "log playback",
-    "playback_thinned": "log playback at the agent's rate",
     "constant_velocity": "constant velocity",
+    "idm": "intelligent driver model",
     "random": "random",
 }
 
