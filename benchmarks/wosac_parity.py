@@ -35,8 +35,8 @@ def feature_differences(found: WosacFeatures, file: Path) -> dict[str, float]:
     largest = {}
     with np.load(file, allow_pickle=False) as official:
         for prefix, part in (("log", found.log), ("sim", found.simulated)):
-            for name in part.__dataclass_fields__:
-                ours, theirs = getattr(part, name).numpy(), official[f"{prefix}_{name}"]
+            for name, values in part.items():
+                ours, theirs = values.numpy(), official[f"{prefix}_{name}"]
                 if ours.dtype == bool:
                     apart = float((ours != theirs).sum())
                 else:

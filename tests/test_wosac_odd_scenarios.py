@@ -194,8 +194,8 @@ def test_features_and_scores_are_those_of_a_plain_computation(kind: str) -> None
     found = compute_features(scenario, rollouts)
     own: list[dict[str, NDArray[Any]]] = []
     for got, expected in ((found.log, log), (found.simulated, simulated)):
-        arrays = {name: getattr(got, name).numpy() for name in (*BINS, *FLAGS.values())}
-        arrays["ade"] = got.average_displacement_error.numpy()
+        arrays = {name: got[name].numpy() for name in (*BINS, *FLAGS.values())}
+        arrays["ade"] = got["average_displacement_error"].numpy()
         own.append(arrays)
         for name, values in expected.items():
             # float32 against float64: of speeds from positions some tens of metres out, a few thousandths.

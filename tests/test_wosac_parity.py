@@ -117,9 +117,8 @@ def test_features(case: tuple[str, Arrays, WosacFeatures]) -> None:
     assert features.object_type.tolist() == expected["eval_object_type"].tolist()
     equal(features.log_valid, expected["log_valid"])
     for prefix, source in (("log", features.log), ("sim", features.simulated)):
-        for name in source.__dataclass_fields__:
-            found, wanted = getattr(source, name), expected[f"{prefix}_{name}"]
-            close(found, wanted, rtol=1e-3, atol=1e-3, err_msg=f"{prefix}_{name}")
+        for name, found in source.items():
+            close(found, expected[f"{prefix}_{name}"], rtol=1e-3, atol=1e-3, err_msg=f"{prefix}_{name}")
 
 
 @pytest.mark.parametrize("year", CONFIGS)

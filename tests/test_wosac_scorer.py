@@ -41,11 +41,7 @@ from symphony.wosac.scorer.scoring import bin_of, flag_log_likelihood, histogram
 def every(features: WosacFeatures) -> dict[str, NDArray[Any]]:
     """All features by name."""
     sources = {"log": features.log, "sim": features.simulated}
-    return {
-        f"{side}_{name}": getattr(source, name).numpy()
-        for side, source in sources.items()
-        for name in source.__dataclass_fields__
-    }
+    return {f"{side}_{name}": v.numpy() for side, source in sources.items() for name, v in source.items()}
 
 
 def taken(
@@ -166,7 +162,7 @@ def test_playback_has_the_features_of_the_log_and_runs_the_light() -> None:
     found = every(features)
     for name in (name for name in found if name.startswith("log_")):
         np.testing.assert_array_equal(np.stack([found[name]] * 2), found[name.replace("log_", "sim_")])
-    assert features.simulated.traffic_light_violation_per_step.any(-1).tolist() == [[True, False]] * 2
+    assert features.simulated["traffic_light_violation_per_step"].any(-1).tolist() == [[True, False]] * 2
 
 
 def test_order_and_who_is_not_there_change_nothing() -> None:
@@ -311,12 +307,13 @@ def test_steps_at_which_the_log_is_not_valid_do_not_count() -> None:
     hidden = features.log_valid.clone()
     hidden[:, 40:60] = False
     masked = replace(features, log_valid=hidden)
-    wild, flags = features.log.distance_to_road_edge.clone(), features.simulated.offroad_per_step.clone()
+    wild = features.log["distance_to_road_edge"].clone()
+    flags = features.simulated["offroad_per_step"].clone()
     wild[:, 40:60], flags[..., 40:60] = 1e9, True
     changed = replace(
         masked,
-        log=replace(features.log, distance_to_road_edge=wild),
-        simulated=replace(features.simulated, offroad_per_step=flags),
+        log=features.log | {"distance_to_road_edge": wild},
+        simulated=features.simulated | {"offroad_per_step": flags},
     )
     assert score_features(changed) == score_features(masked) != score_features(features)
     shown = score_features(replace(changed, log_valid=features.log_valid))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -160,11 +160,8 @@ def _write_features(file: Path, features: WosacFeatures) -> None:
     """Write features as arrays: ``eval_object_id`` [E], ``log_valid`` [E, 80], and each feature of the log
     (``log_NAME``) and of the rollouts (``sim_NAME``, with a leading dimension of rollouts).
     """
-    arrays = {
-        f"{prefix}_{field.name}": getattr(source, field.name).numpy()
-        for prefix, source in (("log", features.log), ("sim", features.simulated))
-        for field in fields(source)
-    }
+    arrays: dict[str, Any] = {f"log_{name}": values.numpy() for name, values in features.log.items()}
+    arrays |= {f"sim_{name}": values.numpy() for name, values in features.simulated.items()}
     arrays |= {"eval_object_id": features.object_id.numpy(), "eval_object_type": features.object_type.numpy()}
     np.savez_compressed(file, log_valid=features.log_valid.numpy(), **arrays)
 

@@ -6,7 +6,7 @@ The definitions are in ``docs/wosac.md``, with the legal notice that goes with t
 from __future__ import annotations
 
 from symphony.wosac.scorer.config import CHALLENGES, Component, WosacConfig
-from symphony.wosac.scorer.features import StepFeatures, WosacFeatures, compute_features
+from symphony.wosac.scorer.features import WosacFeatures, compute_features
 from symphony.wosac.scorer.scenario import SimulatedRollouts, WosacScenario
 from symphony.wosac.scorer.scoring import check_scored, mean_scores, object_scores, score, score_features
 
@@ -14,7 +14,6 @@ __all__ = [
     "CHALLENGES",
     "Component",
     "SimulatedRollouts",
-    "StepFeatures",
     "WosacConfig",
     "WosacFeatures",
     "WosacScenario",

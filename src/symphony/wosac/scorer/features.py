@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,56 +22,27 @@ from symphony.wosac.scorer.scenario import STATES, SURFACE_STREET, SimulatedRoll
 
 
 @dataclass(frozen=True)
-class StepFeatures:
-    """Features of E objects at steps 11 to 90, of the log or of R rollouts.
-
-    Attributes:
-        linear_speed: m/s in space.
-        linear_acceleration: m/s², change of the speed.
-        angular_speed: rad/s.
-        angular_acceleration: rad/s².
-        distance_to_nearest_object: m, negative in a collision.
-        collision_per_step: whether it is negative.
-        time_to_collision: s, at most 5.
-        distance_to_road_edge: m, positive off the road.
-        offroad_per_step: whether it is positive.
-        traffic_light_violation_per_step: whether a red light is run.
-        average_displacement_error: [..., E] m from the log, over history and future.
-    """
-
-    linear_speed: Float[Tensor, "*rollout E 80"]
-    linear_acceleration: Float[Tensor, "*rollout E 80"]
-    angular_speed: Float[Tensor, "*rollout E 80"]
-    angular_acceleration: Float[Tensor, "*rollout E 80"]
-    distance_to_nearest_object: Float[Tensor, "*rollout E 80"]
-    collision_per_step: Bool[Tensor, "*rollout E 80"]
-    time_to_collision: Float[Tensor, "*rollout E 80"]
-    distance_to_road_edge: Float[Tensor, "*rollout E 80"]
-    offroad_per_step: Bool[Tensor, "*rollout E 80"]
-    traffic_light_violation_per_step: Bool[Tensor, "*rollout E 80"]
-    average_displacement_error: Float[Tensor, "*rollout E"]
-
-    def __getitem__(self, rollout: int | slice) -> StepFeatures:
-        return StepFeatures(*(getattr(self, field.name)[rollout] for field in fields(self)))
-
-
-@dataclass(frozen=True)
 class WosacFeatures:
-    """Features of a scenario's scored objects.
+    """Features of a scenario's E scored objects at steps 11 to 90, of the log and of R rollouts.
+
+    By name: ``linear_speed`` (m/s, in space), ``linear_acceleration`` (m/s², change of the speed), ``angular_speed``
+    (rad/s), ``angular_acceleration`` (rad/s²), ``distance_to_nearest_object`` (m, below 0 is ``collision_per_step``),
+    ``time_to_collision`` (s, at most 5), ``distance_to_road_edge`` (m, above 0 is ``offroad_per_step``),
+    ``traffic_light_violation_per_step``, ``average_displacement_error`` ([..., E], m from the log, with the history).
 
     Attributes:
         object_id: [E] ascending.
         object_type: [E].
         log_valid: [E, 80] where the log is valid.
-        log: of the log.
-        simulated: of R rollouts.
+        log: [E, 80] by name.
+        simulated: [R, E, 80] by name.
     """
 
     object_id: Int[Tensor, " E"]
     object_type: Int[Tensor, " E"]
     log_valid: Bool[Tensor, "E 80"]
-    log: StepFeatures
-    simulated: StepFeatures
+    log: dict[str, Tensor]
+    simulated: dict[str, Tensor]
 
 
 def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> WosacFeatures:
@@ -92,8 +63,8 @@ def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> Wo
             object_id=torch.from_numpy(scenario.object_id[rows]),
             object_type=torch.from_numpy(scenario.object_type[rows]),
             log_valid=tracks.valid[0, : tracks.evaluated, CURRENT + 1 :],
-            log=features[0],
-            simulated=features[1:],
+            log={name: values[0] for name, values in features.items()},
+            simulated={name: values[1:] for name, values in features.items()},
         )
 
 
@@ -153,8 +124,8 @@ def _tracks(scenario: WosacScenario, rollouts: SimulatedRollouts) -> _Tracks:
     return _Tracks(rows, len(scored), x, y, z, heading, torch.from_numpy(valid), size)
 
 
-def _features(tracks: _Tracks, scenario: WosacScenario) -> StepFeatures:
-    """Of the log and all rollouts, [R, E, 80]."""
+def _features(tracks: _Tracks, scenario: WosacScenario) -> dict[str, Tensor]:
+    """Features of the log, in row 0, and of all rollouts, [R, E, 80]."""
     count, valid = tracks.evaluated, tracks.valid
     future, scored = slice(CURRENT + 1, None), (slice(None), slice(tracks.evaluated))
     x, y, z, heading = (values[scored] for values in (tracks.x, tracks.y, tracks.z, tracks.heading))
@@ -182,19 +153,19 @@ def _features(tracks: _Tracks, scenario: WosacScenario) -> StepFeatures:
     )
     away = sum((axis - axis[:1]).square() for axis in (x, y, z)).sqrt()  # type: ignore[union-attr]
     known = valid[0, :count]
-    return StepFeatures(
-        linear_speed=linear[..., future],
-        linear_acceleration=(central_difference(linear) / DT)[..., future],
-        angular_speed=turning[..., future],
-        angular_acceleration=turning_change[..., future],
-        distance_to_nearest_object=nearest,
-        collision_per_step=nearest < 0,
-        time_to_collision=time_to_collision(boxes, count),
-        distance_to_road_edge=edge,
-        offroad_per_step=edge > 0,
-        traffic_light_violation_per_step=violations[..., future],
-        average_displacement_error=torch.where(known, away, 0.0).sum(-1) / known.sum(-1),
-    )
+    return {
+        "linear_speed": linear[..., future],
+        "linear_acceleration": (central_difference(linear) / DT)[..., future],
+        "angular_speed": turning[..., future],
+        "angular_acceleration": turning_change[..., future],
+        "distance_to_nearest_object": nearest,
+        "collision_per_step": nearest < 0,
+        "time_to_collision": time_to_collision(boxes, count),
+        "distance_to_road_edge": edge,
+        "offroad_per_step": edge > 0,
+        "traffic_light_violation_per_step": violations[..., future],
+        "average_displacement_error": torch.where(known, away, 0.0).sum(-1) / known.sum(-1),
+    }
 
 
 def central_difference(values: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch T"]:

@@ -66,7 +66,7 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGES["20
         _check(mask, name)
         found[name] = math.exp(values[mask].double().mean().item())
     weight = {name: component.weight for name, component in config.items()}
-    displacement = features.simulated.average_displacement_error
+    displacement = features.simulated["average_displacement_error"]
     return {
         "metametric": sum(weight[name] * value for name, value in found.items()),
         **{f"{name}_likelihood": value for name, value in found.items()},
@@ -120,7 +120,7 @@ def object_scores(features: WosacFeatures, config: WosacConfig = CHALLENGES["202
         mask = _mask(features.log_valid, features.object_type, name).view(len(values), -1)
         total = torch.where(mask, values.view(len(values), -1), 0.0).sum(-1)
         parts[f"{name}_likelihood"] = (total / mask.sum(-1)).exp().tolist()
-    displacement = features.simulated.average_displacement_error
+    displacement = features.simulated["average_displacement_error"]
     parts["average_displacement_error"] = displacement.mean(0).tolist()
     parts["min_ade"] = displacement.amin(0).tolist()
     for name, flag in _RATES.items():
@@ -136,7 +136,7 @@ def log_likelihoods(features: WosacFeatures, config: WosacConfig) -> dict[str, T
             log, simulated = _ever(features, _FLAGS[name], vehicles=name == "traffic_light_violation")
             found[name] = flag_log_likelihood(log, simulated)
         else:
-            log, simulated = getattr(features.log, name), getattr(features.simulated, name)
+            log, simulated = features.log[name], features.simulated[name]
             found[name] = histogram_log_likelihood(log, simulated, component.bins)
     return found
 
@@ -205,7 +205,7 @@ def _ever(features: WosacFeatures, flag: str, *, vehicles: bool = False) -> tupl
     vehicles alone, if asked for.
     """
     log, simulated = (
-        (getattr(source, flag) & features.log_valid).any(-1) for source in (features.log, features.simulated)
+        (source[flag] & features.log_valid).any(-1) for source in (features.log, features.simulated)
     )
     kind = (features.object_type == VEHICLE) | (not vehicles)
     return log & kind, simulated & kind
