@@ -42,7 +42,8 @@ def test_settings_are_those_of_the_evaluation() -> None:
     assert (made.rollouts, made.trees, made.seed) == (32, 32, 9)
     assert (made.branches, made.rule, made.threshold, made.goals) == (3, "replace", 1.0, "branch")
     # What is left open is the agent's own, and the record says what that is.
-    how = simulated_how(load_agent(AGENT), WosacSettings.of(EvaluateConfig(action_temperature=0.5)))
+    settings = WosacSettings.of(EvaluateConfig(search="tree", action_temperature=0.5))
+    how = simulated_how(load_agent(AGENT), settings)
     assert {"rule": "replace", "goals": "branch", "action_temperature": 0.5}.items() <= how.items()
     with pytest.raises(ConfigError, match="score is one of"):
         WosacSettings.of(EvaluateConfig(score="flags"))
@@ -192,7 +193,7 @@ def test_what_cannot_be_scored_is_refused_before_the_work(
     assert said.out == ""
     # Whoever simulates must not know what is scored.
     assert main(["evaluate", AGENT, *data, "--score", "flags"]) != 0
-    assert "score is one of discriminator, rule" in capsys.readouterr().err
+    assert "score is one of agent, discriminator, rule" in capsys.readouterr().err
 
 
 def test_the_record_has_the_score_and_tables_have_its_columns(record: dict[str, Any]) -> None:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from symphony.cli.helps import TrustCode
-from symphony.cli.tables import print_table, write_numbers
+from symphony.cli.shared import TrustCode, at_least, print_table, progress, segment_indices, write_numbers
 from symphony.config import WosacSettings
 from symphony.config.wosac import FUTURE
 from symphony.errors import ConfigError, DataError, printable
@@ -66,8 +65,7 @@ class Score:
     """Processes that score."""
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"--workers must be at least 1, is {self.workers}")
+        at_least(1, workers=self.workers)
         if self.per_object and self.json is None:
             raise ConfigError("--per-object goes with --json")
 
@@ -76,11 +74,10 @@ class Score:
         from rich.console import Console
         from rich.table import Table
 
-        from symphony.cli.evaluate import segments_bar
         from symphony.wosac.files import score_files
 
         options = {key: value for key, value in vars(self).items() if key not in ("scenario", "json")}
-        with segments_bar("scoring") as advance:
+        with progress("scoring", "scenarios") as advance:
             found, skipped = score_files(self.scenario, **options, progress=advance)
         title = f"WOSAC {self.config}, {found['scenario_count']} scenarios"
         table = Table(show_header=False, box=None, pad_edge=False, title=title, title_justify="left")
@@ -89,8 +86,7 @@ class Score:
                 table.add_row(name, f"{value:.6f}")
         print_table(table, Console(stderr=str(self.json) == "-"))
         print_left_out(skipped)
-        if self.json is not None:
-            write_numbers(self.json, found)
+        write_numbers(self.json, found)
 
 
 @app.command(name="evaluate")
@@ -124,8 +120,6 @@ class Evaluate:
     def run(self) -> None:
         """Simulate and score, showing how far it is, and report."""
         from symphony.agents import load_agent
-        from symphony.cli.evaluate import segments_bar
-        from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
         from symphony.wosac.evaluate import evaluate_wosac
 
@@ -133,11 +127,10 @@ class Evaluate:
         store = SegmentStore(self.data)
         items = segment_indices(store, self.segments) or list(range(len(store)))
         options = {"baselines": self.baselines, "strict": self.strict}
-        with segments_bar(f"scoring {agent.name}") as advance:
+        with progress(f"scoring {agent.name}") as advance:
             found = evaluate_wosac(agent, store, items, self.settings, self.config, advance, **options)
         print_wosac(found, aside=str(self.json) == "-")
-        if self.json is not None:
-            write_numbers(self.json, found.record())
+        write_numbers(self.json, found.record())
 
 
 @app.command(name="table")
@@ -189,8 +182,7 @@ class Submit:
     settings: Annotated[WosacSettings, tyro.conf.arg(name="")] = field(default_factory=WosacSettings)
 
     def __post_init__(self) -> None:
-        if self.shards < 0:
-            raise ConfigError(f"--shards must not be negative, is {self.shards}")
+        at_least(0, shards=self.shards)
         if self.settings.logged_goals:
             raise ConfigError(
                 "a submission must not know the routes of the log: --logged-goals is not for it"
@@ -201,7 +193,6 @@ class Submit:
     def run(self) -> None:
         """Simulate, showing how far it is, and write."""
         from symphony.agents import load_agent
-        from symphony.cli.evaluate import segments_bar
         from symphony.wosac.simulate import simulated_scenarios
         from symphony.wosac.submission import required_agents, write_submission
 
@@ -211,7 +202,7 @@ class Submit:
         shards = self.shards or min(SHARDS, total)
         if shards > total:
             raise ConfigError(f"{total} scenarios don't fill {shards} shards")
-        with segments_bar(f"simulating {agent.name}") as advance:
+        with progress(f"simulating {agent.name}", "scenarios") as advance:
             found = simulated_scenarios(agent, self.data, self.settings, lambda done: advance(done, total))
             write_submission(found, self.meta, self.out, shards)
         check = f"symphony wosac validate {self.out} --scenario {self.data}"

@@ -64,7 +64,7 @@ def walks(
     stream = fold_in(torch.tensor(stream_of(segment.segment_id)), Stream.WALKS)
     agents = torch.from_numpy(segment.agent_id[rows].astype(np.int64))
     line = fold_in(fold_in(stream, torch.arange(rollouts)[:, None]), agents)[..., None]
-    drawn = uniform(seed, line, torch.arange(steps + 2), dtype=torch.float64).numpy()
+    drawn = uniform(seed, line, torch.arange(steps + 2)).double().numpy()
     pace, course = 1 + PACE * (2 * drawn[..., 0] - 1), COURSE * (2 * drawn[..., 1] - 1)
     velocity = segment.velocity[rows, now].astype(np.float64)
     cos, sin = pace * np.cos(course), pace * np.sin(course)

@@ -21,7 +21,6 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import BASELINES
 from symphony.evaluation.paired import clustered_mean
 from symphony.metrics import OrderStatistics
-from symphony.rollouts.driving import search_kind
 from symphony.rollouts.workers import shared
 from symphony.wosac.passing import PassingGaps, order_of, passing_gaps, passing_pairs
 from symphony.wosac.scorer import (
@@ -145,7 +144,7 @@ def wosac_parts(found: WosacEvaluation, record: Mapping[str, Any]) -> dict[str, 
 def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
     """What decides the rollouts, with what was left to the agent filled in."""
     config = settings.config(ROLLOUTS, settings.seed)
-    kind, pruning = search_kind(agent, config), config.pruning(agent.search)
+    kind, _, branches, _, pruning = agent.plan(config)
     replaces = kind == "backtrack" or (kind == "tree" and pruning.rule == "replace")
     said: dict[str, tuple[bool, Any]] = {
         "search": (True, kind),
@@ -153,8 +152,8 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
         "horizon": (settings.future != FUTURE, settings.horizon),
         "logged_goals": (agent.goals is not None, settings.logged_goals),
         "action_temperature": (settings.action_temperature != 1.0, settings.action_temperature),
-        "score": (kind != "none" and settings.score != "discriminator", settings.score),
-        "branches": (kind in ("tree", "best"), pruning.test_branches),
+        "score": (kind != "none" and pruning.score != "discriminator", pruning.score),
+        "branches": (kind in ("tree", "best"), branches),
         "rule": (kind == "tree", pruning.rule),
         "prune_every": (kind in ("tree", "backtrack"), pruning.prune_every),
         "goals": (kind == "tree", pruning.goals),
