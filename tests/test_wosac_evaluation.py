@@ -19,9 +19,8 @@ from symphony.config import EvaluateConfig, WosacSettings
 from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.comparison import WOSAC, compare
-from symphony.evaluation.entries import Entry
-from symphony.evaluation.formats import as_markdown
+from symphony.evaluation.formats import FORMATS
+from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.wosac.evaluate import evaluate_wosac, simulated_how
 from symphony.wosac.passing import order_of, passing_gaps, passing_pairs
 from symphony.wosac.scorer import SimulatedRollouts, score
@@ -208,7 +207,7 @@ def test_the_record_has_the_score_and_tables_have_its_columns(record: dict[str, 
     entries = [Entry(Path(m), {"method": m, "seed": 0}, m, kept) for m in ("bc", "bc_h")]
     table = compare(entries, "main")
     assert set(WOSAC) <= set(table.columns)
-    assert f"{record['wosac_metametric']:.3f}" in as_markdown(table)
+    assert f"{record['wosac_metametric']:.3f}" in FORMATS["markdown"](table)
     other = {key: value for key, value in kept.items() if not key.startswith("wosac")}
     assert not set(WOSAC) & set(compare([entries[0], replace(entries[1], record=other)], "main").columns)
     year = kept | {"wosac": kept["wosac"] | {"config": "2024"}}
