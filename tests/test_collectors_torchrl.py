@@ -41,7 +41,7 @@ def read_of_self(name: str) -> set[str]:
 
 def test_every_member_the_collector_reads_is_there(plain):
     read = read_of_self("BeamSearchCollector")
-    assert {"env", "policy", "postproc", "storing_device", "set_truncated"} <= read
+    assert {"env", "policy_device", "postproc", "storing_device", "set_truncated"} <= read
     private = {name for name in read if name.startswith("_")}
     assert not private, f"private members belong into _torchrl.PRIVATE: {private}"
     missing = sorted(name for name in {*read, *_torchrl.PRIVATE} if not hasattr(plain, name))

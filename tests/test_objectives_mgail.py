@@ -26,7 +26,7 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.keys import ACTION, NOISE, OBJECTS, OWN, POINTS, SCORE, STATE, VALID
 from symphony.modules import NoiseSampler, discriminator, displacement_policy
 from symphony.objectives import MGAILLoss
-from symphony.rollouts.search import ENDED, search
+from symphony.rollouts.search import search
 from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]
@@ -197,7 +197,7 @@ def test_the_gradient_is_that_through_the_surviving_branches(env, rule):
     result = search(env, policy, network, start.copy(), seed=5, rule=rule, prune_every=2)
     forked = not torch.equal(result.slots[:, 0], branch)
     assert forked == isinstance(rule, KeepBest)
-    counted = result.scores != ENDED
+    counted = result.alive[..., None].expand_as(result.scores)
     assert counted[0].all()
     assert not counted[1].all()
     total = result.scores[counted].mean()

@@ -139,6 +139,7 @@ def test_fates_are_those_of_the_search(parents: np.ndarray) -> None:
     result = BeamSearchResult(
         trajectories=None,  # type: ignore[arg-type]
         scores=nothing,
+        alive=nothing,
         slots=lineage(torch.from_numpy(parents)),
         totals=nothing,
         parents=torch.from_numpy(parents),

@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from symphony import keys
 from symphony.agents import Agent, build_agent
-from symphony.collectors import BeamSearchResult, KeepAll, KeepBest, beam_search, max_then_sum
+from symphony.collectors import BeamSearchResult, KeepAll, KeepBest, max_then_sum
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
@@ -32,7 +32,7 @@ from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.rollouts import simulate
 from symphony.rollouts.driving import simulated, simulation
-from symphony.rollouts.search import ENDED, flag_score, search
+from symphony.rollouts.search import flag_score, search
 from symphony.rollouts.unroll import Rollouts, draw_goals, rollouts_of
 
 EVERY = 2
@@ -189,8 +189,7 @@ def test_what_the_search_scored_is_what_the_discriminator_says_of_the_leaves(
     for states, scores in ((found.state, result.scores), (tree, result.simulated_scores)):
         expected = scored(env, agent, start, states)
         torch.testing.assert_close(scores[counted], expected[counted], atol=1e-6, rtol=1e-5)
-        assert (scores[~counted] == ENDED).all()
-        assert scores[counted].min() > ENDED / 2
+        assert (scores[~counted] == 0).all()
     assert not counted.all()
 
 
@@ -288,26 +287,6 @@ def test_longer_segments_beside_it_choose_no_leaves(
         periods = alone.search.slots.shape[-2]
         assert torch.equal(together.search.slots[item][:, :periods], alone.search.slots[0])
         assert torch.equal(together.search.scores[item][:, :, : steps - 1], alone.search.scores[0])
-
-
-@pytest.mark.parametrize("every", [2, 3, 5])
-def test_leaves_are_chosen_in_the_period_in_which_a_scene_ends(
-    dataset: SceneDataset, agent: Agent, every: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[Any] = []
-
-    def spy(*given: Any, **named: Any) -> BeamSearchResult:
-        seen.append(named["last_period"])
-        return beam_search(*given, **named)
-
-    monkeypatch.setattr("symphony.rollouts.search.beam_search", spy)
-    scenes = dataset.scenes(range(4))
-    simulation(searching(agent, prune_every=every), scenes, EvaluateConfig(rollouts=4, trees=2))
-    assert len(scenes.last_step.unique()) > 1
-    # A scene's last step begins at the one before it.
-    expected = [(last - 1) // every for last in scenes.last_step.tolist()]
-    assert all(found.tolist() == [[each] * 2 for each in expected] for found in seen)
-    assert seen
 
 
 def test_the_best_is_the_best_up_to_the_end(dataset: SceneDataset, agent: Agent) -> None:

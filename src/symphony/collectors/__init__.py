@@ -11,7 +11,17 @@ from symphony.collectors.beam_search import beam_search
 from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
 from symphony.collectors.result import BeamSearchResult, lineage
-from symphony.collectors.rules import GroupRule, KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
+from symphony.collectors.rules import (
+    GroupRule,
+    KeepAll,
+    KeepBest,
+    PruningRule,
+    ReplaceBad,
+    Resampling,
+    Residual,
+    Stratified,
+    Systematic,
+)
 from symphony.collectors.scores import Aggregate, KeyScore, max_then_sum, mean_then_sum
 
 __all__ = [
@@ -25,6 +35,9 @@ __all__ = [
     "KeyScore",
     "PruningRule",
     "ReplaceBad",
+    "Resampling",
+    "Residual",
+    "Stratified",
     "Systematic",
     "beam_search",
     "branch",

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from symphony.collectors.rules import sample_size
+
 
 @dataclass(frozen=True)
 class BeamSearchResult:
@@ -19,7 +21,9 @@ class BeamSearchResult:
 
     Attributes:
         trajectories: [*b, L, T] of the leaves, laid out and named as by ``env.rollout``, kept entries only.
-        scores: [*b, L, T, N] of the leaves' histories; `scores[..., t, :]` is of ``("next", ...)`` of step t.
+        scores: [*b, L, T, N] of the leaves' histories; `scores[..., t, :]` is of ``("next", ...)`` of step t, 0 after
+            the end of an episode.
+        alive: [*b, L, T] steps before (and with) the end of their episodes.
         slots: [*b, P, L] int64, the slot in which each period of each leaf's history was simulated.
         totals: [*b, P, S] aggregate of each period, by the slot that simulated it.
         parents: [*b, P, S] int64; after period p slot s was continued from slot `parents[..., p, s]`. The last
@@ -28,10 +32,16 @@ class BeamSearchResult:
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated.
+        log_weights: [*b, P, S] of a :class:`Resampling` rule, before each pruning: minus the totals since the row was
+            last resampled, by the temperature; None with other rules, like the following.
+        leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 where it resampled.
+        log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
+            bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
     """
 
     trajectories: TensorDictBase
     scores: Float[Tensor, "*b L T N"]
+    alive: Bool[Tensor, "*b L T"]
     slots: Int[Tensor, "*b P L"]
     totals: Float[Tensor, "*b P S"]
     parents: Int[Tensor, "*b P S"]
@@ -39,6 +49,9 @@ class BeamSearchResult:
     tree: TensorDictBase | None
     prune_every: int
     simulated_steps: int
+    log_weights: Float[Tensor, "*b P S"] | None = None
+    leaf_log_weights: Float[Tensor, "*b L"] | None = None
+    log_evidence: Float[Tensor, "*b"] | None = None
 
     @property
     def leaf_totals(self) -> Float[Tensor, "*b P L"]:
@@ -46,19 +59,24 @@ class BeamSearchResult:
         return self.totals.gather(-1, self.slots)
 
     @property
-    def ranking(self) -> Int[Tensor, "*b L"]:
-        """The leaves from best to worst by their last period, repeated copies of one history after all others."""
-        return ranking(self.totals[..., -1, :], self.slots[..., -1, :])
+    def sample_size(self) -> Float[Tensor, "*b P"] | None:
+        """Effective sample size before each pruning, between 1 and S."""
+        return None if self.log_weights is None else sample_size(self.log_weights)
+
+    @property
+    def descendants(self) -> Int[Tensor, "*b P S"]:
+        """How many of the leaves have what a slot simulated in a period in their history."""
+        return torch.zeros_like(self.parents).scatter_add(-1, self.slots, torch.ones_like(self.slots))
 
     @property
     def survived(self) -> Bool[Tensor, "*b P S"]:
         """Whether what a slot simulated in a period survived the pruning right after it."""
-        return _named(self.parents, self.parents.shape[-1])
+        return torch.zeros_like(self.parents, dtype=torch.bool).scatter(-1, self.parents, True)
 
     @property
     def reaches_leaf(self) -> Bool[Tensor, "*b P S"]:
         """Whether what a slot simulated in a period is part of the history of one of the L leaves."""
-        return _named(self.slots, self.parents.shape[-1])
+        return self.descendants > 0
 
 
 def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
@@ -67,12 +85,6 @@ def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
     for period in reversed(range(parents.shape[-2] - 1)):
         slots.append(parents[..., period, :].gather(-1, slots[-1]))
     return torch.stack(slots[::-1], -2)
-
-
-def _named(slots: Int[Tensor, "*b L"], branches: int) -> Bool[Tensor, "*b S"]:
-    """Which of the slots occur among `slots` [..., L]."""
-    found = torch.zeros(*slots.shape[:-1], branches, dtype=torch.bool, device=slots.device)
-    return found.scatter(-1, slots, True)
 
 
 def ranking(totals: Float[Tensor, "*b S"], slots: Int[Tensor, "*b L"]) -> Int[Tensor, "*b L"]:

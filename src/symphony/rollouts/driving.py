@@ -179,7 +179,7 @@ def simulation(
         number = result.trajectories.get(keys.PLANNER, None)
         number = None if number is None else number[..., -1, :]
         if best:
-            order = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
+            order = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[..., :1]
             found = Rollouts(*(_branches(part, order) for part in found))
             goal = _branches(goal, order)
             number = None if number is None else _branches(number, order)

@@ -33,8 +33,6 @@ from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.streams import Stream, fold_in, uniform
 
-ENDED = -100.0
-"""Score past a scene's last logged step, below all others: it decides no maximum, and other totals leave it out."""
 FILL, FEW = 4, 256
 """Where lines go back, those of so many times the usual run segments are simulated one after the other, as many at a
 time as usual: else the last steps of every batch would be of few lines.
@@ -114,7 +112,7 @@ def realism_score(
     score: Score = "discriminator",
     ego: bool = True,
 ) -> Callable[[TensorDictBase], Tensor]:
-    """Scores [..., N] of states up to their scene's last logged step, :data:`ENDED` beyond.
+    """Scores [..., N] of states.
 
     Args:
         env: whose states are scored.
@@ -124,13 +122,11 @@ def realism_score(
     """
     of_states = SCORES[score](env, discriminator)
 
-    def until_the_end(state: TensorDictBase) -> Float[Tensor, "*b N"]:
-        going = state.get(keys.STEP) <= env.scenes.last_step[state.get(keys.SCENE)]
-        found = torch.where(going, of_states(state), ENDED)
-        found = found.masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
+    def of_scored(state: TensorDictBase) -> Float[Tensor, "*b N"]:
+        found = of_states(state).masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
         return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
 
-    return until_the_end
+    return of_scored
 
 
 def branched_streams(start: TensorDictBase) -> TensorDictBase:
@@ -211,7 +207,7 @@ def search(
         ego: whether the first agent is scored, too.
         also: what is kept of every step beside :data:`KEPT`.
     """
-    steps, scene = env.decisions, start.get(keys.SCENE)[..., 0, 0]
+    steps = env.decisions
     return beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
@@ -223,8 +219,6 @@ def search(
         aggregate=max_then_sum,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
         leaves=leaves,
-        # In the last period of all, branches of a shorter scene are equal.
-        last_period=(-(-env.scenes.last_step[scene] // prune_every) - 1).clamp_min(0),
         # A copy takes the random numbers of the place it lands in, so that forks part.
         slot_keys=(keys.STREAM,),
         group_key=keys.GOAL if takes_groups(rule) else None,
