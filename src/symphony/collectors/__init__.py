@@ -1,4 +1,4 @@
-"""Beam search over simulated futures, and backtracking in them, as a function and as a TorchRL collector.
+"""Beam search over simulated futures, and backtracking in them, as a function, a TorchRL collector and a planner.
 
 Works with environments that keep all of their state in the TensorDict, whatever they simulate; not with those that
 wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (ParallelEnv).
@@ -10,6 +10,7 @@ from symphony.collectors.backtracking import Backtrack
 from symphony.collectors.beam_search import beam_search
 from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
+from symphony.collectors.planner import BeamSearchPlanner
 from symphony.collectors.result import BeamSearchResult, lineage
 from symphony.collectors.rules import (
     GroupRule,
@@ -28,6 +29,7 @@ __all__ = [
     "Aggregate",
     "Backtrack",
     "BeamSearchCollector",
+    "BeamSearchPlanner",
     "BeamSearchResult",
     "GroupRule",
     "KeepAll",

@@ -147,11 +147,14 @@ def beam_search(
     )
     slots, weights = lineage(parents), pruning.last_weights()
     log_weight, evidence = weights if weights is not None else (None, None)
+    # In later periods all branches of a row that has ended are equal.
+    last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)
+    costs, named = (_period(part, last_period) for part in (seen, slots))
+    costs = costs.gather(-1, named)
     if leaves is not None:
-        # In later periods all branches of a row that has ended are equal.
-        last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)
-        best = ranking(*(_period(part, last_period) for part in (seen, slots)))[..., :leaves]
+        best = ranking(costs, named)[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
+        costs = costs.gather(-1, best)
         log_weight = None if log_weight is None else log_weight.gather(-1, best)
     steps_at = _step_rows(slots, start.shape[-1], periods)
     trajectories = take(tree, steps_at)
@@ -168,6 +171,7 @@ def beam_search(
         tree=tree if keep_tree else None,
         prune_every=prune_every,
         simulated_steps=start.numel() * steps,
+        leaf_costs=costs,
         log_weights=torch.stack(pruning.log_weights, -2) if pruning.log_weights else None,
         leaf_log_weights=log_weight,
         log_evidence=evidence,

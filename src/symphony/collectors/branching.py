@@ -40,7 +40,8 @@ class BatchedEnv(EnvBase):
         batch_size: of the view, with the environment's own in front.
     """
 
-    batch_locked = False
+    # Or TorchRL would step some rows alone, where others have ended, and take their specs for those of all.
+    batch_locked = True
 
     def __init__(self, env: EnvBase, batch_size: Sequence[int]) -> None:
         super().__init__(device=env.device, batch_size=torch.Size(batch_size))
@@ -116,7 +117,8 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
     Args:
         env: with rows [*b], or for any batch shape.
         shape: of the states.
-        share: what its transforms have learned, such as the statistics of VecNorm, is one with the environment's.
+        share: what its transforms learn, such as the statistics of VecNorm, is one with the environment's; else it is
+            a copy of its own, and frozen.
 
     Raises:
         ValueError: if it can't be branched.
@@ -134,6 +136,8 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
             copy.primers = (
                 copy.primers[(0,) * len(env.batch_size)] if env.batch_size else copy.primers.clone()
             )
+        if isinstance(copy, VecNormV2) and not share:
+            copy.freeze()
         copies.append(copy)
     return TransformedEnv(BatchedEnv(base, shape), Compose(*copies))
 
@@ -146,6 +150,11 @@ def _parts(env: EnvBase) -> tuple[EnvBase, list[Transform]]:
         env = env.base_env
     env = env.inner if isinstance(env, BatchedEnv) else env
     return env, [one for one in transforms if not isinstance(one, BatchSizeTransform)]
+
+
+def innermost(env: EnvBase) -> EnvBase:
+    """The environment without transforms and rows."""
+    return _parts(env)[0]
 
 
 def _flat(transform: Transform) -> list[Transform]:

@@ -32,6 +32,7 @@ class BeamSearchResult:
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated.
+        leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended.
         log_weights: [*b, P, S] of a :class:`Resampling` rule, before each pruning: minus the totals since the row was
             last resampled, by the temperature; None with other rules, like the following.
         leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 where it resampled.
@@ -49,6 +50,7 @@ class BeamSearchResult:
     tree: TensorDictBase | None
     prune_every: int
     simulated_steps: int
+    leaf_costs: Float[Tensor, "*b L"] | None = None
     log_weights: Float[Tensor, "*b P S"] | None = None
     leaf_log_weights: Float[Tensor, "*b L"] | None = None
     log_evidence: Float[Tensor, "*b"] | None = None
@@ -87,9 +89,9 @@ def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
     return torch.stack(slots[::-1], -2)
 
 
-def ranking(totals: Float[Tensor, "*b S"], slots: Int[Tensor, "*b L"]) -> Int[Tensor, "*b L"]:
-    """Leaves from best to worst by the totals of their slots, repeated copies of one slot after all others."""
-    # Two stable sorts: by total, then by how many copies of the same history come before.
+def ranking(costs: Float[Tensor, "*b L"], slots: Int[Tensor, "*b L"]) -> Int[Tensor, "*b L"]:
+    """Leaves from best to worst by their costs, repeated copies of one slot after all others."""
+    # Two stable sorts: by cost, then by how many copies of the same history come before.
     copies = (slots[..., :, None] == slots[..., None, :]).tril(-1).sum(-1)
-    order = totals.gather(-1, slots).argsort(dim=-1, stable=True)
+    order = costs.argsort(dim=-1, stable=True)
     return order.gather(-1, copies.gather(-1, order).argsort(dim=-1, stable=True))
