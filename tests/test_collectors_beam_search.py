@@ -28,7 +28,7 @@ from symphony.collectors import (
     max_then_sum,
     mean_then_sum,
 )
-from symphony.collectors.result import ranking
+from symphony.collectors.beam_search import ranking
 
 
 @pytest.fixture(autouse=True)
@@ -267,9 +267,8 @@ def test_lineage_by_hand():
 
 def test_marks_of_the_tree():
     found = search(starts(Walk(), 3, branches=4), keep_tree=True)
-    assert (found.survived.sum(-1) == 2).all()
-    assert (found.reaches_leaf <= found.survived).all()
-    assert torch.equal(found.reaches_leaf[:, -1], found.survived[:, -1])
+    assert ((found.descendants > 0).sum(-1) <= 2).all()
+    assert (found.descendants.sum(-1) == 4).all()
     for row in range(3):
         for leaf in range(4):
             for step in range(12):

@@ -21,7 +21,7 @@ from helpers_segments import crossing, straight_road
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.cli.plot import run_names
-from symphony.collectors.result import BeamSearchResult, lineage
+from symphony.collectors import BeamSearchResult, lineage
 from symphony.config import AgentConfig, DiscriminatorConfig, EvaluateConfig, SearchConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -148,7 +148,8 @@ def test_fates_are_those_of_the_search(parents: np.ndarray) -> None:
         prune_every=1,
         simulated_steps=0,
     )
-    reaches, survived = result.reaches_leaf.numpy(), result.survived.numpy()
+    reaches = (result.descendants > 0).numpy()
+    survived = (parents[..., None] == np.arange(5)).any(-2)
     score = np.zeros((5, 3, 1))
     tree = SearchTree(np.zeros((5, 3, 1, 2)), score, parents, reaches, 1, np.array([0]))
     assert ((tree.fate == 0) == reaches).all()

@@ -7,11 +7,10 @@ wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (Paralle
 from __future__ import annotations
 
 from symphony.collectors.backtracking import Backtrack
-from symphony.collectors.beam_search import beam_search
+from symphony.collectors.beam_search import BeamSearchResult, beam_search, lineage
 from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
 from symphony.collectors.planner import BeamSearchPlanner
-from symphony.collectors.result import BeamSearchResult, lineage
 from symphony.collectors.rules import (
     GroupRule,
     KeepAll,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import functools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -15,20 +16,17 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import RandomPolicy
 
-from symphony.collectors._torchrl import bind, new_trajectories, policy_of, seed_worker
 from symphony.collectors.backtracking import Backtrack
-from symphony.collectors.beam_search import Aggregation, Policy, Score, beam_search, score_state
+from symphony.collectors.beam_search import Aggregation, BeamSearchResult, Policy, Score, beam_search
 from symphony.collectors.branching import (
     below,
     branch,
     branched_env,
-    branched_specs,
     check_branching,
     last_name,
 )
-from symphony.collectors.result import BeamSearchResult
-from symphony.collectors.rules import GroupRule, KeepBest, PruningRule, Resampling
-from symphony.collectors.scores import Aggregate, max_then_sum
+from symphony.collectors.rules import GroupRule, KeepBest, PruningRule
+from symphony.collectors.scores import max_then_sum
 
 
 class BeamSearchCollector(Collector):
@@ -49,9 +47,8 @@ class BeamSearchCollector(Collector):
       TorchRL's losses leave such steps out. With ``trajs_per_batch`` they are dropped.
     - with a :class:`Resampling` rule, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
       weight of its tree; 0 where the last pruning resampled. Losses may weigh leaves by its exponential.
-    - with `keep_tree`, ``("collector", "beam_rank")`` [..., T] int64: place of the leaf among those of its tree by
-      the aggregate of their whole histories, 0 for the best; and ``"tree"``, a TensorDict [*env.batch_size, S, T]
-      of all that was simulated, by slot, pruned branches included, with their ``("collector", "beam_score")``.
+    - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all that was simulated, by slot, pruned
+      branches included, with their ``("collector", "beam_score")``.
 
     Frames are counted as returned; `simulated_frames` counts what was simulated for them, about S / L times as
     many.
@@ -113,7 +110,11 @@ class BeamSearchCollector(Collector):
         if kwargs.get("auto_register_policy_transforms") is None:
             # What TorchRL 0.14 does when left unset, minus its warning about any policy that is a module.
             kwargs["auto_register_policy_transforms"] = False
-        seed_worker(kwargs.get("worker_idx"))
+        if kwargs.get("worker_idx") is not None:
+            # The global generators of worker processes all begin alike.
+            torch.manual_seed(
+                (torch.initial_seed() + (kwargs["worker_idx"] + 1) * 0x9E3779B97F4A7C15) % (1 << 63)
+            )
         super().__init__(create_env_fn, policy, **kwargs)
         self.branches = branches
         self.leaves = leaves
@@ -121,7 +122,6 @@ class BeamSearchCollector(Collector):
         self.prepare = prepare
         self.simulated_frames = 0
         self._score = score
-        self._aggregate = aggregate
         self._search = functools.partial(
             beam_search,
             prune_every=prune_every,
@@ -162,10 +162,15 @@ class BeamSearchCollector(Collector):
         """One search from a reset: the leaves, [*env.batch_size, T] or [*env.batch_size, L, T]."""
         if self.pre_collect_hook is not None:
             self.pre_collect_hook()
-        start = branch(self.env.reset(), self.branches)
+        found = self._searched(self.env.reset())
+        self.simulated_frames += found.simulated_steps
+        return self._finish(found)
+
+    def _searched(self, rows: TensorDictBase) -> BeamSearchResult:
+        start = branch(rows, self.branches)
         if self.prepare is not None:
             start = self.prepare(start.copy())
-        found = self._search(
+        return self._search(
             self.env,
             self._acting(),
             self._score,
@@ -175,8 +180,6 @@ class BeamSearchCollector(Collector):
             keep=self._keep,
             exploration_type=self.exploration_type,
         )
-        self.simulated_frames += found.simulated_steps
-        return self._finish(found)
 
     def _finish(self, found: BeamSearchResult) -> TensorDictBase:
         leaves, totals = found.trajectories, found.leaf_totals
@@ -187,10 +190,6 @@ class BeamSearchCollector(Collector):
         leaves.set(("collector", "beam_total"), totals.transpose(-1, -2)[..., period])
         leaves.set(("collector", "beam_slot"), found.slots.transpose(-1, -2)[..., period])
         if found.tree is not None:
-            # The last period alone would say nothing of how a leaf came there.
-            order = _whole(self._aggregate, found).argsort(dim=-1, stable=True)
-            rank = order.argsort(dim=-1, stable=True)
-            leaves.set(("collector", "beam_rank"), rank[..., None].expand(leaves.shape).clone())
             found.tree.set(("collector", "beam_score"), found.simulated_scores)
             leaves.set("tree", found.tree)
         ended = torch.stack([_per_entry(leaves.get(key), leaves.ndim) for key in self._done]).any(0)
@@ -200,7 +199,7 @@ class BeamSearchCollector(Collector):
             weight = found.leaf_log_weights.float()[..., None]
             leaves.set(("collector", "log_weight"), weight.expand(leaves.shape).clone())
         if self.track_traj_ids:
-            ids = new_trajectories(self, leaves.shape[:-1].numel(), mask.device)
+            ids = self._traj_pool.get_traj_and_increment(leaves.shape[:-1].numel(), device=mask.device)
             leaves.set(
                 ("collector", "traj_ids"), ids.reshape(*leaves.shape[:-1], 1).expand(leaves.shape).clone()
             )
@@ -241,7 +240,7 @@ class BeamSearchCollector(Collector):
         first = self.init_random_frames or 0
         buffer = self.replay_buffer
         seen = self.stats()["frames"] if buffer is None else buffer.write_count
-        policy = policy_of(self)
+        policy = self._wrapped_policy
         if isinstance(policy, RandomPolicy) or seen < first:
             # The specs of a random policy have the rows of the collector's environment, but no branches.
             return branched_env(self.env, (*self.env.batch_size, self.branches)).rand_action
@@ -273,41 +272,21 @@ class BeamSearchCollector(Collector):
     @torch.no_grad()
     def fake_tensordict(self) -> TensorDictBase:
         """Zeros in the shape and with the entries of a batch."""
-        plain = self.env.fake_tensordict()
-        if self.compact_obs:
-            plain = plain.exclude(*self._next_states())
-        first = branch(plain, self.branches).clone()
-        state = first.exclude("next", *self.env.action_keys)
-        # The actor's own entries are found by letting it act.
-        with branched_specs(policy_of(self), plain.shape, first.shape):
-            acted = self._acting()(state if self.prepare is None else self.prepare(state.copy()))
-        score = score_state(self.env, self._score, first.update(acted), first.exclude("next"))
-        plain = first[..., 0].unsqueeze(-1).expand(*plain.shape, self.frames_per_batch).clone().zero_()
-        if self.leaves is not None:
-            plain = plain.unsqueeze(-2).expand(*plain.shape[:-1], self.leaves, plain.shape[-1]).clone()
-        if self._keep is not None:
-            plain = plain.select(*self._keep, strict=False)
-        ranked = self._search.keywords["keep_tree"]
-        tree = plain.clone() if ranked else None
-        plain.set(("collector", "beam_score"), score.new_zeros(*plain.shape, score.shape[-1]))
-        entries = {
-            "beam_total": (True, score.dtype),
-            "beam_slot": (True, torch.int64),
-            "mask": (True, torch.bool),
-            "beam_rank": (ranked, torch.int64),
-            "log_weight": (isinstance(self._rule, Resampling), torch.float32),
-            "traj_ids": (self.track_traj_ids, torch.int64),
-        }
-        for name, (there, dtype) in entries.items():
-            if there:
-                plain.set(("collector", name), torch.zeros(plain.shape, dtype=dtype, device=score.device))
-        if tree is not None:
-            tree.set(("collector", "beam_score"), plain.get(("collector", "beam_score")).clone())
-            plain.set("tree", tree)
-        plain.refine_names(..., "time")
-        plain = self._truncate(plain)
-        plain = plain if self.postproc is None else self.postproc(plain)
-        return plain.exclude(*(key for key in plain.keys(True) if last_name(key).startswith("_")))
+        rng, track = self._rng.get_state(), self.track_traj_ids
+        start = self.env.fake_tensordict().exclude("next", *self.env.action_keys)
+        with torch.random.fork_rng([]):
+            self.track_traj_ids = False  # or numbers would be used up
+            batch = self._finish(self._searched(start))
+        self._rng.set_state(rng)
+        self.track_traj_ids = track
+        if track:
+            number = torch.zeros(
+                batch.shape, dtype=torch.int64, device=batch.get(("collector", "mask")).device
+            )
+            batch.set(("collector", "traj_ids"), number)
+        batch = batch if self.postproc is None else self.postproc(batch)
+        batch = batch.exclude(*(key for key in batch.keys(True) if last_name(key).startswith("_")))
+        return self._truncate(batch.apply(torch.zeros_like))
 
     def state_dict(self) -> OrderedDict:
         """State of the collector (policy, environment, counters) and of the search."""
@@ -328,13 +307,30 @@ class BeamSearchCollector(Collector):
         return {**super().stats(), "simulated_frames": self.simulated_frames}
 
 
-def _whole(aggregate: Aggregation, found: BeamSearchResult) -> Float[Tensor, "*b L"]:
-    """The aggregate of whole histories."""
-    if isinstance(aggregate, Aggregate):
-        return aggregate(found.scores, found.alive[..., None])
-    return aggregate(found.scores)
-
-
 def _per_entry(flag: Bool[Tensor, "*e"], batch_dims: int) -> Bool[Tensor, "*_"]:
     """Whether any of the flags [*b, ...] of an entry [*b] is set."""
     return flag.reshape(*flag.shape[:batch_dims], -1).any(-1)
+
+
+class BoundType(type(Collector)):  # type: ignore[misc]  # TorchRL's metaclass has no public name
+    """Of classes made at run time, which are pickled as their base and the arguments bound."""
+
+    settings: dict[str, Any]
+
+
+def bind(base: type[Collector], settings: dict[str, Any]) -> type[Collector]:
+    """A subclass with arguments given; those of a call take precedence."""
+
+    def __init__(self: Any, create_env_fn: Any, policy: Any = None, **kwargs: Any) -> None:  # noqa: N807
+        base.__init__(self, create_env_fn, policy, **{**settings, **kwargs})
+
+    members = {"__init__": __init__, "__module__": base.__module__, "settings": settings}
+    return BoundType(base.__name__, (base,), members)
+
+
+def _reduced(bound: BoundType) -> tuple[Any, ...]:
+    return bind, (bound.__base__, bound.settings)
+
+
+# pickle would look for a class in its module, unless its type has a reduction.
+copyreg.pickle(BoundType, _reduced)

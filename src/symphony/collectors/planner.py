@@ -24,8 +24,8 @@ class BeamSearchPlanner(MPCPlannerBase):
     for a policy (as mctx gives them):
 
     - ``("planner", "action")`` [*b, S, ...]: the first actions of all branches;
-    - ``("planner", "weight")`` [*b, S]: the share of the final branches, weighed by ``softmax(return / temperature)``,
-      that go back to each of them;
+    - ``("planner", "weight")`` [*b, S]: the share of the final branches that go back to each of them, by
+      ``softmax(return / temperature)``;
     - ``("planner", "value")`` [*b, 1]: the return of the best branch.
 
     Args:
@@ -50,7 +50,7 @@ class BeamSearchPlanner(MPCPlannerBase):
         *,
         policy: Policy | None = None,
         value_network: Callable[[TensorDictBase], TensorDictBase] | None = None,
-        prune_every: int = 1,
+        prune_every: int = 10,
         rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
         temperature: float = 1.0,
         reward_key: NestedKey = "reward",

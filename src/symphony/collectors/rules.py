@@ -29,9 +29,6 @@ class PruningRule(Protocol):
     ...     return slots.scatter(-1, worst, best)
     >>> drop_worst(torch.tensor([[0.5, 3.0, 0.1, 1.0]])).tolist()
     [[0, 2, 2, 3]]
-
-    It is passed as ``rule=drop_worst``. What goes to other processes must be defined in a module, not in a script's
-    ``main``; a frozen dataclass with a ``__call__`` also carries parameters.
     """
 
     def __call__(
