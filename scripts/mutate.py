@@ -100,7 +100,7 @@ TESTED = {
     "evaluation.relations": "test_relations.py",
     "collectors.rules": "test_collectors_rules.py",
     "collectors.beam_search": "test_collectors_beam_search.py",
-    "collectors.result": "test_collectors_beam_search.py",
+    "collectors.pruning": "test_collectors_weights.py",
     "collectors.scores": "test_collectors_beam_search.py",
     "objectives.base": "test_objectives_bc.py test_objectives_masks.py",
     "objectives.goal": "test_objectives_goal.py",

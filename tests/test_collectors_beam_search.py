@@ -397,7 +397,7 @@ def test_aggregates_by_hand():
         ({"steps": 0}, "positive"),
         ({"prune_every": 0}, "positive"),
         ({"leaves": 5}, "leaves"),
-        ({"group_key": STREAM}, "GroupRule"),
+        ({"group_key": STREAM}, "takes groups"),
         ({"group_key": "goal", "rule": ReplaceBad(0.0)}, "goal"),
         ({"group_key": X, "rule": ReplaceBad(0.0)}, "integers, one or some per branch"),
         ({"noise": torch.zeros(2, 2)}, "noise"),

@@ -148,7 +148,7 @@ def test_fates_are_those_of_the_search(parents: np.ndarray) -> None:
         prune_every=1,
         simulated_steps=0,
     )
-    reaches = (result.descendants > 0).numpy()
+    reaches = result.reaches_leaf.numpy()
     survived = (parents[..., None] == np.arange(5)).any(-2)
     score = np.zeros((5, 3, 1))
     tree = SearchTree(np.zeros((5, 3, 1, 2)), score, parents, reaches, 1, np.array([0]))

@@ -12,7 +12,6 @@ from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
 from symphony.collectors.planner import BeamSearchPlanner
 from symphony.collectors.rules import (
-    GroupRule,
     KeepAll,
     KeepBest,
     PruningRule,
@@ -30,7 +29,6 @@ __all__ = [
     "BeamSearchCollector",
     "BeamSearchPlanner",
     "BeamSearchResult",
-    "GroupRule",
     "KeepAll",
     "KeepBest",
     "KeyScore",

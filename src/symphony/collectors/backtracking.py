@@ -110,24 +110,6 @@ class Run(NamedTuple):
     after: TensorDictBase
 
 
-class Lines(NamedTuple):
-    """What became of the lines [*b, S] in T steps.
-
-    Attributes:
-        steps: [*b, S, T] kept entries.
-        scores: [*b, S, T, N].
-        alive: [*b, S, T].
-        totals: [*b, P, S].
-        simulated: line-steps, those that were done again included.
-    """
-
-    steps: TensorDictBase
-    scores: Tensor
-    alive: Tensor
-    totals: Tensor
-    simulated: int
-
-
 @torch.no_grad()
 def follow(
     simulate: Callable[[TensorDictBase, Tensor, int], Run],
@@ -137,8 +119,11 @@ def follow(
     rule: Backtrack,
     steps: int,
     every: int,
-) -> Lines:
+) -> tuple[TensorDictBase, Tensor, Tensor, Tensor, int]:
     """Simulate lines [*b, S] until all have come to their ends.
+
+    Returns their kept entries and scores [*b, S, T, N], which steps counted [*b, S, T], totals [*b, P, S], and how
+    many line-steps were simulated, those that were done again included.
 
     Args:
         simulate: steps of lines [R, 1] that may have ended [R, 1, K].
@@ -198,7 +183,7 @@ def follow(
             over = torch.cat([over, take_values(ended, others[:, None], start.ndim)])
     assert history is not None  # noqa: S101  (a search has a line and a step)
     order = torch.arange(lines * length, device=device).reshape(*start.shape, length)[..., :steps]
-    return Lines(
+    return (
         take(history, order),
         take_values(all_scores, order, 1),
         take_values(all_alive, order, 1),

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from symphony.collectors.backtracking import Backtrack, Lines, Run, follow
+from symphony.collectors.backtracking import Backtrack, Run, follow
 from symphony.collectors.branching import (
     below,
     branched_env,
@@ -30,7 +30,7 @@ from symphony.collectors.branching import (
     take_values,
 )
 from symphony.collectors.pruning import Pruning
-from symphony.collectors.rules import GroupRule, KeepBest, PruningRule, sample_size
+from symphony.collectors.rules import KeepBest, PruningRule, sample_size
 from symphony.collectors.scores import Aggregate, max_then_sum
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -96,6 +96,11 @@ class BeamSearchResult:
         """How many of the leaves have what a slot simulated in a period in their history."""
         return torch.zeros_like(self.parents).scatter_add(-1, self.slots, torch.ones_like(self.slots))
 
+    @property
+    def reaches_leaf(self) -> Bool[Tensor, "*b P S"]:
+        """Whether what a slot simulated in a period is part of the history of one of the L leaves."""
+        return self.descendants > 0
+
 
 def beam_search(
     env: EnvBase,
@@ -105,7 +110,7 @@ def beam_search(
     *,
     steps: int,
     prune_every: int = 10,
-    rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
+    rule: PruningRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
     aggregate: Aggregation = max_then_sum,
     value: Score | None = None,
     accumulate: bool = False,
@@ -151,7 +156,8 @@ def beam_search(
             ``noise_per_slot``.
         slot_keys: entries that stay in their slot when a branch is copied, such as the identity of a stream of
             random numbers: otherwise copies of one branch that draw from it would all do the same.
-        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree, for a :class:`GroupRule`. A copy is
+        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree, for a rule that
+            takes groups. A copy is
             of its parent's group.
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
@@ -237,22 +243,15 @@ def beam_search(
     )
 
 
-def _independent(lines: Lines, prune_every: int, keep_tree: bool) -> BeamSearchResult:
+def _independent(
+    lines: tuple[TensorDictBase, Tensor, Tensor, Tensor, int], prune_every: int, keep_tree: bool
+) -> BeamSearchResult:
     """Lines as the leaves of a search in which every branch goes on from itself."""
-    slots = torch.arange(lines.totals.shape[-1], device=lines.totals.device).expand(lines.totals.shape)
-    lines.steps.refine_names(..., "time")
-    return BeamSearchResult(
-        trajectories=lines.steps,
-        scores=lines.scores,
-        alive=lines.alive,
-        slots=slots,
-        totals=lines.totals,
-        parents=slots,
-        simulated_scores=lines.scores,
-        tree=lines.steps.copy() if keep_tree else None,
-        prune_every=prune_every,
-        simulated_steps=lines.simulated,
-    )
+    steps, scores, alive, totals, simulated = lines
+    slots = torch.arange(totals.shape[-1], device=totals.device).expand(totals.shape)
+    steps.refine_names(..., "time")
+    tree = steps.copy() if keep_tree else None
+    return BeamSearchResult(steps, scores, alive, slots, totals, slots, scores, tree, prune_every, simulated)
 
 
 def _period(values: Shaped[Tensor, "*b P S"], number: Int[Tensor, "*b"]) -> Shaped[Tensor, "*b S"]:

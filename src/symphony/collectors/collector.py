@@ -25,7 +25,7 @@ from symphony.collectors.branching import (
     check_branching,
     last_name,
 )
-from symphony.collectors.rules import GroupRule, KeepBest, PruningRule
+from symphony.collectors.rules import KeepBest, PruningRule
 from symphony.collectors.scores import max_then_sum
 
 
@@ -83,7 +83,7 @@ class BeamSearchCollector(Collector):
         branches: int,
         leaves: int | None = None,
         prune_every: int = 10,
-        rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
+        rule: PruningRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
         aggregate: Aggregation = max_then_sum,
         value: Score | None = None,
         accumulate: bool = False,
@@ -181,7 +181,7 @@ class BeamSearchCollector(Collector):
             exploration_type=self.exploration_type,
         )
 
-    def _finish(self, found: BeamSearchResult) -> TensorDictBase:
+    def _finish(self, found: BeamSearchResult, *, fake: bool = False) -> TensorDictBase:
         leaves, totals = found.trajectories, found.leaf_totals
         period = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
         if self.compact_obs:
@@ -199,7 +199,9 @@ class BeamSearchCollector(Collector):
             weight = found.leaf_log_weights.float()[..., None]
             leaves.set(("collector", "log_weight"), weight.expand(leaves.shape).clone())
         if self.track_traj_ids:
-            ids = self._traj_pool.get_traj_and_increment(leaves.shape[:-1].numel(), device=mask.device)
+            number = leaves.shape[:-1].numel()
+            ids = torch.zeros(number, dtype=torch.int64, device=mask.device)
+            ids = ids if fake else self._traj_pool.get_traj_and_increment(number, device=mask.device)
             leaves.set(
                 ("collector", "traj_ids"), ids.reshape(*leaves.shape[:-1], 1).expand(leaves.shape).clone()
             )
@@ -272,18 +274,11 @@ class BeamSearchCollector(Collector):
     @torch.no_grad()
     def fake_tensordict(self) -> TensorDictBase:
         """Zeros in the shape and with the entries of a batch."""
-        rng, track = self._rng.get_state(), self.track_traj_ids
+        rng = self._rng.get_state()
         start = self.env.fake_tensordict().exclude("next", *self.env.action_keys)
         with torch.random.fork_rng([]):
-            self.track_traj_ids = False  # or numbers would be used up
-            batch = self._finish(self._searched(start))
+            batch = self._finish(self._searched(start), fake=True)
         self._rng.set_state(rng)
-        self.track_traj_ids = track
-        if track:
-            number = torch.zeros(
-                batch.shape, dtype=torch.int64, device=batch.get(("collector", "mask")).device
-            )
-            batch.set(("collector", "traj_ids"), number)
         batch = batch if self.postproc is None else self.postproc(batch)
         batch = batch.exclude(*(key for key in batch.keys(True) if last_name(key).startswith("_")))
         return self._truncate(batch.apply(torch.zeros_like))

@@ -12,7 +12,7 @@ from torchrl.modules import MPCPlannerBase
 
 from symphony.collectors.beam_search import Policy, beam_search
 from symphony.collectors.branching import branch, branched_env, check_branching, innermost
-from symphony.collectors.rules import GroupRule, KeepBest, PruningRule
+from symphony.collectors.rules import KeepBest, PruningRule
 from symphony.collectors.scores import Aggregate, KeyScore
 
 
@@ -51,7 +51,7 @@ class BeamSearchPlanner(MPCPlannerBase):
         policy: Policy | None = None,
         value_network: Callable[[TensorDictBase], TensorDictBase] | None = None,
         prune_every: int = 10,
-        rule: PruningRule | GroupRule = KeepBest(0.5),  # noqa: B008  (frozen)
+        rule: PruningRule = KeepBest(0.5),  # noqa: B008  (frozen)
         temperature: float = 1.0,
         reward_key: NestedKey = "reward",
         action_key: NestedKey = "action",
@@ -89,7 +89,7 @@ class BeamSearchPlanner(MPCPlannerBase):
             keep_tree=True,
             leaves=self.branches,
         )
-        assert found.tree is not None  # noqa: S101  (it was asked for)
+        assert found.tree is not None and found.leaf_costs is not None  # noqa: S101, PT018  (as asked for)
         first, roots = found.tree.get(self.action_key).select(root.ndim + 1, 0), found.slots[..., 0, :]
         share = torch.softmax(-found.leaf_costs / self.temperature, -1)
         targets = {

@@ -11,7 +11,6 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from symphony.collectors.rules import (
-    GroupRule,
     KeepAll,
     KeepBest,
     PruningRule,
@@ -43,7 +42,7 @@ class Pruning:
     def __init__(
         self,
         start: TensorDictBase,
-        rule: PruningRule | GroupRule,
+        rule: PruningRule,
         periods: int,
         *,
         group_key: NestedKey | None,
@@ -54,7 +53,7 @@ class Pruning:
         self.weighs = rule if isinstance(rule, Resampling) else None
         self._groups = None if group_key is None else _groups(start, group_key)
         if group_key is not None and not takes_groups(rule):
-            raise ValueError(f"{rule} knows nothing of groups: group_key is for a GroupRule")
+            raise ValueError(f"{rule} knows nothing of groups: group_key is for a rule that takes groups")
         self._noises = _noises(noise, start, periods, per_slot=getattr(rule, "noise_per_slot", False))
         self.totals: list[Tensor] = []
         self.seen: list[Tensor] = []
@@ -149,7 +148,7 @@ def _noises(
 
 
 def checked(
-    rule: PruningRule | GroupRule,
+    rule: PruningRule,
     totals: Float[Tensor, "*b S"],
     noise: Tensor | None = None,
     groups: Int[Tensor, "*b S"] | None = None,

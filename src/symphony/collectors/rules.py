@@ -1,58 +1,38 @@
 """Pruning rules: which branches go on, and in how many copies.
 
 A rule is any callable ``rule(totals, noise) -> parents``: totals [*b, S] float, where a *high* number is bad;
-noise [*b] in [0, 1) or None; parents [*b, S] int64, the branch that each slot is continued from. A
-:class:`GroupRule` also sees groups. A :class:`Resampling` rule weighs branches: what it sees are the totals since a
-row was last resampled.
+noise [*b] in [0, 1) or None; parents [*b, S] int64, the branch that each slot is continued from. One with
+``takes_groups = True`` is called with groups [*b, S] (or None), too, and decides what they mean. A
+:class:`Resampling` rule weighs branches: what it sees are the totals since a row was last resampled.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeGuard
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+PruningRule = Callable[..., Tensor]
+"""What :func:`beam_search` calls at a pruning point: see the module. Rows are independent, and nothing is drawn but
+by the given noise. This one drops the worst branch for the best:
 
-class PruningRule(Protocol):
-    """What :func:`beam_search` calls at a pruning point; a plain function will do.
-
-    Rows are independent, and nothing is drawn but by the given noise. To drop the worst branch for the best:
-
-    >>> import torch
-    >>> def drop_worst(totals, noise=None):
-    ...     slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
-    ...     best, worst = totals.argmin(-1, keepdim=True), totals.argmax(-1, keepdim=True)
-    ...     return slots.scatter(-1, worst, best)
-    >>> drop_worst(torch.tensor([[0.5, 3.0, 0.1, 1.0]])).tolist()
-    [[0, 2, 2, 3]]
-    """
-
-    def __call__(
-        self, totals: Float[Tensor, "*b S"], noise: Float[Tensor, "*b"] | None
-    ) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots; see the module."""
+>>> import torch
+>>> def drop_worst(totals, noise=None):
+...     slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
+...     best, worst = totals.argmin(-1, keepdim=True), totals.argmax(-1, keepdim=True)
+...     return slots.scatter(-1, worst, best)
+>>> drop_worst(torch.tensor([[0.5, 3.0, 0.1, 1.0]])).tolist()
+[[0, 2, 2, 3]]
+"""
 
 
-class GroupRule(Protocol):
-    """A rule that decides itself what groups mean; they may be of any size, and branches may change theirs."""
-
-    takes_groups: ClassVar[bool] = True
-
-    def __call__(
-        self,
-        totals: Float[Tensor, "*b S"],
-        noise: Float[Tensor, "*b"] | None,
-        groups: Int[Tensor, "*b S"] | None = None,
-    ) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots; groups are given where the search has a ``group_key``."""
-
-
-def takes_groups(rule: object) -> TypeGuard[GroupRule]:
-    """Whether a rule wants to see the groups itself."""
+def takes_groups(rule: object) -> bool:
+    """Whether a rule wants to see the groups."""
     return bool(getattr(rule, "takes_groups", False))
 
 
