@@ -14,7 +14,7 @@ CONSTRAINTS ?= constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
 # All there are, so that no test is skipped for want of one.
 EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video
-SPELLED := src tests scripts recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
+SPELLED := src tests recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
@@ -28,7 +28,7 @@ demo: $(CORE)  ## an included agent, then one learned from the built-in data: pi
 	$(BIN)/symphony demo --out out/demo
 
 table: $(CORE)  ## train, evaluate and compare all eight methods, tiny, in out/table
-	$(BIN)/python scripts/make_table.py --out out/table
+	$(BIN)/python benchmarks/make_table.py --out out/table
 
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadfile
 
@@ -38,17 +38,17 @@ test: $(DEV)  ## run the tests, in a process per core
 FUZZ_ARGS ?= --inputs 2000
 
 fuzz: $(DEV)  ## feed damaged files to everything that reads files; goes on where it stopped
-	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/fuzz.py $(FUZZ_ARGS)
+	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/fuzz.py $(FUZZ_ARGS)
 
 KILLS_ARGS ?= --kills 30
 
 kills: $(DEV)  ## kill everything that writes at random moments, go on, and compare with undisturbed work
-	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/kills.py $(KILLS_ARGS)
+	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/kills.py $(KILLS_ARGS)
 
 MUTATE_ARGS ?= --changes 10
 
-mutate: $(DEV)  ## change operators in geometry, pruning rules, losses and metrics; tell which changes no test notices
-	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/mutate.py $(MUTATE_ARGS)
+mutate: $(DEV)  ## change operators in what computes; tell which changes no test notices
+	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/mutate.py $(MUTATE_ARGS)
 
 # Not among the development packages, as nothing else needs it; processes of their own are not counted.
 coverage: $(DEV)  ## run the tests in one process and say which branches of src they take; slow
@@ -57,7 +57,7 @@ coverage: $(DEV)  ## run the tests in one process and say which branches of src 
 	$(BIN)/python -m coverage report --skip-covered --sort=cover
 
 flat: $(DEV)  ## train and evaluate for long and tell whether memory and open files grow
-	OMP_NUM_THREADS=1 nice $(BIN)/python scripts/flat.py
+	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/flat.py
 
 audit: $(DEV)  ## ask a public database for known vulnerabilities of the pinned packages
 	$(INSTALL) 'pip-audit>=2.7'
@@ -67,14 +67,14 @@ audit: $(DEV)  ## ask a public database for known vulnerabilities of the pinned 
 test-lowest:  ## run the tests with the lowest versions that pyproject.toml promises, in a .venv of their own
 	$(MAKE) test VENV=$(VENV)-lowest CONSTRAINTS=constraints-lowest.txt
 
-lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, file lengths
+lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, lengths of files and rooms
 	$(BIN)/ruff check
 	$(BIN)/ruff check --preview --select DOC102 src  # arguments that are described but not there
 	$(BIN)/ruff format --check
 	$(BIN)/codespell $(SPELLED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python scripts/lint_length.py
+	$(BIN)/python tests/tools/lint_length.py
 
 BENCH_ARGS ?=
 
@@ -92,7 +92,7 @@ format: $(DEV)  ## rewrite the files in the style that lint asks for
 clean:  ## remove .venv, caches and everything written by the targets above
 	rm -rf $(VENV) $(VENV)-lowest out build dist src/*.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
-	find src tests scripts recipes benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+	find src tests recipes benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 $(CORE): pyproject.toml $(CONSTRAINTS)
 	@test -n "$(PYTHON)" || { echo "error: needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python" >&2; exit 1; }

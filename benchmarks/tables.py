@@ -1,4 +1,4 @@
-"""The tables of a report from what ``measure.py`` wrote, on standard output or in ``benchmarks/reports/DATE.md``:
+"""The tables of a report from what ``measure.py`` wrote, on standard output or as ``benchmarks/reports/measure.md``:
 
 python benchmarks/tables.py out/bench.json [--before older.json] [--write]
 
@@ -15,7 +15,7 @@ from typing import Any
 
 Row = Mapping[str, Any]
 YARDSTICKS = ("brute force", "matmul")
-REPORTS = Path(__file__).resolve().parent / "reports"
+REPORT = Path(__file__).resolve().parent / "reports" / "measure.md"
 
 
 def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
@@ -146,7 +146,7 @@ def main() -> None:
     )
     parser.add_argument("report", type=Path)
     parser.add_argument("--before", type=Path)
-    parser.add_argument("--write", action="store_true", help="into the folder of reports")
+    parser.add_argument("--write", action="store_true", help="as the latest report")
     arguments = parser.parse_args()
     report = json.loads(arguments.report.read_text())
     before = None if arguments.before is None else json.loads(arguments.before.read_text())
@@ -154,11 +154,8 @@ def main() -> None:
     if not arguments.write:
         print(made)
         return
-    path = REPORTS / f"{report['date']}.md"
-    if path.exists():
-        raise SystemExit(f"{path} exists: move it first")
-    path.write_text(made)
-    print(path)
+    REPORT.write_text(made)
+    print(REPORT)
 
 
 if __name__ == "__main__":

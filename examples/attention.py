@@ -21,7 +21,7 @@ MANY = 48
 class Everything(nn.Module):
     """An agent looks twice, the second time with what it has seen, at the encoded elements of every set around it."""
 
-    def __init__(self, own_features: int, group_features: list[int], *, hidden: int = 64, pool: str = "auto"):
+    def __init__(self, own_features: int, group_features: list[int], *, hidden: int = 64):
         super().__init__()
         self.own = mlp((own_features, hidden, hidden))
         self.groups = nn.ModuleList(mlp((features, hidden, hidden)) for features in group_features)
@@ -56,16 +56,15 @@ class Everything(nn.Module):
 class Others(Everything):
     """The same for small sets, others and lights, with keys and values of their own; map points are pooled."""
 
-    def __init__(self, own_features: int, group_features: list[int], *, hidden: int = 64, pool: str = "auto"):
+    def __init__(self, own_features: int, group_features: list[int], *, hidden: int = 64):
         super().__init__(own_features, group_features, hidden=hidden)
-        self.pool = pool
         self.keys = nn.ModuleList(nn.Linear(hidden, 2 * hidden) for _ in group_features)
         self.both = dict(zip(self.groups, self.keys, strict=True))
 
     def elements(self, encoder: nn.Module, elements: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Keys and values [..., 2, K, hidden], or of large sets their maximum [..., hidden]; and the mask."""
         if elements.shape[-2] > MANY:
-            return pool_elements(encoder, elements, mask, mode=self.pool), mask
+            return pool_elements(encoder, elements, mask), mask
         encoded, _ = super().elements(encoder, elements, mask)
         return torch.stack(self.both[encoder](encoded).chunk(2, -1), -3), mask
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from symphony.agents.agent import usable_device
 from symphony.config.training import Method, TrainConfig
-from symphony.training.processes import Processes, processes
-from symphony.training.trainer import Trainer
+from symphony.training import Processes, Trainer
+from symphony.training.processes import processes
 
-__all__ = ["Recipe", "recipe_of", "train"]
+__all__ = ["Recipe", "recipe_of", "train", "trainer_of"]
 
 Recipe = Callable[[TrainConfig, Processes], Trainer]
 """What builds the trainer of a run."""
@@ -43,4 +43,14 @@ def train(config: TrainConfig, recipe: Recipe | None = None) -> Path:
         TrainingError: if gradients stay infinite or undefined.
     """
     with processes(usable_device(config.device)) as world:
-        return (recipe or recipe_of(config.method))(config, world).run()
+        return trainer_of(config, world, recipe).run()
+
+
+def trainer_of(config: TrainConfig, world: Processes, recipe: Recipe | None = None) -> Trainer:
+    """The trainer that a recipe builds, with the hooks that its configuration asks for: validation and previews."""
+    trainer = (recipe or recipe_of(config.method))(config, world)
+    if world.is_main and (config.validation.data is not None or 0 < config.preview.every <= config.steps):
+        from symphony.training.hooks import add_hooks  # noqa: PLC0415 - loads what simulates, judges and draws
+
+        add_hooks(trainer)
+    return trainer

@@ -23,7 +23,7 @@ def bc(config: TrainConfig, processes: Processes) -> Trainer:
     agent = Agent(str(config.out), policy, spec).to(device)
 
     # Losses and optimizers.
-    policy_loss = processes.share(BCLoss(policy))
+    policy_loss = processes.wrap_ddp(BCLoss(policy))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
 

@@ -24,8 +24,8 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
     agent = Agent(str(config.out), policy, spec, goals).to(device)
 
     # Losses and optimizers.
-    policy_loss = processes.share(BCLoss(policy))
-    goal_loss = processes.share(GoalLoss(goals))
+    policy_loss = processes.wrap_ddp(BCLoss(policy))
+    goal_loss = processes.wrap_ddp(GoalLoss(goals))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
 

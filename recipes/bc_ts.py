@@ -39,8 +39,8 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
-    policy_loss = processes.share(DistillationLoss(policy))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator))
+    policy_loss = processes.wrap_ddp(DistillationLoss(policy))
+    realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
 

@@ -18,7 +18,7 @@ from symphony.collectors import BeamSearchCollector, with_rows
 from symphony.config.training import GOALS
 from symphony.learning import SceneDataset, SearchReplay, with_survivors
 from symphony.modules import SeededNoise
-from symphony.rollouts.search import branched_streams, collector_settings, pruning_rule, realism_score
+from symphony.rollouts.search import collector_settings, pruning_rule, realism_score, with_drawn_goals
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
@@ -34,22 +34,22 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     policy, goals, discriminator = policy_network(spec), goal_network(spec), discriminator_network(spec)
     agent = Agent(str(config.out), policy, spec, goals, discriminator).to(device)
 
-    # Environment and collector: the discriminator prunes branches that follow the routes of the log.
+    # Environment and collector: the discriminator prunes branches whose routes the goal policy draws.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
     collector = BeamSearchCollector(
         with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
-        prepare=lambda start: env.with_goals(branched_streams(start)),
+        prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
         **collector_settings(config.search, env, seed, data, config.segments),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
-    policy_loss = processes.share(DistillationLoss(policy))
-    goal_loss = processes.share(GoalLoss(goals))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator))
+    policy_loss = processes.wrap_ddp(DistillationLoss(policy))
+    goal_loss = processes.wrap_ddp(GoalLoss(goals))
+    realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
 

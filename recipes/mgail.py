@@ -39,9 +39,9 @@ def mgail(config: TrainConfig, processes: Processes) -> Trainer:
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
-    regression_loss = processes.share(BCLoss(policy))
-    mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator))
+    regression_loss = processes.wrap_ddp(BCLoss(policy))
+    mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
     seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device

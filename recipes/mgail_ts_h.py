@@ -12,7 +12,7 @@ from symphony.config.training import GOALS
 from symphony.envs import Displacement, DrivingEnv
 from symphony.learning import SceneDataset, SearchReplay
 from symphony.modules import SeededNoise
-from symphony.rollouts.search import branched_streams, collector_settings, pruning_rule, realism_score
+from symphony.rollouts.search import collector_settings, pruning_rule, realism_score, with_drawn_goals
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
@@ -27,22 +27,22 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     policy, goals, discriminator = policy_network(spec), goal_network(spec), discriminator_network(spec)
     agent = Agent(str(config.out), policy, spec, goals, discriminator).to(processes.device)
 
-    # Environment and collector: the discriminator prunes branches that follow the routes of the log.
+    # Environment and collector: the discriminator prunes branches whose routes the goal policy draws.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     collector = BeamSearchCollector(
         with_rows(env, [min(config.segments, len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
-        prepare=lambda start: env.with_goals(branched_streams(start)),
+        prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
         **collector_settings(config.search, env, seed, data, config.segments),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 
     # Losses and optimizers.
-    regression_loss, goal_loss = processes.share(BCLoss(policy)), processes.share(GoalLoss(goals))
-    mgail_loss = processes.share(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
-    realism_loss = processes.share(DiscriminatorLoss(discriminator))
+    regression_loss, goal_loss = processes.wrap_ddp(BCLoss(policy)), processes.wrap_ddp(GoalLoss(goals))
+    mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)
     seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device

@@ -24,7 +24,8 @@ from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, Valid
 from symphony.errors import ConfigError
 from symphony.learning import SceneDataset
 from symphony.recipes import recipe_of, train
-from symphony.training import Processes, Trainer, processes
+from symphony.training import Processes, Trainer
+from symphony.training.processes import processes
 
 WORLD = 2
 LOSSES = {"bc": "policy_loss", "distillation": "policy_loss", "goals": "goal_loss", "realism": "realism_loss"}
@@ -141,7 +142,7 @@ def main(rank: int, store: Path, out: Path) -> None:
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     found: dict[str, Any] = {}
     with processes(CPU) as world:
-        found["world"] = [world.rank, world.count, world.leads]
+        found["world"] = [world.rank, world.count, world.is_main]
         found["mean"] = {
             name: value.item()
             for name, value in world.mean(

@@ -16,7 +16,7 @@ from typing import Any
 import helpers_runs
 from symphony.config import TrainConfig, ValidationConfig
 from symphony.recipes import train
-from symphony.training import Trainer, validation
+from symphony.training import Trainer, hooks
 from symphony.training import trainer as training
 from symphony.training.logging import Tracker
 
@@ -24,7 +24,7 @@ STEPS = 8
 OWNERS = {
     "_update": Trainer,
     "log": Tracker,
-    "evaluate_dataset": validation,
+    "evaluate_dataset": hooks,
     "fsync": os,
     "rename": Path,
     "replace": Path,

@@ -14,7 +14,7 @@ from torch import Tensor
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
 from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig
-from symphony.recipes import recipe_of
+from symphony.recipes import trainer_of
 from symphony.training import Processes, Trainer
 
 
@@ -38,8 +38,8 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 def build(config: TrainConfig) -> Trainer:
-    """What the recipe of a configuration builds, before any training."""
-    return recipe_of(config.method)(config, Processes(torch.device("cpu")))
+    """What the recipe of a configuration builds, with its hooks, before any training."""
+    return trainer_of(config, Processes(torch.device("cpu")))
 
 
 def pieces(trainer: Trainer) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import Polylines, RunSegment
 from symphony.data.store import SegmentStore
 from symphony.learning.demonstrations import SceneDataset
-from symphony.rollouts.driving import driven_by
+from symphony.rollouts.driving import simulate_batch
 from symphony.saved.folder import About
 from symphony.saved.rollouts import SavedRollouts, SavedTrees, saved_rollouts
 
@@ -73,9 +73,9 @@ def _searched(count: int, rollouts: int, branches: int, duration: int) -> tuple[
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
     indices = range(count)
     dataset = SceneDataset(store, agent.interactive, agent.dynamics, indices, routes=True, duration=duration)
-    config = EvaluateConfig(rollouts=rollouts, branches=branches)
+    config = EvaluateConfig(search="tree", score="discriminator", rollouts=rollouts, branches=branches)
     scenes = dataset.scenes(indices)
-    found = driven_by(agent, scenes, config, keep_tree=True)
+    found = simulate_batch(agent, scenes, config, keep_tree=True)
     saved = [
         saved_rollouts(
             dataset.segment(b).replace(group=store.tags(b)["network"]),

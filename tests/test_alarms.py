@@ -21,13 +21,11 @@ from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony.agents.choice import choose
 from symphony.cli import main
-from symphony.errors import SymphonyError
 from symphony.objectives import BCLoss
 from symphony.recipes import train
 from symphony.training import Trainer
-from symphony.training.alarms import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, loss_of
 from symphony.training.logging import read_metrics
-from symphony.training.phases import Updates
+from symphony.training.trainer import ALARMS, PATIENCE, WINDOW, Alarms, Skips, TrainingError, Updates
 
 NAN, INF = math.nan, math.inf
 
@@ -64,19 +62,6 @@ def test_an_update_without_a_network_neither_counts_nor_forgives() -> None:
         skips.count({})
     with pytest.raises(TrainingError, match="the policy network was not finite in 20 updates in a row"):
         skips.count(norms(policy=INF))
-
-
-def test_giving_up_names_the_loss() -> None:
-    values = {"loss_bc": torch.tensor(2.0), "loss_policy": torch.tensor(NAN), **norms(policy=NAN)}
-    assert [loss_of(name) for name in ("policy", "goals")] == ["loss_policy", "loss_goals"]
-    skips = Skips(in_row={"policy": PATIENCE - 1})
-    with pytest.raises(TrainingError, match=r"policy network \(loss_policy is nan\)") as caught:
-        skips.count(values)
-    assert isinstance(caught.value, SymphonyError)
-    # Not that of another network, where its own is not known.
-    skips = Skips(in_row={"goals": PATIENCE - 1})
-    with pytest.raises(TrainingError, match="gradient of the goals network was not finite"):
-        skips.count({**values, **norms(goals=NAN)})
 
 
 def alarms(*values: float | None) -> list[str | None]:
@@ -213,13 +198,3 @@ def test_a_discriminator_that_has_won_raises_an_alarm(
     train(tiny("bc_ts", store, settings.out, steps=WINDOW + 4, checkpoint_every=2, resume=True))
     after = (settings.out / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(a).get("alarm") for a in after] == [json.loads(b).get("alarm") for b in before]
-
-
-def test_the_line_of_progress_tells_speed_and_time_left(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    train(tiny("bc", store, tmp_path / "run"))
-    printed = capsys.readouterr()
-    assert "updates/s" in printed.err
-    assert "left 0:00:00" in printed.err
-    assert printed.out == ""

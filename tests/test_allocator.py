@@ -55,11 +55,6 @@ def test_memory_is_kept_once_it_is_set() -> None:
     assert returned > 100
 
 
-@pytest.mark.skipif(not GLIBC, reason="not glibc")
-def test_settings_of_the_user_take_precedence() -> None:
-    assert outcome(MALLOC_TOP_PAD_="1024")[0] is False
-
-
 BESIDE = """
 import re, sys, numpy as np
 from symphony import allocator
@@ -92,18 +87,6 @@ def test_training_gives_back_at_every_record(tmp_path: Path, monkeypatch: pytest
     assert len(calls) == 3  # after 2 and 4 updates, and at the end
 
 
-def test_whoever_sets_it_otherwise_keeps_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SYMPHONY_MALLOPT", "0")
-    assert allocator.release() is False
-
-
-def test_nothing_happens_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("SYMPHONY_MALLOPT", raising=False)
-    monkeypatch.setattr(platform, "system", lambda: "Darwin")
-    assert allocator.tune() is False
-    assert allocator.release() is False
-
-
 def test_the_command_sets_it_for_a_process_of_its_own_only(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
     monkeypatch.setattr(allocator, "tune", lambda: calls.append(1))
@@ -118,22 +101,3 @@ def test_the_command_sets_it_for_a_process_of_its_own_only(monkeypatch: pytest.M
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     assert cli.main() == 0
     assert os.environ["OMP_WAIT_POLICY"] == "active"
-
-
-def test_threads_wait_as_the_command_has_set_it() -> None:
-    given = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    # A short command that needs torch.
-    show = ["data", "info", str(builtin_store("test"))]
-    script = f"import sys; from symphony.cli import main; sys.argv = ['symphony', *{show}]; main()"
-    # The library tells what it was loaded with.
-    shown = subprocess.run(
-        [sys.executable, "-c", script],
-        env=given | {"OMP_DISPLAY_ENV": "true"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    told = shown.stdout + shown.stderr
-    if "OMP_WAIT_POLICY = '" not in told:
-        pytest.skip("this torch has another library of threads")
-    assert "OMP_WAIT_POLICY = 'PASSIVE'" in told

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from helpers_segments import crossing, straight_road
-from symphony import keys
+from symphony import keys, load_agent
 from symphony.collectors import Backtrack
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
@@ -22,7 +24,7 @@ from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.records import evaluation_record, simulation_way
 from symphony.rollouts.crowd import crowd_dataset
-from symphony.rollouts.driving import Simulation, search_kind, simulation
+from symphony.rollouts.driving import Simulation, filled_lines, simulation
 from symphony.rollouts.search import rule_score
 from symphony.rollouts.unroll import Rollouts
 from test_search import SEGMENTS, blocked, make_agent
@@ -114,7 +116,7 @@ def test_who_begins_again_draws_goals_anew(store: SegmentStore, monkeypatch: pyt
     assert torch.equal(logged.goal, routes.route_logged[:, None].expand_as(logged.goal))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_rule_is_that_of_the_gaps_agents_may_observe(seed: int) -> None:
     scenes = scene(
         crossing(6, seed=seed, steps=12) if seed % 2 else straight_road(6, seed=seed, steps=12), [0, 1, 2]
@@ -161,9 +163,36 @@ def test_what_is_searched_for_is_on_record(store: SegmentStore) -> None:
 
 def test_agents_without_a_discriminator_are_searched_by_what_they_do(store: SegmentStore) -> None:
     blind = replace(make_agent(), discriminator=None)
-    assert search_kind(blind, EvaluateConfig()) == "none"
-    assert search_kind(blind, EvaluateConfig(score="rule")) == "tree"
+    assert blind.plan(EvaluateConfig()).kind == "none"
+    assert blind.plan(EvaluateConfig(rollouts=1, score="rule")).kind == "tree"
     assert evaluate(blind, store, replace(LINES, rollouts=2)).search == "backtrack"
     assert evaluate("constant_velocity", store, replace(LINES, rollouts=1)).search == "backtrack"
     with pytest.raises(ConfigError, match="another score: --score flags or rule"):
-        search_kind(blind, EvaluateConfig(search="backtrack"))
+        blind.plan(EvaluateConfig(search="backtrack"))
+
+
+@given(st.integers(1, 6), st.integers(1, 9), st.integers(0, 1000))
+def test_bad_lines_are_filled_from_good_ones_in_turn(scenes: int, lines: int, seed: int) -> None:
+    totals = torch.rand(scenes, lines, 3, generator=torch.Generator().manual_seed(seed))
+    found = filled_lines(totals, 0.8)
+    good = (totals <= 0.8).all(-1)
+    for row, is_good in zip(found, good, strict=True):
+        if not is_good.any():
+            assert row.tolist() == list(range(lines))
+            continue
+        assert bool(is_good[row].all())
+        assert row[is_good].tolist() == is_good.nonzero().flatten().tolist()
+        copies = torch.bincount(row, minlength=lines)[is_good]
+        assert copies.max() - copies.min() <= 1
+
+
+def test_included_agents_go_back_by_the_rule_and_others_search_as_they_learned() -> None:
+    for name in ("bc_ts_h", "mgail_ts_h"):
+        agent = load_agent(f"pretrained:{name}")
+        assert agent.plan(EvaluateConfig()).kind == "backtrack"
+        assert agent.plan(EvaluateConfig()).search.score == "rule"
+        assert EvaluateConfig().pruning(agent.search).threshold == 0
+        assert agent.plan(EvaluateConfig(search="tree")).kind == "tree"
+        assert agent.plan(EvaluateConfig(score="discriminator")).search.score == "discriminator"
+    plan = make_agent().plan(EvaluateConfig(rollouts=4))
+    assert (plan.kind, plan.trees, plan.taken, plan.search.score) == ("tree", 1, 4, "discriminator")

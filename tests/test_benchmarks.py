@@ -89,3 +89,12 @@ def test_dense_counts_the_operations_of_every_element(program: Any) -> None:
     assert found["dense"][:2] == (forward, forward + 2 * 200 * 4 * 5)
     assert found["auto"][1] < found["dense"][1] / 10
     torch.testing.assert_close(found["auto"][2], found["dense"][2])
+
+
+def test_a_step_and_an_update_start_no_more_operators_than_they_did(program: Any) -> None:
+    """Each is a launch on a device. Whoever needs more raises the bound, and says why."""
+    launches = program("launches")
+    step = launches.of_a_search_step()
+    assert step["environment"] <= 830
+    assert step.total() - step["environment"] <= 200
+    assert launches.of_an_update("bc") <= 3700

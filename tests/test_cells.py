@@ -23,8 +23,7 @@ from symphony.envs.road import road_distance
 from symphony.envs.tables import Tables
 from symphony.geometry import NO_BOUNDARY, segments_of
 from symphony.geometry.cells import EdgeCells, PointCells
-from symphony.geometry.edges import Edges
-from symphony.geometry.nearest import kth_smallest, nearest, smallest
+from symphony.geometry.nearest import nearest, smallest
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
 
@@ -109,7 +108,7 @@ def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) 
     assert (distance[row == len(scenes) - 1] == NO_BOUNDARY).all()
     visited = tables.edge_cells.begin >= 0
     assert 0.01 < visited.mean() < 0.5
-    assert 0.3 < (tables.edge_cells.sign[visited] != 0).mean() < 1
+    assert 0.3 < (tables.edge_cells.sign[:-1][visited] != 0).mean() < 1
 
 
 @pytest.mark.usefixtures("at_once")
@@ -254,7 +253,8 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
     values[values == 5] = np.inf
     if spoiled:
         values[rng.random(values.shape) < 0.2] = np.nan
-    expected = np.sort(np.argsort(values, axis=-1, kind="stable")[:, :count], axis=-1)
+    ordered = np.argsort(np.where(np.isnan(values), np.inf, values), axis=-1, kind="stable")
+    expected = np.sort(ordered[:, :count], axis=-1)
     found = smallest(values, count).reshape(rows, -1) - np.arange(rows)[:, None] * width
     np.testing.assert_array_equal(found, expected)
     index, finite = nearest(torch.from_numpy(values), count)
@@ -271,52 +271,14 @@ def test_ties_of_one_row_do_not_make_up_for_numbers_that_another_lacks() -> None
     assert smallest(values, 2).tolist() == [0, 1, 4, 6]
 
 
-@settings(max_examples=60)
-@given(
-    st.integers(1, 5),
-    st.integers(1024, 1400),
-    st.integers(1, 200),
-    st.integers(0, 10**6),
-    st.sampled_from(
-        ["even", "equal", "ascending", "descending", "where looked", "where not looked", "negative, too"]
-    ),
-    st.floats(0, 0.99),
-    st.sampled_from([0.0, 0.3, 1.0]),
-)
-def test_in_long_rows_they_are_the_same(
-    rows: int, width: int, count: int, seed: int, kind: str, padded: float, spoiled: float
-) -> None:
-    """However uneven the share is that gives a bound."""
-    rng = np.random.default_rng(seed)
-    values = rng.exponential(10.0, (rows, width)).astype(np.float32)
-    place = np.arange(width) % 4
-    values = {
-        "even": values,
-        "equal": values.round(-1),
-        "ascending": np.sort(values),
-        "descending": -np.sort(-values),
-        "where looked": values + 100 * (place != 0),
-        "where not looked": values + 100 * (place == 0),
-        "negative, too": values - 10,
-    }[kind].astype(np.float32)
-    values[0, rng.random(width) < spoiled] = np.nan
-    values[-1, rng.random(width) < padded] = np.inf
-    np.testing.assert_array_equal(kth_smallest(values.copy(), count), np.sort(values)[:, count - 1 : count])
-    expected = np.sort(np.argsort(values, axis=-1, kind="stable")[:, :count], axis=-1)
-    before = values.copy()
-    found = smallest(values, count).reshape(rows, -1) - np.arange(rows)[:, None] * width
-    np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(values, before)
-
-
 @pytest.mark.parametrize("shift", [0.0, 3e4])
 def test_lists_hold_every_element_that_can_be_nearest(shift: float) -> None:
     rng = np.random.default_rng(7)
     line = (np.cumsum(rng.normal(0, 2, (900, 2)), 0) + shift).astype(np.float32)
     start, end, number, k = line[:-1], line[1:], np.arange(899), 20
-    edges = Edges.of(start, end, np.ones(899, bool), number - 1, np.where(number < 898, number + 1, -1))
     near_points = PointCells(*line.T.copy()[:, None], k)
-    near_edges = EdgeCells(edges, np.ones((1, 899), bool))
+    following = np.where(number < 898, number + 1, -1)
+    near_edges = EdgeCells(start, end, np.ones((1, 899), bool), number - 1, following)
     for cells in (near_points, near_edges):
         columns, count = int(cells.columns[0]), len(cells.begin)
         cell = rng.integers(0, count, 300)
@@ -340,8 +302,7 @@ def test_maps_without_elements_have_no_cells() -> None:
     assert len(PointCells(none, none, 1).begin) == len(PointCells(three, three, 2).begin) == 0
     assert len(PointCells(three, three, 1).begin) > 0
     ends = np.zeros((4, 2), np.float32)
-    nowhere = Edges.of(ends, ends, np.zeros(4, bool), np.full(4, -1), np.full(4, -1))
-    cells = EdgeCells(nowhere, np.zeros((2, 2), bool))
+    cells = EdgeCells(ends, ends, np.zeros((2, 2), bool), np.full(4, -1), np.full(4, -1))
     assert (cells.locate(np.array([0, 1]), np.zeros(2), np.zeros(2)) == -1).all()
 
 

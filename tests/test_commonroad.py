@@ -13,16 +13,14 @@ from helpers_sources import (
     lanelet,
     obstacle,
     off_road,
-    read_error,
     read_one,
     state,
 )
 from helpers_sources import convert_xml as convert
-from symphony.data.segment import AgentType, RunSegment, SignalState, content_hash
+from symphony.data.segment import RunSegment, content_hash
 from symphony.data.sources import get_reader
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError
 
 VERSIONS = ["2018b", "2020a"]
 
@@ -61,18 +59,6 @@ def test_the_two_versions_say_the_same(path: Path) -> None:
     assert content_hash(found[0]) == content_hash(found[1])
 
 
-def test_steps_need_not_begin_at_zero(path: Path) -> None:
-    segment = convert(
-        path,
-        ROAD,
-        driver(7, steps=range(40, 45)),
-        driver(8, steps=range(43, 47)),
-        driver(9, steps=range(40, 47)),
-    )
-    assert (segment.num_steps, segment.agent_id[segment.ego]) == (7, 9)
-    np.testing.assert_array_equal(segment.valid[1], [0, 0, 0, 1, 1, 1, 1])
-
-
 def test_static_obstacles_rest_at_every_step(path: Path) -> None:
     parked = obstacle(9, [state(0, 20, -1, 0.3, 7.0)], kind="parkedVehicle", role="static")
     segment = convert(path, ROAD, parked, driver(7))
@@ -81,34 +67,6 @@ def test_static_obstacles_rest_at_every_step(path: Path) -> None:
     assert not segment.velocity[1].any()
     np.testing.assert_allclose(segment.heading[1], 0.3)
     np.testing.assert_allclose(segment.position[1], [[20, -1, 0]] * 5, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("kind", "expected"),
-    [
-        ("car", AgentType.VEHICLE),
-        ("bus", AgentType.VEHICLE),
-        ("motorcycle", AgentType.VEHICLE),
-        ("pedestrian", AgentType.PEDESTRIAN),
-        ("bicycle", AgentType.CYCLIST),
-        ("unknown", AgentType.OTHER),
-        ("spaceship", AgentType.OTHER),
-    ],
-)
-def test_types(path: Path, kind: str, expected: AgentType) -> None:
-    other = obstacle(8, [state(k, 20.0, 0) for k in range(5)], kind=kind)
-    assert convert(path, ROAD, driver(7), other).agent_type.tolist() == [AgentType.VEHICLE, expected]
-
-
-def test_scenery_is_left_out(path: Path) -> None:
-    house = obstacle(8, [state(0, 20.0, 30.0)], kind="building", role="static")
-    assert convert(path, ROAD, driver(7), house).agent_id.tolist() == [7]
-
-
-def test_the_velocity_points_along_the_orientation(path: Path) -> None:
-    turned = obstacle(8, [state(k, 20, k, 2.0, 5.0) for k in range(5)])
-    segment = convert(path, ROAD, driver(7), turned)
-    np.testing.assert_allclose(segment.velocity[1], [[5 * np.cos(2), 5 * np.sin(2)]] * 5, rtol=1e-5)
 
 
 def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:
@@ -229,64 +187,4 @@ def test_the_boundary_is_open_where_the_network_is_cut(path: Path) -> None:
             assert np.sign(np.diff(line[:, 0])).tolist() == [-np.sign(line[0, 1])] * (len(line) - 1)
 
 
-def test_an_unknown_choice_of_egos_is_refused() -> None:
-    with pytest.raises(ConfigError, match="'one' or 'all'"):
-        get_reader("commonroad", egos="some")
-
-
-def test_precision_far_from_the_origin(path: Path) -> None:
-    def shifted(by: float) -> RunSegment:
-        road = lanelet(10, [(by, 2), (by + 50, 2)], [(by, -2), (by + 50, -2)])
-        return convert(path, road, driver(7, x=by), driver(8, x=by + 17.125))
-
-    near, far = shifted(0), shifted(5_000_000)
-    np.testing.assert_allclose(near.position, far.position, atol=1e-6)
-    np.testing.assert_allclose(near.road.lanes.points, far.road.lanes.points, atol=1e-6)
-
-
 # Real files.
-
-
-@pytest.mark.samples
-def test_every_sample_reads(samples: Path) -> None:
-    files = sorted((samples / "commonroad").rglob("*.xml"))
-    assert len(files) == 26
-    for file in files:
-        if "Starnberg" in file.name:
-            error = read_error("commonroad", file)
-            assert (error.message, error.segment) == ("has no dynamic obstacles", "DEU_Starnberg-1_1_T-1")
-            continue
-        segment = read_one("commonroad", file)
-        assert segment.segment_id == file.stem
-        assert segment.valid[segment.ego].all()
-        assert_drives_on_its_lanes(segment)
-
-
-def assert_drives_on_its_lanes(segment: RunSegment) -> None:
-    """Moving vehicles are on the drivable side of the boundary and head along a lane near them."""
-    moving = segment.valid & (np.hypot(*np.moveaxis(segment.velocity, -1, 0)) > 3)
-    spots = segment.position[moving][:, :2].astype(float)
-    assert (off_road(segment.road, spots) < 0.3).mean() > 0.97, segment.segment_id
-    lanes = [segment.road.lanes[k][:, :2] for k in range(len(segment.road.lanes))]
-    starts = np.concatenate([(line[:-1] + line[1:]) / 2 for line in lanes])
-    steps = np.concatenate([np.diff(line, axis=0) for line in lanes])
-    some = np.arange(0, len(spots), 37)
-    offset = np.hypot(*np.moveaxis(spots[some, None] - starts, -1, 0))
-    angle = np.arctan2(steps[:, 1], steps[:, 0]) - segment.heading[moving][some, None]
-    aligned = ((offset < 20) & (np.cos(angle) > 0.9)).any(axis=1)
-    assert aligned.mean() > 0.9, segment.segment_id
-
-
-@pytest.mark.samples
-def test_sample_agrees_with_a_direct_look(samples: Path) -> None:
-    segment = read_one("commonroad", samples / "commonroad" / "USA_Lanker-1_1_T-1.xml")
-    k = segment.agent_id.tolist().index(1213)
-    assert segment.num_agents == 24
-    np.testing.assert_allclose(segment.size[k], [3.1699, 2.0726, 0], rtol=1e-6)
-    np.testing.assert_allclose(segment.position[k, 1, :2] + segment.origin[:2], [7.1255, 15.1052], atol=1e-4)
-    np.testing.assert_allclose(np.hypot(*segment.velocity[k, 2]), 9.7566, rtol=1e-5)
-    assert segment.heading[k, 1] == np.float32(1.0983)
-    assert len(segment.road.lane_id) == 91
-    light = read_one("commonroad", samples / "commonroad" / "USA_Peach-4_8_T-1.xml")
-    assert len(light.signal_lane) == 16
-    assert set(np.unique(light.signal_state)) <= {SignalState.STOP, SignalState.CAUTION, SignalState.GO}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from helpers_sources import ROAD, bound, driver, lanelet, off_road, signed_area
 from helpers_sources import convert_xml as convert
-from symphony.data.segment import LaneType, MarkType, SignalState
+from symphony.data.segment import MarkType, SignalState
 from symphony.data.sources.lines import SLIT, drivable_rings
 
 
@@ -61,23 +61,6 @@ def test_speed_limits_of_either_version(path: Path) -> None:
         assert found == expected or (expected is None and np.isnan(found))
 
 
-@pytest.mark.parametrize(
-    ("inner", "tags", "expected"),
-    [
-        ("<laneletType>highway</laneletType>", "", LaneType.FREEWAY),
-        ("<laneletType>urban</laneletType>", "highway", LaneType.SURFACE_STREET),
-        ("<laneletType>urban</laneletType><laneletType>bicycleLane</laneletType>", "", LaneType.BIKE_LANE),
-        ("<laneletType>unknown</laneletType>", "", LaneType.UNDEFINED),
-        ("", "multi_lane highway comfort", LaneType.FREEWAY),
-        ("", "urban", LaneType.SURFACE_STREET),
-        ("", "", LaneType.UNDEFINED),
-    ],
-)
-def test_lane_types(path: Path, inner: str, tags: str, expected: LaneType) -> None:
-    lane = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], inner)
-    assert convert(path, lane, driver(7), tags=tags).road.lane_type.tolist() == [expected]
-
-
 def test_walkways_are_no_lanes(path: Path) -> None:
     walk = lanelet(20, [(0, 4), (50, 4)], [(0, 2), (50, 2)], "<laneletType>sidewalk</laneletType>")
     cross = lanelet(21, [(20, 2), (20, -2)], [(18, 2), (18, -2)], "<laneletType>crosswalk</laneletType>")
@@ -115,11 +98,6 @@ def test_painted_lines_are_marks_and_shared_ones_count_once(path: Path) -> None:
     road = convert(path, low, high, driver(7)).road
     assert road.mark_type.tolist() == [MarkType.ROAD_LINE] * 2
     assert sorted(road.marks.points[:, 1].tolist()) == [2, 2, 6, 6]
-
-
-def test_lanelets_of_one_point_go_with_all_that_refers_to_them(path: Path) -> None:
-    dot = lanelet(12, [(100, 2)], [(100, -2)], '<predecessor ref="11"/>')
-    assert convert(path, ROAD, dot, driver(7)).road.successors.tolist() == [[0, 1]]
 
 
 def test_boundary_rings_have_the_drivable_side_on_their_left(path: Path) -> None:
@@ -182,13 +160,6 @@ def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:
     assert union.difference(rebuilt.buffer(0.05)).area < 0.05
 
 
-def test_slits_between_lanelets_are_no_boundary() -> None:
-    low = np.array([[0, 0], [50, 0], [50, 4], [0, 4], [0, 0.0]])
-    near, far = (low + np.array([0, 4 + gap * SLIT]) for gap in (1.5, 3))
-    assert len(drivable_rings([low, near])) == 1
-    assert len(drivable_rings([low, far])) == 2
-
-
 LIGHT = (
     '<trafficLight id="30"><cycle>'
     "<cycleElement><duration>3</duration><color>green</color></cycleElement>"
@@ -235,20 +206,3 @@ def test_a_light_repeats_its_cycle_from_the_offset(path: Path, offset: int) -> N
 )
 def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: list[int]) -> None:
     assert convert(path, FORK, TURNS, light(direction=direction), driver(7)).signal_lane.tolist() == lanes
-
-
-def test_a_light_at_the_end_of_the_map_holds_for_its_own_lanelet(path: Path) -> None:
-    segment = convert(path, APPROACH, light(), driver(7))
-    assert segment.signal_lane.tolist() == [0]
-
-
-def test_stop_lines_that_are_drawn_count(path: Path) -> None:
-    line = "<stopLine><point><x>47</x><y>2</y></point><point><x>47</x><y>-2</y></point></stopLine>"
-    marked = APPROACH.replace("<trafficLightRef", line + "<trafficLightRef", 1)
-    segment = convert(path, marked, light(), driver(7))
-    np.testing.assert_allclose(segment.signal_point + segment.origin, [[47, 0, 0]], atol=1e-5)
-
-
-def test_switched_off_and_dangling_lights(path: Path) -> None:
-    assert not convert(path, FORK, light(active="false"), driver(7)).signal_state.any()
-    assert len(convert(path, FORK, driver(7)).signal_lane) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,8 @@ from hypothesis import strategies as st
 from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
 from symphony.data import context as contexts
 from symphony.data.context import CONFLICT_GAP, Context, relations
-from symphony.data.resample import smooth
 from symphony.data.segment import RunSegment
-from symphony.data.selection import choices, interactive_agents, interactive_choice
+from symphony.data.selection import choices, interactive_choice
 
 STEPS, DT = 51, 0.2
 TIME = np.arange(STEPS) * DT
@@ -148,26 +146,6 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
     assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
 
 
-@pytest.mark.parametrize("case", sorted(CASES))
-def test_headings_on_both_sides_of_the_turn_are_alike(case: str) -> None:
-    """Westward one heading is a little below 180 degrees and another a little above -180."""
-    context, paths = CASES[case]
-    segment = scene(paths)
-    segment = segment.replace(
-        heading=segment.heading + np.where(np.arange(len(paths)) % 2, 0.03, -0.03)[:, None]
-    )
-    turn = np.array([[0, 1], [-1, 0]], np.float32)
-    west = segment.replace(
-        position=np.concatenate([segment.position[..., :2] @ turn, segment.position[..., 2:]], -1),
-        heading=np.angle(np.exp(1j * (segment.heading + np.pi / 2))),
-        velocity=segment.velocity @ turn,
-    )
-    for each in (segment, west):
-        choice = interactive_choice(each, 2)
-        assert choice.context == context
-        assert choice.agents.tolist() == [0, 1]
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     st.floats(3, 25),
@@ -216,38 +194,6 @@ def test_relations_are_mutual(seed: int, make: Any) -> None:
         assert np.isfinite(here.crossing[0]) == np.isfinite(there.crossing[0])
 
 
-def test_one_vehicle_at_a_time_gives_the_same() -> None:
-    segment = crossing(num_agents=9, seed=3)
-    others = np.arange(1, 9)
-    together = relations(segment, others)
-    for k, other in enumerate(others):
-        alone = relations(segment, np.asarray([other]))
-        for name in ("merge", "crossing", "leader", "follower"):
-            assert getattr(alone, name)[0] == getattr(together, name)[k]
-
-
-def test_contexts_come_in_their_order() -> None:
-    merge, cross, lead = (CASES[name][1][1] for name in ("turns in before", "crosses", "leads"))
-    ego = (NORTH, north(-40))
-    lead = (NORTH, north(-24))
-    found = []
-    present = [ego, merge, cross, lead, (BESIDE, north(-39))]
-    while len(present) > 1:
-        choice = interactive_choice(scene(present), 2)
-        found.append(str(choice.context))
-        del present[choice.agents[1]]
-    assert found == ["merge", "crossing", "leader", "nearest"]
-
-
-def test_marks_of_the_source_come_before_geometry() -> None:
-    segment = scene(CASES["crosses"][1])
-    two, three = np.asarray([2], np.int32), np.asarray([3], np.int32)
-    both = interactive_choice(segment.replace(interest=two, predict=three), 2)
-    assert (both.context, both.agents.tolist()) == (Context.INTEREST, [0, 2])
-    only = interactive_choice(segment.replace(predict=three), 2)
-    assert (only.context, only.agents.tolist()) == (Context.PREDICT, [0, 3])
-
-
 def test_a_partner_that_is_seen_throughout_goes_first() -> None:
     context, paths = CASES["crosses"]
     segment = hide(scene(paths), 1, slice(STEPS - 1, STEPS))
@@ -255,19 +201,6 @@ def test_a_partner_that_is_seen_throughout_goes_first() -> None:
     assert (choice.context, choice.agents.tolist()) == (Context.FOLLOWER, [0, 2])
     alone = hide(scene(paths[:2]), 1, slice(STEPS - 1, STEPS))
     assert interactive_choice(alone, 2).context == context
-
-
-def test_the_rest_are_the_nearest_and_none_comes_twice() -> None:
-    segment = scene(CASES["crosses"][1])
-    choice = interactive_choice(segment, 4)
-    first = np.linalg.norm(segment.position[:, 0, :2] - segment.position[0, 0, :2], axis=1)
-    assert choice.agents.tolist() == [0, 1, *sorted([2, 3], key=lambda k: first[k])]
-    assert interactive_agents(segment, 4).tolist() == choice.agents.tolist()
-
-
-def test_an_ego_alone_has_no_context() -> None:
-    choice = interactive_choice(scene(CASES["leads"][1]), 1)
-    assert (choice.context, choice.agents.tolist()) == (None, [0])
 
 
 def test_a_gap_in_the_track_and_no_map_do_no_harm() -> None:
@@ -307,12 +240,3 @@ def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPa
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     assert any(np.isfinite(each.merge).any() for each in whole)
     assert any(np.isfinite(each.crossing).any() for each in whole)
-
-
-def test_a_log_of_minutes_is_looked_at_in_parts() -> None:
-    log = straight_road(16, steps=1500, dt=0.1)
-    tracemalloc.start()
-    interactive_agents(smooth(log, 0.3), 2)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < 60e6  # of all steps at once it would be five times that

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from helpers_convert import FakeReader, scene
-from helpers_segments import hide
 from symphony.data.convert import Report, convert, expand, info
 from symphony.data.resample import resample, smooth
-from symphony.data.segment import RunSegment, content_hash
-from symphony.data.selection import usable
-from symphony.data.sources.base import Item
+from symphony.data.segment import content_hash
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 
@@ -59,13 +55,6 @@ def test_segments_are_smoothed_resampled_and_kept_in_order(logs: Write, out: Pat
     store.verify()
 
 
-def test_the_default_is_5_hz_without_smoothing(logs: Write, out: Path) -> None:
-    convert(FakeReader(), [logs("a.scene", "crossing 2")], out)
-    segment = SegmentStore(out)[0]
-    assert (segment.dt, segment.num_steps) == (0.2, 46)
-    np.testing.assert_allclose(segment.position, scene("crossing", 2).position[:, ::2], atol=1e-5)
-
-
 def test_bad_records_and_files_are_told_and_passed_over(logs: Write, out: Path) -> None:
     files = [
         logs("a.scene", "straight 1", "broken 5", "broken 6", "lonely 7", "straight 1", "straight 2"),
@@ -88,16 +77,6 @@ def test_bad_records_and_files_are_told_and_passed_over(logs: Write, out: Path) 
     assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
 
 
-def test_exclusions_depend_on_the_number_of_interactive_agents(logs: Write, out: Path) -> None:
-    path = logs("a.scene", "lonely 7", "straight 1", "crossing 1")
-    for count, ids in ((1, 3), (2, 2), (4, 1)):
-        convert(FakeReader(), [path], out.with_name(f"for{count}"), interactive=count)
-        found = list(SegmentStore(out.with_name(f"for{count}")))
-        assert len(found) == ids
-        for segment in found:
-            usable(segment, count)
-
-
 @pytest.mark.parametrize("parents", [0, 1])
 def test_nothing_usable_is_an_error_and_leaves_nothing(logs: Write, out: Path, parents: int) -> None:
     if not parents:
@@ -112,29 +91,6 @@ def test_nothing_usable_is_an_error_and_leaves_nothing(logs: Write, out: Path, p
     assert text.endswith("and 2 more")
     assert left(out) == []
     assert out.parent.exists() == (not parents)
-
-
-@pytest.mark.parametrize("before", [False, True])
-def test_an_interrupted_conversion_goes_on_where_it_stopped(logs: Write, out: Path, before: bool) -> None:
-    if before:
-        out.mkdir(parents=True)
-    files = [
-        logs("a.scene", "straight 1", "broken 7"),
-        logs("b.scene", "straight 2", "interrupt", "straight 3"),
-    ]
-    with pytest.raises(KeyboardInterrupt):
-        convert(FakeReader(), files, out)
-    assert left(out) == ["store"] * before + ["store.partial"]
-    assert not out.exists() or not list(out.iterdir())
-    with pytest.raises(DataError, match="unfinished conversion"):
-        SegmentStore(out)
-    reader = FakeReader()
-    reader._stops = False
-    report = convert(reader, files, out)
-    assert left(out) == ["store"]
-    assert SegmentStore(out).ids == ["straight-1", "straight-2", "straight-3"]
-    assert (report.converted, report.present, report.files) == (3, 0, 2)
-    assert [skip.message for skip in report.skipped] == ["13 is not 7"]
 
 
 def test_appending_skips_what_is_there(logs: Write, out: Path) -> None:
@@ -254,24 +210,3 @@ def test_info_counts_what_is_there(logs: Write, out: Path) -> None:
         "message": "13 is not 7",
     }
     assert found["version"] == 1
-
-
-def test_info_of_something_else_is_refused(logs: Write, out: Path) -> None:
-    path = logs("a.scene", "straight 1")
-    with pytest.raises(DataError, match="not a segment store"):
-        info(path.parent)
-    convert(FakeReader(), [path], out)
-    (out / "report.json").write_text('{"skipped": [{"why": 1}]}')
-    with pytest.raises(DataError, match="not a conversion report"):
-        info(out)
-
-
-def test_late_agents_do_not_count_at_the_first_step(logs: Write, out: Path) -> None:
-    class LateReader(FakeReader):
-        def _read(self, path: Path) -> Iterator[Item]:
-            for segment in super()._read(path):
-                assert isinstance(segment, RunSegment)
-                yield hide(hide(segment, 1, slice(0, 9)), 2, slice(0, 1))
-
-    with pytest.raises(DataError, match="has 1"):
-        convert(LateReader(), [logs("a.scene", "straight 1")], out)

@@ -14,11 +14,11 @@ from helpers_scenarionet import scenario, track, write
 from helpers_segments import crossing, straight_road
 from helpers_sources import off_road
 from symphony.data.convert import convert
-from symphony.data.crop import crop
-from symphony.data.segment import Polylines, RunSegment, content_hash, validate
+from symphony.data.segment import Polylines, content_hash, validate
 from symphony.data.selection import road_points
 from symphony.data.store import SegmentStore
-from symphony.errors import ConfigError, DataError
+from symphony.data.subset import crop
+from symphony.errors import ConfigError
 
 
 def test_all_of_a_small_segment_stays() -> None:
@@ -64,21 +64,6 @@ def test_the_boundary_near_the_ego_is_as_it_was() -> None:
     path = segment.position[segment.ego, :, :2]
     spots = np.concatenate([path + shift for shift in ((0, 0), (3, 0), (-3, 0), (0, 6), (0, -6))])
     np.testing.assert_allclose(off_road(found.road, spots), off_road(segment.road, spots), atol=1e-4)
-
-
-def far_away(segment: RunSegment) -> RunSegment:
-    """A map that begins 500 m from everybody."""
-    lanes = segment.road.lanes
-    moved = Polylines(lanes.points + np.float32([0, 500, 0]), lanes.offsets)
-    return segment.replace(road=dataclasses.replace(segment.road, lanes=moved))
-
-
-def test_what_can_not_be_cropped() -> None:
-    with pytest.raises(DataError, match="has no lanes"):
-        crop(far_away(straight_road(3)), 100)
-    for radius in (0, -1, float("nan"), float("inf")):
-        with pytest.raises(ConfigError, match="radius must be positive"):
-            crop(crossing(), radius)
 
 
 def test_a_conversion_crops(tmp_path: Path) -> None:

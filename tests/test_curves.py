@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
 
+from symphony.cli import main
+from symphony.cli.plot import run_names
 from symphony.errors import ConfigError
 from symphony.render import plot_curves
 from symphony.render.curves import DASHES, PANELS, panels_of, read_curves, run_colors, smoothed
@@ -32,16 +35,16 @@ def test_every_metric_has_a_panel_and_every_run_two_lines(tmp_path: Path) -> Non
     }
     figure = plot_curves(runs, tmp_path / "curves.png")
     titles = {axes.get_title(loc="left"): axes for axes in figure.axes}
-    assert list(titles) == ["accuracy", "discriminator AUC", "search: share in collision", "mine"]
-    assert gids_of_lines(titles["discriminator AUC"]) == [
+    assert list(titles) == ["discriminator auc", "policy accuracy", "mine", "search: share in collision"]
+    assert gids_of_lines(titles["discriminator auc"]) == [
         "raw-discriminator_auc-one",
         "discriminator_auc-one",
         "raw-discriminator_auc-two",
         "discriminator_auc-two",
     ]
-    assert gids_of_lines(titles["accuracy"]) == ["raw-policy_accuracy-one", "policy_accuracy-one"]
+    assert gids_of_lines(titles["policy accuracy"]) == ["raw-policy_accuracy-one", "policy_accuracy-one"]
     assert len(titles["search: share in collision"].lines) == 4
-    raw, strong = titles["accuracy"].lines
+    raw, strong = titles["policy accuracy"].lines
     assert raw.get_xdata().tolist() == [20 * k for k in range(1, 31)]
     assert raw.get_ydata().tolist() == list(range(30))
     assert raw.get_alpha() < 0.5
@@ -61,7 +64,6 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
     odd: list[dict[str, Any]] = [
         {"step": 1, "auc": nan, "note": "text"},
         {"step": 2, "auc": None, "flag": True},
-        {"auc": 7.0},
         {"step": 3, "auc": 0.5, "late": nan},
     ]
     curves = read_curves(odd)
@@ -92,9 +94,9 @@ def test_curves_of_choice_and_errors(tmp_path: Path) -> None:
     figure = plot_curves(runs, tmp_path / "auc.png", metrics=["auc"], window=0)
     (axes,) = figure.axes
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), axes.lines[1].get_ydata())
-    with pytest.raises(ValueError, match="no run has auk; there are auc, loss_bc"):
+    with pytest.raises(ConfigError, match="no run has auk; there are auc, loss_bc"):
         plot_curves(runs, tmp_path / "auk.png", metrics=["auk"])
-    with pytest.raises(ValueError, match="no metrics"):
+    with pytest.raises(ConfigError, match="no metrics"):
         plot_curves({"one": []}, tmp_path / "none.png")
     with pytest.raises(ConfigError, match=r"\.png"):
         plot_curves(runs, tmp_path / "curves.txt")
@@ -105,24 +107,49 @@ def test_runs_have_colours_of_their_own(count: int) -> None:
     assert len(set(run_colors(count))) == count
 
 
-def test_panels_hold_each_metric_once() -> None:
-    present = ["step_time", "accuracy_data", "auc", "nll_expert", "nll_rollout"]
-    names = [name for _, metrics in panels_of(present) for name in metrics]
-    assert sorted(names) == sorted(present)
-
-
-def test_what_belongs_together_shares_a_panel_and_how_it_ran_comes_last() -> None:
-    names = {name: title for title, metrics in PANELS for name in metrics}
-    for group in (
-        ["validation_collision_rate", "validation_offroad_time", "validation_infractions"],
-        ["validation_ade", "validation_min_sade"],
-        ["loss_mgail", "loss_policy"],
-        [f"gradient_norm_{name}" for name in ("policy", "discriminator", "goals")],
-        [f"preview_speed_log_p{q}" for q in (10, 50, 90)],
-    ):
-        assert len({names[name] for name in group}) == 1
+def test_panels_hold_each_metric_once_and_how_it_ran_comes_last() -> None:
+    grouped = [name for names in PANELS.values() for name in names]
+    quantiles = [f"preview_speed_p{q}" for q in (90, 50, 10)]
+    present = ["skipped_updates", "updates_per_second", *grouped, *quantiles, "mine", "learning_rate"]
+    panels = panels_of(present)
+    assert sorted(name for names in panels.values() for name in names) == sorted(present)
+    assert panels["preview speed"] == quantiles
+    assert panels["policy loss"] == ["loss_policy", "loss_mgail", "loss_regression"]
+    assert list(panels)[-4:] == ["mine", "updates per second", "learning rate", "skipped updates"]
     # More lines could not be told apart.
-    assert max(len(metrics) for _, metrics in PANELS) <= len(DASHES)
-    present = ["skipped_updates", "updates_per_second", "mine", "learning_rate", "discriminator_auc"]
-    order = [name for _, metrics in panels_of(present) for name in metrics]
-    assert order == ["discriminator_auc", "mine", "updates_per_second", "learning_rate", "skipped_updates"]
+    assert max(len(names) for names in panels.values()) <= len(DASHES)
+
+
+# The command line
+
+
+def record(folder: Path, **metrics: float) -> str:
+    folder.mkdir()
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in records(3, **metrics)))
+    return str(folder)
+
+
+def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, two = record(tmp_path / "one", auc=0.1), record(tmp_path / "two", auc=0.2, accuracy=1.0)
+    fresh, out = tmp_path / "fresh", str(tmp_path / "curves.png")
+    fresh.mkdir()
+    (fresh / "metrics.jsonl").touch()
+    assert main(["plot", "curves", one, two, "--out", out, "--metrics", "auc", "accuracy"]) == 0
+    assert Path(out).stat().st_size > 5_000
+    for words, expected in (
+        ([], "no runs given"),
+        (["nowhere"], "is no run"),
+        ([str(fresh)], "no metrics recorded yet"),
+        ([one, one], "given twice"),
+        ([one, "--metrics", "auk"], "no run has auk"),
+        ([one, "--window", "2"], "--window must be from 0 to 1"),
+    ):
+        assert main(["plot", "curves", *words, "--out", out]) in {1, 2}
+        assert expected in capsys.readouterr().err
+
+
+def test_runs_are_named_by_what_tells_them_apart() -> None:
+    assert run_names((Path("out/a"), Path("out/b"))) == ["a", "b"]
+    assert run_names((Path("out/a/0"), Path("out/b/0"))) == ["a/0", "b/0"]
+    with pytest.raises(ConfigError, match="given twice"):
+        run_names((Path("out/a"), Path("out/b/../a")))

@@ -78,7 +78,7 @@ def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         with StoreWriter(tmp_path / split) as writer:
             writer.append(straight_road(4, seed=seed, steps=6))
             writer.append(crossing(4, seed=seed, steps=6))
-    path = Path(__file__).resolve().parents[1] / "scripts" / "make_table.py"
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "make_table.py"
     script = runpy.run_path(str(path))
     monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)
     sizes = "--steps 2 --states 8 --agent.hidden 8 --agent.num-points 8 --search.updates 2 "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -17,14 +16,13 @@ from helpers_convert import FakeReader
 from helpers_segments import straight_road
 from helpers_sources import ROAD, commonroad, driver
 from helpers_store import fill
-from symphony import cli
 from symphony.cli import main
 from symphony.data.convert import convert
 from symphony.data.sources.base import Item
 from symphony.data.sources.sumo import process
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import DataError, printable
+from symphony.errors import DataError
 from symphony.files import replacing, write_file, write_json
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -53,10 +51,6 @@ def test_reports_show_no_control_characters(tmp_path: Path, capsys: pytest.Captu
     found = capsys.readouterr().out
     assert "a\\x1b[#Jb" in found  # numbers are blanked
     assert "\x1b[2J" not in found
-
-
-def test_printable_text_stays_as_it_is() -> None:
-    assert printable("Straße 12 … 木 [bold]") == "Straße 12 … 木 [bold]"
 
 
 def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,13 +157,6 @@ def test_a_terminated_command_says_so() -> None:
     process.terminate()
     _, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (143, "symphony: error: terminated\n")
-
-
-def test_the_signal_is_left_as_it_was() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    assert main(["--version"]) == 0
-    assert signal.getsignal(signal.SIGTERM) is before
-    assert issubclass(cli.Terminated, KeyboardInterrupt)
 
 
 def test_no_store_can_be_made_of_the_root(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

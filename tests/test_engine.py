@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import multiprocessing
 import os
@@ -17,7 +16,6 @@ from typing import Any
 import pytest
 
 from helpers_convert import FakeReader
-from symphony import parallel as engine
 from symphony.data import parts
 from symphony.data.convert import convert
 from symphony.data.store import SegmentStore
@@ -105,9 +103,7 @@ def test_an_error_comes_through_whole_and_ends_the_workers(workers: int) -> None
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_worker_that_is_killed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The other may wait for ever for a lock that died with the first.
-    monkeypatch.setattr(engine, "PATIENCE", 0.5)
+def test_a_worker_that_is_killed_is_told() -> None:
     with pytest.raises(SymphonyError, match="a worker process ended before its task was done"):
         list(ordered_map(die_at_three, range(1000), workers=2))
     with pytest.raises(WorkerError) as died:
@@ -166,31 +162,6 @@ def test_leaving_early_abandons_what_is_under_way(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["quick"]
 
 
-def goes_on(path: Path) -> None:
-    """A task that doesn't end when it is interrupted."""
-    if path.name == "quick":
-        return
-    path.touch()
-    until = time.monotonic() + 300
-    while time.monotonic() < until:
-        with contextlib.suppress(KeyboardInterrupt):
-            time.sleep(1)
-
-
-def test_a_task_that_ignores_the_interrupt_ends_with_its_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(engine, "PATIENCE", 0.5)
-    results = ordered_map(goes_on, [tmp_path / name for name in ("quick", "a", "b")], workers=2)
-    next(results)
-    while not list(tmp_path.iterdir()):
-        time.sleep(0.1)
-    begun = time.monotonic()
-    results.close()
-    assert time.monotonic() - begun < 200
-    assert not multiprocessing.active_children()
-
-
 SCRIPT = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -220,8 +191,7 @@ def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path
         assert gone(pids)
         errors = process.stderr.read()
     assert process.returncode in {-getattr(signal, how), 128 + signal.SIGINT}
-    # An interrupted task may add its own traceback to that of the main process.
-    assert ("Traceback" in errors) == (how == "SIGINT")
+    assert errors.count("Traceback") == (how == "SIGINT")
 
 
 @pytest.mark.parametrize("bad", [{"workers": 0}, {"engine": "dask"}])

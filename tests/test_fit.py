@@ -13,11 +13,11 @@ from symphony.data.segment import RunSegment
 from symphony.data.sources import get_reader
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle
-from symphony.learning.experts import experts
+from symphony.learning.experts import fit_experts
 
 
 def final_errors(segments: list[RunSegment]) -> torch.Tensor:
-    return torch.cat([experts(segment, Bicycle()).error for segment in segments])
+    return torch.cat([fit_experts([segment], Bicycle())[0].error for segment in segments])
 
 
 @pytest.mark.parametrize("split", ["train", "test"])

@@ -1,4 +1,4 @@
-"""A small part of `make fuzz` (see scripts/fuzz.py), and that it notices what it is for."""
+"""A small part of `make fuzz` (see tests/tools/fuzz.py), and that it notices what it is for."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ pytestmark = pytest.mark.skipif(
     not sys.platform.startswith("linux"), reason="memory is limited on Linux only"
 )
 if sys.platform.startswith("linux"):
-    import fuzz_run
+    import fuzz
     import fuzz_targets
+    from fuzz import BAD, Counts, attempt, from_json, inputs, run, to_json
     from fuzz_base import Target
-    from fuzz_run import BAD, Counts, attempt, from_json, fuzz, inputs, to_json
     from fuzz_targets import TARGETS
 
 NEEDS = {"argoverse2": "pyarrow"}
@@ -94,15 +94,15 @@ def misbehaves(folder: Path, file: str) -> tuple[str, str]:
 
 
 def test_whatever_goes_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz_run, "SECONDS", 1)
-    monkeypatch.setattr(fuzz_run, "WAIT", 1)
-    monkeypatch.setattr(fuzz_run, "inputs", lambda name, seed, number: {"a": bytes([number % 6])})
+    monkeypatch.setattr(fuzz, "SECONDS", 1)
+    monkeypatch.setattr(fuzz, "WAIT", 1)
+    monkeypatch.setattr(fuzz, "inputs", lambda name, seed, number: {"a": bytes([number % 6])})
     monkeypatch.setitem(TARGETS, "bad", Target(lambda: {"a": b"5"}, lambda rng, files: files, misbehaves))
     counts = Counts()
-    fuzz("bad", counts, 4)
-    fuzz("bad", counts, 9)
+    run("bad", counts, 4)
+    run("bad", counts, 9)
     expected = {"foreign": 2, "hang": 2, "memory": 2, "crash": 1, "absurd": 1, "refused": 1}
-    assert counts.outcomes == {**dict.fromkeys(fuzz_run.OUTCOMES, 0), **expected}
+    assert counts.outcomes == {**dict.fromkeys(fuzz.OUTCOMES, 0), **expected}
     assert (counts.inputs, counts.bad) == (9, 8)
     assert {kind for _, kind, _ in counts.found} == set(BAD)
     again = from_json(to_json({"bad": counts}))["bad"]

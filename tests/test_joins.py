@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import crossing_road, make_road, straight_road
+from helpers_segments import make_road, straight_road
 from symphony.data.convert import convert, info
 from symphony.data.joins import REACH, SAME, TURN, joined
 from symphony.data.report import Report
@@ -110,21 +110,6 @@ def test_ends_that_only_look_like_it() -> None:
     kinds[1] = LaneType.BIKE_LANE
     assert joined(replace(track, lane_type=kinds))[1] == 0
     assert joined(make_road([line((0, 0)), line((0, 0), (0, 0))]))[1] == 0
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 2**16))
-def test_what_is_linked_stays_as_it_is(seed: int) -> None:
-    for whole in (crossing_road(), straight_road(2, seed=seed).road):
-        road, count = joined(whole)
-        assert road is whole
-        assert count == 0
-
-
-def test_every_lane_of_a_junction_is_found_again() -> None:
-    whole = crossing_road()
-    road, _ = joined(replace(whole, successors=whole.successors[:0]))
-    assert links(road) == links(whole)
 
 
 class Cut(Reader):

@@ -1,4 +1,4 @@
-"""The harness of `make kills` (see scripts/kills.py): that it kills, goes on, and notices what differs."""
+"""The harness of `make kills` (see tests/tools/kills.py): that it kills, goes on, and notices what differs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc for CPU times")
 if sys.platform.startswith("linux"):
-    from kills_run import Target, compared, torment
+    from kills import Target, compared, torment
     from kills_targets import timeless
 
 

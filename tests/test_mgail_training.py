@@ -25,7 +25,6 @@ from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
-from symphony.render import curves
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
@@ -151,9 +150,7 @@ def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, meth
     same = (replayed[:, None] == paths[keys.STATE][None]).flatten(2).all(-1)
     assert same.any(1).all()
     assert same.any(0).all()
-    followed = env.scenes.route_logged[begin[keys.SCENE].squeeze(-1)]
-    expected = followed if method.endswith("_h") else torch.full_like(followed, -1)
-    assert torch.equal(begin[keys.GOAL], expected)
+    assert (begin[keys.GOAL] >= 0).any() == method.endswith("_h")
 
 
 def test_settings_of_the_configuration_reach_the_loss(store: Path, tmp_path: Path) -> None:
@@ -191,13 +188,6 @@ def test_a_run_that_ends_before_its_adversarial_updates_says_so(
     assert "warning: the run ends at update 4, before the first of adversarial" in capsys.readouterr().err
     train(config("mgail", store, tmp_path / "long", steps=5))
     assert "warning" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_all_that_is_recorded_has_a_panel(trained: Trained, method: str) -> None:
-    known = {name for _, names in (*curves.PANELS, *curves.LAST) for name in names}
-    recorded = {name for record in read_metrics(trained(method)) for name in record}
-    assert recorded - known == {"step"}
 
 
 @pytest.mark.parametrize(("method", "dies_at"), [("mgail", 5), ("mgail_ts_h", 3)])

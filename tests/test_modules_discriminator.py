@@ -122,15 +122,6 @@ def test_the_order_of_elements_and_their_padding_change_nothing(features):
     assert torch.equal(network(masked)[SCORE], plain)
 
 
-@pytest.mark.parametrize("features", ["foresight"])
-@torch.no_grad()
-def test_a_score_does_not_depend_on_the_batch(features):
-    td, network = observation(70), realism(features)
-    whole = network(td.clone())[SCORE]
-    for rows in (slice(0, 1), slice(5, 38), slice(66, 70)):
-        assert torch.equal(network(td[rows].clone())[SCORE], whole[rows])
-
-
 def test_each_kind_reads_what_it_needs_and_no_more():
     td = observation(4)
     reads = {

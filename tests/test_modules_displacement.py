@@ -23,7 +23,6 @@ from symphony.modules import BoundedDisplacement, ElementGroup, SeededNoise, dis
 from symphony.modules.bounded import INSIDE, SMOOTH
 from symphony.modules.displacement import _Parameters
 from symphony.objectives import BCLoss
-from symphony.streams import uniform
 from test_env import moved
 
 GROUPS = (
@@ -248,24 +247,6 @@ def test_exploration_type_decides_how_actions_are_drawn():
             assert not torch.equal(first, second)
             torch.manual_seed(5)
             assert torch.equal(actor(td.clone())[ACTION], first)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_actions_do_not_depend_on_the_batch(threads):
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        actor, td = policy(), observed(20, points=100)
-        td[NOISE] = uniform(0, torch.arange(120).view(20, 3, 2), 0)
-        with torch.no_grad():
-            whole = actor(td.clone())[ACTION]
-            for part in (slice(0, 1), slice(4, 9), slice(19, 20)):
-                assert torch.equal(actor(td[part].clone())[ACTION], whole[part])
-            forked = actor(td[:, None].expand(20, 4).contiguous())[ACTION]
-            assert torch.equal(forked, whole[:, None].expand(20, 4, 3, 2))
-            assert torch.equal(actor(td.flip(0))[ACTION], whole.flip(0))
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("angle", [0.7, -2.5])

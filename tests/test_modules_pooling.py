@@ -1,4 +1,4 @@
-"""Max-pooling through winners equals the dense one, and rows don't depend on their neighbours."""
+"""Max-pooling through winners equals the dense one, and sets do not depend on their neighbours."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from symphony.modules import in_blocks, mlp, pool_elements, pooling, rows
+from symphony.modules import mlp, pool_elements, pooling
 
 
 def make(n=7, count=60, features=5, hidden=16, share=0.6, dtype=torch.float64, seed=0):
@@ -21,9 +21,9 @@ def make(n=7, count=60, features=5, hidden=16, share=0.6, dtype=torch.float64, s
     return network, elements, mask
 
 
-def results(network, elements, mask, mode, **kwargs):
+def results(network, elements, mask, mode):
     elements = elements.clone().requires_grad_()
-    pooled = pool_elements(network, elements, mask, mode=mode, **kwargs)
+    pooled = pool_elements(network, elements, mask, mode=mode)
     weights = torch.linspace(-1, 2, pooled.numel(), dtype=pooled.dtype, device=pooled.device).view_as(pooled)
     gradients = torch.autograd.grad((pooled * weights).sum(), [elements, *network.parameters()])
     return [pooled.detach(), *gradients]
@@ -42,9 +42,10 @@ def reference(network, elements, mask):
 @pytest.mark.parametrize("mode", ["auto", "dense", "winner"])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("rows", [1, 150, 100_000])
-def test_values_and_gradients_equal_an_elementwise_reference(mode, dtype, tolerance, rows):
+def test_values_and_gradients_equal_an_elementwise_reference(mode, dtype, tolerance, rows, monkeypatch):
     network, elements, mask = make(dtype=dtype)
-    got = results(network, elements, mask, mode, rows=rows)
+    monkeypatch.setattr(pooling, "ROWS", rows)
+    got = results(network, elements, mask, mode)
     leaf = elements.clone().requires_grad_()
     pooled = reference(network, leaf, mask)
     weights = torch.linspace(-1, 2, pooled.numel(), dtype=dtype).view_as(pooled)
@@ -52,7 +53,7 @@ def test_values_and_gradients_equal_an_elementwise_reference(mode, dtype, tolera
     for a, b in zip(got, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
     with torch.no_grad():
-        again = pool_elements(network, elements, mask, mode=mode, rows=rows)
+        again = pool_elements(network, elements, mask, mode=mode)
     torch.testing.assert_close(again, pooled.detach(), rtol=tolerance, atol=tolerance)
 
 
@@ -131,116 +132,29 @@ def test_among_equal_elements_the_first_gets_the_gradient(mode):
     assert not gradient[0, 3:].any()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize(
-    # Small products add in another order where a row lies elsewhere in a tile.
-    ("count", "features", "hidden"),
-    [(16, 10, 64), (200, 9, 64), (1000, 8, 64), (16, 15, 2), (16, 5, 4), (13, 23, 8), (200, 23, 4)],
-)
-def test_without_gradients_a_result_does_not_depend_on_its_batch(threads, count, features, hidden):
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        n = 12
-        network, elements, mask = make(
-            n=n, count=count, features=features, hidden=hidden, dtype=torch.float32
-        )
-        mask[2] &= torch.arange(count) == 5
-        with torch.no_grad():
-            whole = pool_elements(network, elements, mask)
-            for part in (slice(0, 1), slice(3, 5), slice(5, 12)):
-                assert torch.equal(pool_elements(network, elements[part], mask[part]), whole[part])
-            order = torch.randperm(n)
-            assert torch.equal(pool_elements(network, elements[order], mask[order]), whole[order])
-            many = pool_elements(network, elements.repeat(20, 1, 1), mask.repeat(20, 1))
-            assert torch.equal(many, whole.repeat(20, 1))
-    finally:
-        torch.set_num_threads(before)
-
-
-def test_fewer_rows_are_multiplied_only_where_that_changes_nothing(monkeypatch) -> None:
-    network, x = mlp((5, 24, 16)), torch.randn(2048, 5)
+@pytest.mark.parametrize(("count", "hidden"), [(16, 64), (200, 64), (1000, 8), (13, 2)])
+def test_a_result_does_not_depend_on_the_sets_beside_it(count, hidden):
+    network, elements, mask = make(n=12, count=count, hidden=hidden, dtype=torch.float32)
+    mask[2] &= torch.arange(count) == 5
+    order = torch.randperm(12)
     with torch.no_grad():
-        whole = network(x.clone())
-        sizes = rows.equal_rows(network, x, 2048)
-        assert sizes[-1] == 2048
-        assert sorted(sizes) == list(sizes)
-        for size in sizes:
-            assert torch.equal(network(x[:size].clone()), whole[:size])
-        for other, given in ((network.double(), x.double()), (network.forward, x)):
-            assert rows.equal_rows(other, given, 2048) == (2048,)
-        assert rows.equal_rows(network, x, 100) in ((64, 100), (100,))
-        monkeypatch.setattr(rows, "_alike", lambda outputs, inputs, few, *_: few != 256)
-        assert rows.equal_rows(network, x, 2048) == (64, 1000, 2048)
+        whole = pool_elements(network, elements, mask)
+        for rows in (slice(0, 1), slice(5, 12), order):
+            found = pool_elements(network, elements[rows], mask[rows])
+            torch.testing.assert_close(found, whole[rows], rtol=1e-5, atol=1e-5)
+        assert torch.equal(pool_elements(network, elements, mask), whole)
 
 
-@pytest.mark.parametrize("widths", [(5, 64), (5, 64, 64)])
-def test_blocks_of_another_size_have_memory_of_their_own(widths) -> None:
-    """As many rows as channels come last."""
-    network, elements = mlp(widths), torch.randn(33, 64, 5)
-    mask = torch.ones(33, 64, dtype=torch.bool)
-    winner, dense = (results(network, elements, mask, mode) for mode in ("winner", "dense"))
-    for a, b in zip(winner, dense, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
-
-
-def test_only_valid_elements_are_encoded(monkeypatch) -> None:
-    """Of a set with few of them few rows are, with a gradient and without."""
+def test_only_valid_elements_are_encoded() -> None:
     network, elements, _ = make(n=100, count=16, dtype=torch.float32)
     mask = torch.zeros(100, 16, dtype=torch.bool)
     mask[::10, ::8] = True
     encoded = []
     network.register_forward_hook(lambda module, inputs, out: encoded.append(len(out)))
-    monkeypatch.setattr(rows, "_hooked", lambda module: False)
     pool_elements(network, elements, mask)
-    assert encoded == [20]
-    monkeypatch.setattr(pooling, "reusing", lambda function: function)
     with torch.no_grad():
         pool_elements(network, elements, mask)
-    assert encoded[1] < 300  # at most the next size
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 63, 64, 65, 200, 511, 512, 513, 1100])
-def test_blocks_of_rows_do_not_depend_on_the_batch(monkeypatch, n):
-    torch.manual_seed(0)
-    network, x = mlp((150, 128, 128, 147)), torch.randn(1200, 150)
-    with torch.no_grad():
-        whole = in_blocks(network, x)
-        assert torch.equal(in_blocks(network, x[:n]), whole[:n])
-        assert torch.equal(in_blocks(network, x[-n:]), whole[-n:])
-        multiplied = []
-        monkeypatch.setattr(
-            rows, "reusing", lambda function: lambda block: multiplied.append(len(block)) or function(block)
-        )
-        many = [rows.MANY] * (n // rows.MANY) if rows.BLOCK in rows.equal_rows(network, x, rows.MANY) else []
-        assert torch.equal(in_blocks(network, x[:n]), whole[:n])
-        assert multiplied == many + [rows.BLOCK] * -(-(n - sum(many)) // rows.BLOCK)
-        multiplied.clear()
-        monkeypatch.setattr(rows, "_alike", lambda *_: False)
-        assert torch.equal(in_blocks(network, x[:n]), whole[:n])
-        assert set(multiplied) == {rows.BLOCK}
-    x = x[:200]
-    torch.testing.assert_close(in_blocks(network, x.view(2, 100, 150)), network(x).view(2, 100, 147))
-    assert in_blocks(network, x[:0]).shape == (0, 147)
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("wrap", [lambda network: network, lambda network: network.forward])
-def test_memory_that_is_reused_is_never_handed_out(wrap) -> None:
-    network = mlp((5, 7, 3))
-    function, x, sets = wrap(network), torch.randn(130, 5), torch.randn(70, 60, 5)
-    mask = torch.rand(70, 60) < 0.9
-    given, before = x.clone(), in_blocks(function, x)
-    pooled = pool_elements(function, sets, mask)
-    kept = before.clone(), pooled.clone()
-    in_blocks(function, torch.randn(130, 5))
-    pool_elements(function, torch.randn(70, 60, 5), mask)
-    assert torch.equal(before, kept[0])
-    assert torch.equal(pooled, kept[1])
-    assert torch.equal(x, given)
-    torch.testing.assert_close(before, network(x))
-    expected = network(sets).masked_fill(~mask[..., None], -torch.inf).amax(1)
-    torch.testing.assert_close(pooled, expected)
+    assert encoded == [20, 20]
 
 
 class Doubled(nn.Sequential):
@@ -272,8 +186,6 @@ def test_what_a_network_does_beside_its_layers_is_done(change) -> None:
     with torch.no_grad():
         for weight in network.parameters():
             weight.mul_(3.0)
-        expected = network(elements)
-        torch.testing.assert_close(in_blocks(network, elements), expected)
         dense, winner = (pool_elements(network, elements, mask, mode=mode) for mode in ("dense", "winner"))
     torch.testing.assert_close(winner, dense)
     found = []
@@ -307,20 +219,17 @@ def test_bad_arguments_are_refused():
 
 
 @pytest.mark.parametrize("at_once", [1, 60, 100, 150, 420])
-def test_many_elements_are_encoded_a_part_at_a_time(at_once, monkeypatch):
+def test_elsewhere_many_elements_are_encoded_a_part_at_a_time(at_once, monkeypatch):
     network, elements, mask = make()
     monkeypatch.setattr(pooling, "AT_ONCE", at_once)
+    monkeypatch.setattr(pooling, "on_host", lambda _: False)
     sizes = []
     network.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
     with torch.no_grad():
-        pooled = pool_elements(network, elements, mask, mode="dense")
+        pooled = pool_elements(network, elements, mask)
     assert max(sizes) <= max(at_once, 60)
     assert len(sizes) == -(-7 // max(1, at_once // 60))
     torch.testing.assert_close(pooled, reference(network, elements, mask))
-    # With a gradient it is one piece.
-    sizes.clear()
-    pool_elements(network, elements, mask, mode="dense")
-    assert len(sizes) == 1
 
 
 @pytest.mark.gpu
@@ -345,7 +254,7 @@ def test_many_sets_of_weights_at_once_give_what_each_gives_alone() -> None:
         def function(x: Tensor) -> Tensor:
             return torch.func.functional_call(encoder, weights, (x,))
 
-        return in_blocks(nn.ReLU(), pool_elements(function, elements, seen, mode="winner"))
+        return pool_elements(function, elements, seen, mode="winner").relu()
 
     with torch.no_grad():
         masks = torch.stack([mask, ~mask, torch.ones_like(mask)])

@@ -39,10 +39,7 @@ def test_the_hash_is_splitmix64():
 def test_tensor_arithmetic_equals_unbounded_integers(seed, stream, step):
     bits = folded(folded(splitmix(seed & MASK), stream), step)
     tensor = torch.tensor([stream])
-    single = (2 * (bits >> 41) + 1) * 2.0**-24
-    double = (2 * (bits >> 12) + 1) * 2.0**-53
-    assert uniform(seed, tensor, step).item() == single
-    assert uniform(seed, tensor, torch.tensor(step), dtype=torch.float64).item() == double
+    assert uniform(seed, tensor, step).item() == (2 * (bits >> 41) + 1) * 2.0**-24
 
 
 def test_numbers_lie_strictly_between_zero_and_one():
@@ -128,8 +125,6 @@ def test_a_name_has_the_same_stream_in_every_process():
 def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match="int64"):
         uniform(0, torch.zeros(2), 0)
-    with pytest.raises(ValueError, match="dtype"):
-        uniform(0, torch.arange(2), 0, dtype=torch.float16)
 
 
 def test_draws_follow_the_distribution():
@@ -181,7 +176,4 @@ def test_of_no_categories_none_is_drawn():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cuda_gives_the_same_bits():
     streams = torch.randint(-(2**62), 2**62, (1000,))
-    for dtype in (torch.float32, torch.float64):
-        assert torch.equal(
-            uniform(7, streams.cuda(), 3, dtype=dtype).cpu(), uniform(7, streams, 3, dtype=dtype)
-        )
+    assert torch.equal(uniform(7, streams.cuda(), 3).cpu(), uniform(7, streams, 3))

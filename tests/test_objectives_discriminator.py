@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -12,7 +14,7 @@ from torch import nn
 from torch.nn import functional
 
 from helpers_objectives import check_contract
-from symphony.modules import SceneEncoder, SceneNetwork
+from symphony.modules import SceneEncoder, SceneNetwork, encoder, pool_elements
 from symphony.objectives import DiscriminatorLoss, auc
 
 OBSERVATION, SCORE = ("agents", "observation"), ("agents", "score")
@@ -232,19 +234,19 @@ def scenes(count, elements):
     return td
 
 
-def scene_discriminator(pool):
+def scene_discriminator():
     torch.manual_seed(3)
-    network = SceneNetwork(SceneEncoder(5, [6], hidden=8, pool=pool), 1, head=(8,))
+    network = SceneNetwork(SceneEncoder(5, [6], hidden=8), 1, head=(8,))
     keys = [("agents", "own"), VALID, ("agents", "objects"), ("agents", "objects_mask")]
     return TensorDictModule(Squeeze(network), in_keys=keys, out_keys=[SCORE]).double()
 
 
-@pytest.mark.parametrize("pool", ["dense", "winner", "auto"])
-def test_the_penalty_reaches_the_encoders_through_every_pool(pool):
+def test_the_penalty_reaches_the_encoders_through_every_pool(monkeypatch):
     td = scenes(12, 50)
     assert (td[VALID] & ~td[SIMULATED]).any()
-    reference, network = scene_discriminator("dense"), scene_discriminator(pool)
-    for one in (reference, network):
+    reference, network = scene_discriminator(), scene_discriminator()
+    for one, mode in ((reference, "dense"), (network, "winner")):
+        monkeypatch.setattr(encoder, "pool_elements", partial(pool_elements, mode=mode))
         out = DiscriminatorLoss(one, gradient_penalty=5.0)(td)
         out["loss_discriminator"].backward()
     for (name, a), b in zip(reference.named_parameters(), network.parameters(), strict=True):
@@ -260,14 +262,14 @@ def test_the_penalty_reaches_the_encoders_through_every_pool(pool):
 
 def test_the_penalty_is_that_of_each_agent_by_itself():
     td = scenes(12, 7)
-    loss = DiscriminatorLoss(scene_discriminator("winner"), gradient_penalty=1.0)
+    loss = DiscriminatorLoss(scene_discriminator(), gradient_penalty=1.0)
     rows = []
     for i, j in (td[VALID] & ~td[SIMULATED]).nonzero().tolist():
         one = td[i : i + 1].clone()
         leaves = [one["agents", name].requires_grad_() for name in ("own", "objects")]
         for name, leaf in zip(("own", "objects"), leaves, strict=True):
             one["agents", name] = leaf
-        gradients = torch.autograd.grad(scene_discriminator("dense")(one)[SCORE][0, j], leaves)
+        gradients = torch.autograd.grad(scene_discriminator()(one)[SCORE][0, j], leaves)
         rows.append(sum(gradient.square().sum() for gradient in gradients))
     assert len(rows) > 1
     torch.testing.assert_close(loss(td)["gradient_penalty"], torch.stack(rows).mean())

@@ -14,17 +14,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_convert import FakeReader
-from helpers_interaction import public, track
 from helpers_segments import hide, straight_road
-from helpers_sources import read_error, read_one, womd_scenario
-from symphony.cli import main
 from symphony.data.convert import convert, info
 from symphony.data.odd import LATE_EGO, NO_SIZE, THIN, WILD, from_ego, mended
-from symphony.data.resample import LOST, REPEATED, UNEVEN, evened, resample
+from symphony.data.resample import LOST, REPEATED, UNEVEN, evened
 from symphony.data.segment import RunSegment, SignalState, validate
 from symphony.data.sources.base import Item, time_step
 from symphony.data.sources.interaction_tracks import Rows, stepped
-from symphony.data.sources.tfrecord import write_records
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 
@@ -53,12 +49,6 @@ def seen_at(times: NDArray[np.float64]) -> RunSegment:
 
 
 # Times
-
-
-def test_even_times_change_nothing() -> None:
-    whole = scene()
-    assert evened(whole, TENTH) is whole
-    assert evened(whole, TENTH + np.random.default_rng(0).uniform(-0.004, 0.004, 91)) is whole
 
 
 @given(st.integers(2, 80), st.integers(1, 9))
@@ -134,34 +124,6 @@ def test_rates_of_recordings(rate: float, whole: bool) -> None:
     assert start == 5000
 
 
-@pytest.mark.parametrize("rate", [25, 30, 29.97])
-def test_interaction_at_other_rates(rate: float, tmp_path: Path) -> None:
-    def at(line: str) -> str:
-        fields = line.split(",")
-        frame = round(float(fields[2]) / 100)
-        fields[2] = f"{1000 * frame / rate:.3f}"
-        fields[6:8] = (str(float(v) * rate / 10) for v in fields[6:8])
-        return ",".join(fields)
-
-    cars = [*track(3, steps=range(110)), *track(4, x=-20, steps=range(110))]
-    path = public(tmp_path, [at(line) for line in cars])
-    found = read_one("interaction", path, window=3.0)
-    assert found.dt == pytest.approx(1 / rate, rel=1e-6)
-    assert not found.odd
-    fifth = resample(found, 0.2)
-    assert fifth.num_steps == 16
-    assert fifth.valid.all()
-
-
-def test_frames_that_a_recording_lost(tmp_path: Path) -> None:
-    cars = [*track(3), *track(4, x=-20)]
-    whole = read_one("interaction", public(tmp_path / "a", cars))
-    lost = [line for line in cars if not 300 <= int(line.split(",")[2]) < 800]
-    found = read_one("interaction", public(tmp_path / "b", lost))
-    assert found.odd == {LOST: f"5 of {whole.num_steps}"}
-    np.testing.assert_allclose(found.position, whole.position, atol=1e-3)
-
-
 # Agents and states
 
 
@@ -193,20 +155,6 @@ def test_a_wild_state_costs_itself_alone(step: int, away: float) -> None:
     expected[1, step] = False
     np.testing.assert_array_equal(found.valid, expected)
     assert list(found.odd) == [WILD]
-
-
-def test_who_is_never_where_it_can_be_is_left_out() -> None:
-    velocity = scene().velocity.copy()
-    velocity[1] = 1e4
-    found = validate(mended(scene(velocity=velocity)))
-    assert found.num_agents == 2
-
-
-def test_references_follow_who_is_left() -> None:
-    size = scene().size.copy()
-    size[1] = 0
-    found = mended(scene(size=size, ego=2, predict=np.int32([1, 2]), interest=np.int32([1])))
-    assert (found.ego, found.predict.tolist(), found.interest.tolist()) == (1, [1], [])
 
 
 def test_an_ego_that_comes_late() -> None:
@@ -251,25 +199,3 @@ def test_it_is_counted_by_kind_with_an_example(workers: int, tmp_path: Path) -> 
     assert (strict.converted, strict.odd) == (1, {})
     assert [skip.segment for skip in strict.skipped] == ["straight-2", "straight-3", "straight-4"]
     assert strict.settings["strict"] is True
-
-
-def test_the_command_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fine, odd = womd_scenario("fine"), womd_scenario("odd")
-    for state in odd.tracks[0].states:
-        state.length = 0
-    write_records(tmp_path / "a.tfrecord", [s.SerializeToString() for s in (fine, odd)])
-    base = ["data", "convert", "womd", str(tmp_path / "a.tfrecord"), "--interactive", "1", "--rate", "10"]
-    assert main([*base, "--out", str(tmp_path / "out")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert NO_SIZE in said
-    assert "first: odd: agent" in said
-    assert len(SegmentStore(tmp_path / "out")) == 2
-    assert main([*base, "--out", str(tmp_path / "strict"), "--strict"]) == 0
-    assert SegmentStore(tmp_path / "strict").ids == ["fine"]
-
-
-def test_what_cannot_be_mended_is_refused_as_before(tmp_path: Path) -> None:
-    scenario = womd_scenario("nan")
-    scenario.tracks[2].states[0].center_x = np.nan  # of the ego, from whose first place all is counted
-    write_records(tmp_path / "a", [scenario.SerializeToString()])
-    assert read_error("womd", tmp_path / "a").field == "position"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,11 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers_segments import hide, random_segment, straight_road
-from helpers_sources import ROAD, commonroad, driver
-from symphony.cli import main
 from symphony.data.convert import convert, info
 from symphony.data.overlaps import overlapping
-from symphony.data.report import Report, Skip
+from symphony.data.report import Report
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import travel
 from symphony.data.sources.base import Item, Reader
@@ -45,12 +42,6 @@ def crowded(seed: int) -> RunSegment:
     return segment.replace(position=position, valid=segment.valid & ~gone)
 
 
-def test_some_of_them_overlap() -> None:
-    found = [len(overlapping(crowded(seed))) for seed in range(20)]
-    assert min(found) == 0
-    assert sum(found) > 10
-
-
 @given(st.integers(0, 200))
 def test_agrees_with_shapely(seed: int) -> None:
     segment = crowded(seed)
@@ -68,31 +59,6 @@ def test_agrees_with_shapely(seed: int) -> None:
                     sure |= {(a, b)} if shapes[a].intersection(shapes[b]).area > 1e-3 else set()
     found = {tuple(pair) for pair in overlapping(segment).tolist()}
     assert sure <= found <= possible
-
-
-def test_long_logs_of_many_agents_take_little_memory() -> None:
-    """All agents with all at all steps at once, those of INTERACTION's ten minutes would take gigabytes."""
-    lanes, steps = np.arange(100), 400
-    position = np.zeros((100, steps, 3), np.float32)
-    position[..., 0] = np.arange(steps)
-    position[..., 1] = 3.5 * lanes[:, None]
-    position[7] = position[3]
-    some = straight_road(2)
-    segment = some.replace(
-        agent_id=lanes,
-        agent_type=np.full(100, AgentType.VEHICLE, np.uint8),
-        size=np.tile(some.size[:1], (100, 1)),
-        position=position,
-        heading=np.zeros((100, steps), np.float32),
-        velocity=np.zeros((100, steps, 2), np.float32),
-        valid=np.ones((100, steps), np.bool_),
-    )
-    tracemalloc.start()
-    try:
-        assert overlapping(segment).tolist() == [[3, 7]]
-        assert tracemalloc.get_traced_memory()[1] < 60e6
-    finally:
-        tracemalloc.stop()
 
 
 def overlapped(seed: int = 0) -> RunSegment:
@@ -154,32 +120,3 @@ def test_a_conversion_counts_and_tells(workers: int, tmp_path: Path) -> None:
     assert without.settings["exclude_overlaps"] is True
     assert {skip.segment for skip in without.skipped} == {"bad-1", "bad-5", "bad-7"}
     assert without.problems == {}
-
-
-def test_few_overlaps_are_counted_without_a_warning() -> None:
-    assert Report(converted=100, overlaps=5).warning == ""
-    assert "6.0 %" in Report(converted=100, overlaps=6).warning
-    assert Report().warning == ""
-    both = Report(converted=3, overlaps=1).after(Report(converted=4, overlaps=2, skipped=[Skip("a")]))
-    assert (both.converted, both.overlaps, len(both.skipped)) == (7, 3, 1)
-
-
-def test_the_command_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # The second is slower and starts ahead of the first, which drives through it.
-    cars = (
-        driver(7, steps=range(25)),
-        driver(8, x=6, speed=5, steps=range(25)),
-        driver(9, x=-30, steps=range(25)),
-    )
-    file = tmp_path / "a.xml"
-    file.write_text(commonroad(ROAD, *cars))
-    out = str(tmp_path / "store")
-    assert main(["data", "convert", "commonroad", str(file), "--out", out]) == 0
-    shown = capsys.readouterr()
-    assert "--exclude-overlaps leaves them out" in shown.err
-    assert "converted with boxes that overlap" in shown.out
-    assert main(["data", "info", out]) == 0
-    assert "boxes overlap in the log of" in capsys.readouterr().out
-    clean = str(tmp_path / "clean")
-    assert main(["data", "convert", "commonroad", str(file), "--out", clean, "--exclude-overlaps"]) == 1
-    assert "overlap in the log" in capsys.readouterr().err

@@ -17,6 +17,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+import lint_length
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
@@ -145,7 +147,7 @@ def test_without_any_python_the_message_says_what_is_needed(tmp_path: Path) -> N
     ("target", "commands"),
     [
         ("demo", ["bin/symphony demo --out out/demo"]),
-        ("table", ["bin/python scripts/make_table.py --out out/table"]),
+        ("table", ["bin/python benchmarks/make_table.py --out out/table"]),
         ("test", ["bin/python -m pytest"]),
         (
             "lint",
@@ -155,7 +157,7 @@ def test_without_any_python_the_message_says_what_is_needed(tmp_path: Path) -> N
                 "codespell",
                 "mypy",
                 "lint-imports",
-                "scripts/lint_length.py",
+                "tests/tools/lint_length.py",
             ],
         ),
         ("docs", ["bin/mkdocs build --strict"]),
@@ -247,24 +249,32 @@ def test_ci_runs_lint_then_tests(tmp_path: Path) -> None:
         assert (done.returncode == 0) == (failing == "")
 
 
-def test_long_files_are_found(tmp_path: Path) -> None:
-    code = "from lint_length import too_long\nimport sys, pathlib\nprint(too_long(pathlib.Path(sys.argv[1])))"
-    source = tmp_path / "src" / "deep"
-    source.mkdir(parents=True)
-    (source / "short.py").write_text("x = 1\n" * 600)
-    (source / "made_pb2.py").write_text("x = 1\n" * 900)
-    for lines, expected in ((600, False), (601, True)):
-        (source / "long.py").write_text("x = 1\n" * lines)
-        done = subprocess.run(
-            [sys.executable, "-c", code, tmp_path],
-            cwd=ROOT / "scripts",
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert ("long.py" in done.stdout) == expected
-        assert "short.py" not in done.stdout
-        assert "made_pb2.py" not in done.stdout
+def test_long_files_and_rooms_are_found(tmp_path: Path) -> None:
+    room = tmp_path / "src" / "symphony" / "deep"
+    room.mkdir(parents=True)
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "page.md").write_text("word " * 12)
+    (room / "short.py").write_text("x = 1\n" * 600)
+    (room / "made_pb2.py").write_text("x = 1\n" * 900)
+    rows = ["| `deep` | all | – | 1 100 | {} |", "| `docs/` | pages | | 12 words | |"]
+    for lines, today, expected in (
+        (600, "1 200", []),
+        (601, "1 201", ["src/symphony/deep/long.py: 601 lines, may have 600"]),
+        (600, "1 199", ["deep: 1200 lines, may have 1199"]),
+        (600, "", ["deep: 1200 lines, may have 1100"]),
+        (500, "", []),
+    ):
+        (room / "long.py").write_text("x = 1\n" * lines)
+        (tmp_path / "CONTRIBUTING.md").write_text("\n".join(rows).format(today))
+        assert lint_length.long_files(tmp_path) + lint_length.large_rooms(tmp_path) == expected
+        size = f"1 {lines - 400}" if lines > 500 else ""
+        assert lint_length.updated(tmp_path).splitlines()[0] == rows[0].format(size).replace("|  |", "| |")
+    (tmp_path / "docs" / "page.md").write_text("word " * 13)
+    (tmp_path / "CONTRIBUTING.md").write_text(rows[1])
+    assert lint_length.large_rooms(tmp_path) == [
+        "docs: 13 words, may have 12",
+        "deep: has no place in the table of CONTRIBUTING.md",
+    ]
 
 
 def skeleton(root: Path) -> Path:
@@ -288,7 +298,8 @@ IMPORTS = [
     ("roadgraph/a.py", "import symphony.geometry", True),
     ("roadgraph/b.py", "import symphony.data", False),
     ("roadgraph/c.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import symphony.data", True),
-    ("data/a.py", "import symphony.roadgraph", True),
+    ("data/a.py", "import symphony.errors, numpy", True),
+    ("data/c.py", "import symphony.geometry", False),
     ("data/b.py", "import symphony.envs", False),
     ("envs/a.py", "import symphony.keys, symphony.data", True),
     ("envs/b.py", "def f():\n    import symphony.metrics", False),

@@ -29,7 +29,7 @@ from symphony.learning.personas import PersonaScale, styles
 from symphony.recipes import train
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.control import given_personas
-from symphony.rollouts.driving import simulated
+from symphony.rollouts.driving import simulate_batch
 
 OWN = AgentConfig(num_points=12, hidden=8, persona=True)
 
@@ -133,7 +133,7 @@ def test_an_agent_drives_in_the_style_that_it_is_told(agent: Agent, store: Path)
 
     def driven(asked: str, search: str = "none", seed: int = 0) -> torch.Tensor:
         config = EvaluateConfig(rollouts=2, branches=2, search=search, persona=asked, seed=seed)  # type: ignore[arg-type]
-        return simulated(agent, scenes, config).state
+        return simulate_batch(agent, scenes, config).rollouts.state
 
     for search in ("none", "tree"):
         assert torch.equal(driven("", search), driven("", search))
@@ -152,7 +152,7 @@ def test_what_is_no_persona_is_refused(store: Path) -> None:
     plain = load_agent("pretrained:bc_ts_h")
     scenes = SceneDataset(SegmentStore(store), 2, plain.dynamics, routes=True).scenes([0])
     with pytest.raises(ConfigError, match="without personas"):
-        simulated(plain, scenes, EvaluateConfig(rollouts=1, persona="speed=.5"))
+        simulate_batch(plain, scenes, EvaluateConfig(rollouts=1, persona="speed=.5"))
 
 
 def test_a_warm_start_without_personas_drives_as_before(store: Path, tmp_path: Path) -> None:
@@ -161,8 +161,8 @@ def test_a_warm_start_without_personas_drives_as_before(store: Path, tmp_path: P
     after, plain = build(config).agent, load_agent(str(before))
     scenes = SceneDataset(SegmentStore(store), 2, plain.dynamics, routes=True).scenes([0, 1])
     for asked in ("", "headway=1,speed=0"):
-        told = simulated(after, scenes, EvaluateConfig(rollouts=2, persona=asked)).state
-        assert torch.equal(told, simulated(plain, scenes, EvaluateConfig(rollouts=2)).state)
+        told = simulate_batch(after, scenes, EvaluateConfig(rollouts=2, persona=asked)).rollouts.state
+        assert torch.equal(told, simulate_batch(plain, scenes, EvaluateConfig(rollouts=2)).rollouts.state)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from helpers_segments import straight_road
 from symphony.data.segment import RunSegment
 from symphony.render import Clip, plot_grid, plot_rollout, viewer
-from symphony.render.plots import Rollouts, beginnings, colors_of
+from symphony.render.plots import colors_of
 from symphony.render.style import AGENT_COLORS, new_figure, with_aspect
 from symphony.render.video import frames_of
 
@@ -30,7 +31,7 @@ def rollouts(found: RunSegment, count: int = 1) -> dict[str, Any]:
     return {
         "position": np.repeat(found.position[None, [ego], :, :2], count, 0),
         "heading": np.repeat(found.heading[None, [ego]], count, 0),
-        "agent_index": [ego],
+        "agents": [ego],
     }
 
 
@@ -47,13 +48,13 @@ def test_playback_vehicles_are_drawn_where_they_were_hit() -> None:
     collision = np.zeros((1, 1, STEPS), bool)
     collision[0, 0, at:] = True
     axes = new_figure().add_subplot()
-    plot_rollout(found, **given, target=axes, collision=collision)
+    plot_rollout(Clip(found, **given, collision=collision), axes)
     boxes = patches(axes, "hit")
     middles = [box[:4].mean(0) for box in boxes]
     assert any(np.allclose(middle, found.position[other, at, :2], atol=1e-3) for middle in middles)
     assert "playback, when it was hit" in [text.get_text() for text in axes.get_legend().get_texts()]
     calm = new_figure().add_subplot()
-    plot_rollout(found, **given, target=calm, collision=np.zeros_like(collision))
+    plot_rollout(Clip(found, **given), calm)
     assert patches(calm, "hit") == []
 
 
@@ -70,7 +71,7 @@ def test_rollouts_that_are_the_same_are_counted_once(kinds: list[int], words: st
     valid[..., -1] = False
     given["position"][..., -1, :] += np.arange(len(kinds))[:, None, None]
     axes = new_figure().add_subplot()
-    plot_rollout(found, **given, target=axes, valid=valid)
+    plot_rollout(Clip(found, **given, valid=valid), axes)
     assert any(f"{words} of " in text.get_text() for text in axes.texts)
 
 
@@ -92,7 +93,7 @@ def test_panels_are_of_one_size(tmp_path: Path) -> None:
         first = drawn["position"][:, :, :1]
         clips.append(Clip(found, first + scale * (drawn["position"] - first), *list(drawn.values())[1:]))
     figure = plot_grid(
-        [lambda axes, clip=clip: plot_rollout(target=axes, **vars(clip)) for clip in clips],
+        [partial(plot_rollout, clip) for clip in clips],
         tmp_path / "a.png",
     )
     sizes = [axes.get_window_extent().size for axes in figure.axes]
@@ -111,9 +112,3 @@ def test_views_grow_about_their_middle(aspect: float) -> None:
     assert right >= 7
     assert low <= 10
     assert high >= 16
-
-
-def test_rollouts_without_any_flags_begin_nothing() -> None:
-    found = segment()
-    runs = Rollouts.of(found, *rollouts(found).values(), 0, None, None, None)
-    assert not beginnings(runs, "collision").any()

@@ -32,8 +32,7 @@ from symphony.evaluation.planners import (
     without_score,
 )
 from symphony.learning.demonstrations import SceneDataset
-from symphony.planners.calls import answer
-from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan, planner_maker
+from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan
 from symphony.planners.view import Observation
 from symphony.saved.folder import RolloutFolder, load_rollouts
 from symphony.saved.saving import save_simulation
@@ -135,12 +134,9 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
     ("said", "why"),
     [
         ('{"step": 2, "plan": [NaN, 0.0]}', "not finite"),
-        ('{"step": 2, "plan": null}', "step 2: "),
-        ('{"step": 1, "plan": [-1.0, 0.0]}', 'step 2: ValueError: answered .* not {"step": 2, '),
         ("[-1.0, 0.0]", 'step 2: ValueError: answered .* not {"step": 2, '),
         ('{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
         ("what?", "step 2: JSONDecodeError"),
-        ("null", "step 2: "),
     ],
 )
 def test_what_another_process_says_wrong_fails_the_run(
@@ -182,24 +178,6 @@ def test_one_that_takes_too_long_fails_its_run(store: Path, tmp_path: Path, how:
             "step 3: TimeoutError: took more than 0.1 s (test_planner_kinds.py:"
         )
         assert saved.counted[0].sum() == 3
-
-
-def test_time_limits_leave_other_alarms_as_they_were() -> None:
-    import signal
-
-    rung = []
-    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(1))
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.05)
-        assert answer(lambda: 3, seconds=60) == 3
-        assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 0.05
-        deadline = time.monotonic() + 10
-        while not rung and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert rung
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def test_of_a_trajectory_the_first_state_is_driven() -> None:
@@ -443,15 +421,6 @@ def test_a_folder_without_a_planner_is_refused(store: Path, tmp_path: Path) -> N
         planner_record(folder)
 
 
-def test_files_that_cannot_be_run_are_named(tmp_path: Path) -> None:
-    (tmp_path / "broken.py").write_text("1 / 0\n")
-    with pytest.raises(ConfigError, match=r"broken.py.*ZeroDivisionError"):
-        planner_maker(f"{tmp_path}/broken.py:plan")
-    (tmp_path / "empty.py").write_text("")
-    with pytest.raises(ConfigError, match=r"no attribute 'plan'"):
-        planner_maker(f"{tmp_path}/empty.py:plan")
-
-
 ODD = """
 import json, os, sys, time
 kind, said = sys.argv[1], sys.argv[2]
@@ -469,9 +438,6 @@ for line in sys.stdin:
     if step == 2 and kind == "binary":
         sys.stdout.buffer.write(b"\\xff\\x00\\n")
         sys.stdout.flush()
-    if step == 2 and kind == "deep":
-        print("[" * 200_000 + "]" * 200_000, flush=True)
-        continue
     if step == 2 and kind == "debug":
         print([0.0, 0.0], flush=True)
     print(json.dumps({} if step is None else {"step": step, "plan": [-1.0, 0.0]}), flush=True)
@@ -492,7 +458,6 @@ def odd(store: Path, tmp_path: Path, kind: str) -> RolloutFolder:
     [
         ("flood", 2, "an answer of more than 1048576 bytes"),
         ("binary", 2, "UnicodeDecodeError|JSONDecodeError|more than one line"),
-        ("deep", 2, "RecursionError"),
         ("debug", 2, "more than one line for an answer|answered"),
         ("twice", "[23]", "more than one line for an answer|answered"),
     ],

@@ -35,7 +35,7 @@ PRUNING = EvaluateConfig(rule="best", prune_every=3)
 
 
 def load_script(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -192,7 +192,7 @@ def test_scores_of_another_agent_are_refused(run: Path, tmp_path: Path) -> None:
 
 
 def test_its_name_works_wherever_an_agent_is_named(made: Path, store: Path, tmp_path: Path) -> None:
-    before, picture = contents(made), tmp_path / "picture.png"
+    before = contents(made)
     data = ["--data", str(store)]
     file = tmp_path / "numbers.json"
     command = ["evaluate", "pretrained:tiny", *data, "--rollouts", "2", "--json", str(file)]
@@ -202,12 +202,8 @@ def test_its_name_works_wherever_an_agent_is_named(made: Path, store: Path, tmp_
     assert {key: found[key] for key in ("ade", "collision_rate", "config")} == {
         key: json.loads(kept.read_text())[key] for key in ("ade", "collision_rate", "config")
     }
-    tree = ["plot", "tree", "pretrained:tiny", *data, "--segment", "0", "--branches", "2"]
-    assert main([*tree, "--out", str(picture)]) == 0
-    assert picture.stat().st_size > 5_000
     figure = ["plot", "curvature", "pretrained:tiny", "--out"]
     assert main([*figure, str(tmp_path / "a.png")]) == 0
-    assert main([*figure, str(tmp_path / "b.png"), *data, "--rollouts", "2"]) == 0
     method = make_pretrained.read_run(made).method
     start = tiny(method, store, tmp_path / "further", warm_start=Path("pretrained:tiny"), learning_rate=1e-30)
     start = dataclasses.replace(start, mgail=MGAILConfig(head_start=0, rollouts=2, learning_rate=1e-30))

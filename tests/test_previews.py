@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Iterator
@@ -15,24 +14,22 @@ import pytest
 import torch
 from PIL import Image
 
-from helpers_runs import build, same_weights, tiny, weights
+from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
-from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig, read_json, to_json
+from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import scene
-from symphony.errors import ConfigError, DataError
-from symphony.evaluation import evaluate
-from symphony.evaluation.pictures import clip_of
+from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
-from symphony.render import Clip, curves
-from symphony.rollouts.driving import playback, simulated
+from symphony.render import Clip
+from symphony.rollouts.driving import playback, simulate_batch
 from symphony.rollouts.unroll import Rollouts
+from symphony.training.hooks import QUANTILES, ROLLOUTS, quantiles, samples_of
 from symphony.training.logging import read_metrics
-from symphony.training.previews import QUANTILES, ROLLOUTS, Preview, samples_of
 
 MOTIONS = ("speed", "acceleration", "turn")
 
@@ -41,7 +38,7 @@ MOTIONS = ("speed", "acceleration", "turn")
 def few() -> Iterator[None]:
     """Two run segments are shown."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("symphony.training.previews.SEGMENTS", 2)
+        patch.setattr("symphony.training.hooks.SEGMENTS", 2)
         yield
 
 
@@ -85,7 +82,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"".join(clip.position.tobytes() for clip in clips))
 
-    monkeypatch.setattr("symphony.training.previews.animate_rollouts", write)
+    monkeypatch.setattr("symphony.training.hooks.animate_rollouts", write)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +105,7 @@ def test_runs_shorter_than_that_and_others_show_nothing(store: Path, tmp_path: P
         assert previewed(out) == {}
 
 
-@pytest.mark.parametrize(("method", "validated"), [("bc", True), ("bc_ts_h", True), ("mgail", False)])
+@pytest.mark.parametrize(("method", "validated"), [("bc_ts_h", True), ("mgail", False)])
 @pytest.mark.usefixtures("undrawn")
 def test_being_watched_changes_nothing(
     store: Path, held_out: Path, tmp_path: Path, method: str, validated: bool
@@ -153,7 +150,7 @@ def test_segments_to_validate_on_are_shown_where_there_are_some(
 ) -> None:
     seen: list[str] = []
     monkeypatch.setattr(
-        "symphony.training.previews.animate_rollouts",
+        "symphony.training.hooks.animate_rollouts",
         lambda clips, path: seen.extend(clip.segment.segment_id for clip in clips),
     )
     for data in (None, held_out):
@@ -167,7 +164,7 @@ def test_the_numbers_are_quantiles_of_what_the_agent_does(run: Path, store: Path
     agent, segments = load_agent(f"{run}@4"), SegmentStore(store)
     dataset = SceneDataset(segments, 2, agent.dynamics, [0, 1], routes=True)
     scenes = dataset.scenes([0, 1])
-    found = simulated(agent, scenes, EvaluateConfig(rollouts=ROLLOUTS))
+    found = simulate_batch(agent, scenes, EvaluateConfig(rollouts=ROLLOUTS)).rollouts
     values: dict[str, list[float]] = {name: [] for name in (*MOTIONS, *(f"{m}_log" for m in MOTIONS), "ade")}
     for b in range(2):
         segment, away = dataset.segment(b), []
@@ -196,15 +193,6 @@ def test_the_numbers_are_quantiles_of_what_the_agent_does(run: Path, store: Path
     assert len(record) == 3 * (len(values) + 2)
 
 
-def test_displacement_is_the_evaluators(run: Path, store: Path) -> None:
-    agent = load_agent(str(run))
-    dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
-    scenes, how = dataset.scenes(range(3)), EvaluateConfig(rollouts=2)
-    samples = samples_of(scenes, simulated(agent, scenes, how), [0.2] * 3)
-    rows = evaluate(agent, SegmentStore(store), how).metrics.rows()
-    np.testing.assert_allclose(sorted(samples["ade"]), sorted(row["ade"] for row in rows), rtol=1e-5)
-
-
 def test_the_log_is_like_itself_and_what_is_not_there_is_left_out() -> None:
     segment = crossing(4, steps=9)
     gone = hide(segment, 1, slice(3, 6))
@@ -218,13 +206,13 @@ def test_the_log_is_like_itself_and_what_is_not_there_is_left_out() -> None:
     assert len(samples["speed_log"]) == 8 + 4
 
 
-def test_statistics_of_nothing_are_no_numbers(tmp_path: Path) -> None:
+def test_statistics_of_nothing_are_no_numbers() -> None:
     scenes = scene(crossing(4, steps=5), [0, 1])
     found = playback(scenes)
     nobody = Rollouts(*found[:3], torch.zeros_like(found.counted))
     samples = samples_of(scenes, nobody, [0.2])
     assert len(samples["speed"]) == len(samples["ade"]) == 0
-    numbers = Preview(tmp_path, samples).numbers()
+    numbers = quantiles(samples)
     assert math.isnan(numbers["preview_speed_p50"])
     assert math.isfinite(numbers["preview_speed_log_p50"])
 
@@ -241,19 +229,6 @@ def test_a_discriminator_that_has_not_scored_yet_has_no_scores(store: Path, tmp_
     assert not any(
         "score" in name for name in previewed(train(config(store, tmp_path / "bc", 2, steps=2)))[2]
     )
-
-
-def test_padding_of_a_batch_is_cut_off(store: Path) -> None:
-    dataset = SceneDataset(SegmentStore(store), 2)
-    together = dataset.scenes(range(3))
-    for b in range(3):
-        segment, alone = dataset.segment(b), dataset.scene(b)
-        one, other = (
-            clip_of(segment, together, playback(together), b),
-            clip_of(segment, alone, playback(alone)),
-        )
-        for name, value in vars(one).items():
-            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 
 
 class Recorder:
@@ -294,18 +269,6 @@ def test_weights_and_biases_gets_video_and_histograms(
         assert all(isinstance(value, wandb.Histogram) and sum(value.histogram) for value in values.values())
 
 
-def test_settings_are_checked_and_read_back(store: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        PreviewConfig(every=-1)
-    file = tmp_path / "config.json"
-    file.write_text(to_json(config(store, tmp_path, 7)))
-    assert read_json(TrainConfig, file).preview == PreviewConfig(every=7)
-    saved = json.loads(file.read_text())
-    del saved["preview"]
-    file.write_text(json.dumps(saved))
-    assert read_json(TrainConfig, file).preview == PreviewConfig()
-
-
 def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
     settings = config(store, tmp_path / "run", 2)
     settings.out.mkdir()
@@ -326,8 +289,3 @@ def test_networks_are_left_as_they_were(store: Path, tmp_path: Path) -> None:
     assert policy.training
     assert torch.equal(state, torch.get_rng_state())
     assert first.numbers().keys() == previewer(4).numbers().keys()
-
-
-def test_all_that_is_previewed_has_a_panel(run: Path) -> None:
-    known = {name for _, names in curves.PANELS for name in names}
-    assert {name for record in previewed(run).values() for name in record} <= known

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,9 +11,9 @@ from tensordict.nn import TensorDictModule
 
 from symphony.agents import Agent, discriminator_network, goal_network, policy_network
 from symphony.cli import main
-from symphony.cli.profiles import expanded
 from symphony.cli.recipe import Arguments
-from symphony.config import METHODS, PROFILES, AgentSpec, TrainConfig
+from symphony.config import METHODS, AgentSpec, TrainConfig
+from symphony.config.profiles import PROFILES, expanded
 from symphony.errors import ConfigError
 
 NEEDED = ["--data", "a", "--out", "b", "--test", "c"]
@@ -70,18 +69,6 @@ def test_what_is_given_has_precedence(given: list[str], first: bool) -> None:
     config = settings("bc", *args)
     assert config.steps == 7
     assert config.states == 16
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-def test_a_profile_is_the_same_for_every_method(profile: str) -> None:
-    found = [replace(settings(method, "--profile", profile), method="bc") for method in METHODS]
-    assert all(config == found[0] for config in found)
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-def test_the_flags_of_a_profile_make_what_its_function_returns(profile: str) -> None:
-    plain = settings("bc")
-    assert settings("bc", "--profile", profile) == PROFILES[profile](plain)  # type: ignore[index]
 
 
 def test_unknown_profiles_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

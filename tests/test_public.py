@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +12,7 @@ import symphony
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 
-ROOT = Path(__file__).resolve().parents[1]
-MOST = 85
+MOST = 80
 """Modules of the package that plain behavioural cloning reaches, at most."""
 NOT_NEEDED = (
     "symphony.cli",
@@ -41,8 +39,6 @@ print(*sys.modules, sep="\\n")
 
 def test_public_names_are_there_and_documented() -> None:
     names = {name for name in symphony.__all__ if not name.startswith("_")}
-    page = (ROOT / "docs" / "reference" / "symphony.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"^\| \[`(\w+)`\]", page, re.M)) == names
     for name in names:
         found = getattr(symphony, name)
         assert inspect.getdoc(found), name

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,30 +8,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_convert import FakeReader
 from helpers_segments import crossing, hide, segments, straight_road
 from symphony.data import resample as resampling
-from symphony.data.convert import convert
 from symphony.data.resample import hold_lights, resample, smooth
 from symphony.data.segment import RunSegment, SignalState, content_hash, validate
-from symphony.data.sources.base import Item
-from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 
 PER_STEP = ("position", "heading", "velocity", "valid", "signal_state")
-
-
-def test_10_hz_becomes_5_hz_by_every_second_step() -> None:
-    log = hide(crossing(4, steps=91, dt=0.1, current_step=10), 2, slice(20, 31))
-    new = resample(log, 0.2)
-    assert (new.num_steps, new.current_step, new.dt) == (46, 5, 0.2)
-    for name in PER_STEP:
-        np.testing.assert_array_equal(getattr(new, name), getattr(log, name)[:, ::2])
-
-
-@pytest.mark.parametrize(("step", "expected"), [(0, 0), (1, 0), (2, 1), (3, 1), (90, 45)])
-def test_current_step_becomes_the_latest_kept_one(step: int, expected: int) -> None:
-    assert resample(straight_road(steps=91, dt=0.1, current_step=step), 0.2).current_step == expected
 
 
 @settings(max_examples=40, deadline=None)
@@ -70,18 +51,6 @@ def test_interpolation_is_exact_for_uniform_motion() -> None:
     np.testing.assert_allclose(
         new.velocity, np.broadcast_to(log.velocity[:, :1], new.velocity.shape), atol=1e-5
     )
-
-
-def test_refining_and_picking_again_gives_the_log_back() -> None:
-    log = hide(crossing(4, steps=31, dt=0.2, current_step=7), 1, slice(5, 9))
-    fine = resample(log, 0.05)
-    assert fine.num_steps == 121
-    back = resample(fine, 0.2)
-    np.testing.assert_array_equal(back.valid, log.valid)
-    np.testing.assert_array_equal(back.signal_state, log.signal_state)
-    np.testing.assert_allclose(back.position, log.position, atol=1e-5)
-    np.testing.assert_allclose(back.heading, log.heading, atol=1e-6)
-    assert back.current_step == 7
 
 
 def test_headings_take_the_shorter_arc() -> None:
@@ -126,55 +95,11 @@ def test_held_lights_are_never_unknown_if_they_were_ever_known(state: NDArray[np
     assert content_hash(held.replace(signal_state=state)) == content_hash(log)
 
 
-class FlashOfLight(FakeReader):
-    """Crossings that show their lights at one step that 5 Hz does not keep."""
-
-    name = "flash"
-
-    def _read(self, path: Path) -> Iterator[Item]:
-        log = crossing(steps=91, dt=0.1)
-        state = np.zeros_like(log.signal_state)
-        state[:, 7] = SignalState.GO
-        yield log.replace(signal_state=state)
-
-
-def test_a_conversion_can_hold_lights_and_says_where_they_are_hardly_known(tmp_path: Path) -> None:
-    (tmp_path / "a.scene").touch()
-    stores = {hold: tmp_path / str(hold) for hold in (False, True)}
-    reports = {
-        hold: convert(FlashOfLight(), [tmp_path], out, hold_lights=hold) for hold, out in stores.items()
-    }
-    states = {hold: SegmentStore(out)[0].signal_state for hold, out in stores.items()}
-    assert (states[True] == SignalState.GO).all()
-    assert (states[False] == SignalState.GO).sum(1).tolist() == [1] * len(states[False])
-    assert reports[True].settings["hold_lights"] is True
-    assert "hold_lights" not in reports[False].settings
-    told = {hold: " ".join(report.odd) for hold, report in reports.items()}
-    assert "--hold-lights" in told[False]
-    assert not told[True]
-
-
-@pytest.mark.parametrize("dt", [0.0, -1.0, float("nan"), float("inf")])
-def test_impossible_steps_are_refused(dt: float) -> None:
-    with pytest.raises(ConfigError, match="dt"):
-        resample(straight_road(1), dt)
-
-
-def test_too_few_steps_are_a_data_error() -> None:
-    with pytest.raises(DataError, match="at least 2 steps"):
-        resample(straight_road(1, steps=5, dt=0.2), 2.0)
-
-
 def noisy(log: RunSegment, sigma: float, seed: int = 0) -> RunSegment:
     noise = np.random.default_rng(seed).normal(0, sigma, (*log.valid.shape, 2)).astype(np.float32)
     position = log.position.copy()
     position[..., :2] += noise * log.valid[..., None]
     return log.replace(position=position)
-
-
-def test_no_smoothing_is_no_change() -> None:
-    log = crossing(3, steps=21)
-    assert content_hash(smooth(log, 0.0)) == content_hash(log)
 
 
 def test_uniform_motion_with_gaps_stays_as_it_is() -> None:
@@ -184,23 +109,6 @@ def test_uniform_motion_with_gaps_stays_as_it_is() -> None:
     for name in ("position", "velocity", "heading"):
         np.testing.assert_allclose(getattr(new, name), getattr(log, name), atol=2e-4)
     assert not new.position[~log.valid].any()
-
-
-def test_noise_shrinks_everywhere_also_at_the_ends() -> None:
-    clean = straight_road(30, steps=91, dt=0.1)
-    new = smooth(noisy(clean, 0.2), 0.4)
-    error = np.sqrt(((new.position - clean.position)[..., :2] ** 2).mean(axis=(0, 2)))
-    assert error[5:-5].max() < 0.1
-    assert error.max() < 0.17
-    speed_error = (new.velocity - clean.velocity)[:, 5:-5]
-    assert np.sqrt((speed_error**2).mean()) < 0.3
-
-
-def test_the_velocity_is_the_slope_of_the_smoothed_path() -> None:
-    log = crossing(4, steps=91, dt=0.1)
-    new = smooth(noisy(log, 0.05), 0.4)
-    slope = np.gradient(new.position[..., :2].astype(float), 0.1, axis=1)
-    assert np.abs(slope - new.velocity)[:, 8:-8].max() < 0.1
 
 
 def turned(log: RunSegment, angle: float, shift: float) -> RunSegment:
@@ -251,28 +159,6 @@ def test_headings_stay_on_the_logged_branch() -> None:
     log = along_x(np.full(40, 5.0), 0.0)
     new = smooth(log.replace(heading=log.heading + np.float32(4 * np.pi)), 0.3)
     np.testing.assert_allclose(new.heading, 4 * np.pi, atol=1e-5)
-
-
-def test_a_single_sighting_is_left_alone() -> None:
-    log = hide(hide(straight_road(2, steps=21, dt=0.1), 1, slice(0, 10)), 1, slice(11, 21))
-    new = smooth(log, 0.4)
-    np.testing.assert_array_equal(new.position[1], log.position[1])
-    np.testing.assert_array_equal(new.velocity[1], log.velocity[1])
-    np.testing.assert_array_equal(new.heading[1], log.heading[1])
-
-
-@settings(max_examples=30, deadline=None)
-@given(segments(), st.floats(0.01, 5))
-def test_whatever_is_valid_stays_valid(log: RunSegment, sigma: float) -> None:
-    new = validate(smooth(log, sigma))
-    np.testing.assert_array_equal(new.valid, log.valid)
-    assert not new.position[~log.valid].any()
-
-
-@pytest.mark.parametrize("sigma", [-0.1, float("nan"), float("inf")])
-def test_impossible_windows_are_refused(sigma: float) -> None:
-    with pytest.raises(ConfigError, match="sigma"):
-        smooth(straight_road(1), sigma)
 
 
 @pytest.mark.parametrize("every", [1, 2, 3, 5])

@@ -29,10 +29,10 @@ from symphony.roadgraph import (
     LaneGraph,
     Route,
     blend,
-    feasible_routes,
     route_line,
     route_lines,
     routes,
+    starting_lanes,
 )
 from symphony.roadgraph import ground_truth_routes as ground_truth
 from symphony.roadgraph.paths import arc_lengths, at, beside, own_sharpest, sharpest
@@ -148,7 +148,6 @@ def test_pocket_is_reached_by_a_change_where_it_begins():
     plain = Route(named(name, "first", "second", "third", "on"))
     turn = Route(named(name, "first", "second", "third", "pocket", "turn"), 3, 0.0, 0.0)
     assert routes(graph, [(name["first"], 0.0)]) == [plain, turn]
-    assert routes(graph, [(name["first"], 0.0)], lane_change=False) == [plain]
     assert routes(graph, [(name["first"], 0.0)], limit=1) == [plain]
     assert lanes_of(routes(graph, [(name["first"], 0.0)], horizon=100)) == [named(name, "first", "second")]
     line = route_line(graph, turn)
@@ -185,13 +184,12 @@ def test_a_neighbour_that_has_ended_or_leads_elsewhere_is_no_lane_to_change_to()
             assert found[1].begins == max(100.0, other[0][0])
 
 
-def test_feasible_routes_inside_a_junction_start_on_every_connector():
+def test_routes_inside_a_junction_start_on_every_connector():
     road, name = crossing()
     graph = LaneGraph(road)
-    found = lanes_of(feasible_routes(graph, np.array([2.0, -8.0]), np.pi / 2))
+    found = lanes_of(routes(graph, starting_lanes(graph, np.array([2.0, -8.0]), np.pi / 2)))
     assert {route[0] for route in found} == {name["left0"], name["ahead0"], name["right0"]}
     assert found[0][0] == name["ahead0"]
-    assert feasible_routes(graph, np.array([40.0, 40.0]), 0.0) == []
 
 
 @pytest.mark.parametrize("degrees", [0, 73])
@@ -425,7 +423,7 @@ def test_going_around_the_block_first_is_not_the_way_of_the_log():
     loop = np.array([30.0, 0.0]) + 8.0 * np.concatenate([np.sin(angle), 1 - np.cos(angle)], -1)
     loop = np.concatenate([loop[:45], [[10.0, 20.0], [-10.0, 10.0], [-5.0, 0.0], [0.0, 0.0]]])
     graph = LaneGraph(make_road([street, onward, loop], successors=[(0, 1), (0, 2), (2, 0)]))
-    found = routes(graph, [(0, 2.0)], horizon=250.0, lane_change=False)
+    found = routes(graph, [(0, 2.0)], horizon=250.0)
     assert (0, 1) in lanes_of(found)
     assert any(lanes[:3] == (0, 2, 0) and 1 in lanes for lanes in lanes_of(found))
     valid = np.ones(25, bool)
@@ -447,9 +445,7 @@ def two_blocks():
     large = np.array([[30.0, 0], [40, -10], [30, -30], [0, -30], [-20, -12], [0, 0]])
     lanes = [street, small, large, street + np.array([30.0, 0.0])]
     graph = LaneGraph(make_road(lanes, successors=[(0, 1), (1, 0), (0, 2), (2, 0), (0, 3)]))
-    found, longer = (
-        routes(graph, [(0, 2.0)], horizon=metres, lane_change=False) for metres in (250.0, 400.0)
-    )
+    found, longer = (routes(graph, [(0, 2.0)], horizon=metres) for metres in (250.0, 400.0))
     return lines_of(graph, found, 2.0), [way for way in lines_of(graph, longer) if len(way) > 100]
 
 

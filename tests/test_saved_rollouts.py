@@ -280,7 +280,7 @@ def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path:
     def dataset(count: int) -> SceneDataset:
         return SceneDataset(store, agent.interactive, agent.dynamics, range(count), routes=True, duration=2)
 
-    config = EvaluateConfig(rollouts=2, branches=4, batch=2)
+    config = EvaluateConfig(search="tree", rollouts=2, branches=4, batch=2)
     done: list[tuple[int, int]] = []
     save_simulation(tmp_path / "cut", agent, dataset(1), config)
     cut = save_simulation(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
-import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,9 +13,8 @@ from helpers_scenarionet import FAR, STEPS, line, ring, scenario, track, write
 from helpers_sources import off_road, read_error, read_one
 from symphony.data.conformance import check_reader
 from symphony.data.convert import convert
-from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, SignalState, validate
+from symphony.data.segment import AgentType, LaneType, MarkType, SignalState
 from symphony.data.sources import get_reader
-from symphony.data.sources.scenarionet_map import read_features
 from symphony.data.store import SegmentStore
 
 LANES = ["right", "left", "on", "end"]
@@ -47,16 +43,6 @@ def test_an_ego_wider_than_long_is_turned(tmp_path: Path) -> None:
     np.testing.assert_allclose(segment.size[segment.ego], (4.08, 1.73, 1.56), rtol=1e-6)
     # Anybody else is as logged.
     np.testing.assert_allclose(segment.size[0], (1, 2, 1.5), rtol=1e-6)
-
-
-def test_numbers_as_names_are_ids(tmp_path: Path) -> None:
-    tree = scenario()
-    tree["tracks"] = {"17": tree["tracks"]["ego"], "4": tree["tracks"]["8f3a"]}
-    tree["metadata"]["sdc_id"] = "17"
-    del tree["metadata"]["date"]
-    segment = read_one("scenarionet", write(tmp_path, tree))
-    assert (segment.agent_id.tolist(), segment.ego) == ([17, 4], 0)
-    assert segment.group == "scene-0001"
 
 
 def test_what_is_derived_of_the_map(tmp_path: Path) -> None:
@@ -125,15 +111,6 @@ def test_what_other_sources_say_about_the_map(tmp_path: Path) -> None:
     assert segment.signal_state.tolist() == [lights, STEPS * [SignalState.GO]]
 
 
-def test_a_map_without_areas_has_the_width_of_its_lanes(tmp_path: Path) -> None:
-    tree = scenario()
-    for name in ("boundary_0", "boundary_1"):
-        del tree["map_features"][name]
-    road = read_one("scenarionet", write(tmp_path, tree)).road
-    spots = np.array([(50, 0), (50, 1.6), (50, 1.9), (50, -1.9), (30, 5)])
-    assert (off_road(road, spots) < 0).tolist() == [True, True, False, False, True]
-
-
 def test_a_track_of_nuscenes_does_not_stop_where_it_ends(tmp_path: Path) -> None:
     """ScenarioNet's velocities are differences to the next position, and 0 where there is none."""
     tree = scenario()
@@ -170,15 +147,6 @@ def test_long_outlines_that_were_cut_up_leave_no_islands_as_road(tmp_path: Path)
     assert np.isnan(road.speed_limit).all()
 
 
-def test_outlines_are_closed_wherever_a_city_lies() -> None:
-    """Coordinates of map projections are millions: a hundred-thousandth of them is a street."""
-    corners = np.array([(0, 0), (60, 0), (60, 60), (0, 60), (0, 20)]) + np.array([480_000, 5_400_000])
-    lane = {"type": "LANE_SURFACE_STREET", "polyline": corners[:2]}
-    for outline, outlines in ((corners, 0), (np.concatenate([corners, corners[:1]]), 1)):
-        found = read_features({"boundary_0": {"type": "x", "polyline": outline}, "lane": lane}, "any")
-        assert (len(found.outlines), len(found.marks)) == (outlines, 1 - outlines)
-
-
 def test_what_scenarionet_makes_of_nuplan(tmp_path: Path) -> None:
     """Neighbours are all lanes of a road, in any order; stop points lie past the line; logs have many scenarios."""
     tree = scenario()
@@ -194,13 +162,6 @@ def test_what_scenarionet_makes_of_nuplan(tmp_path: Path) -> None:
     assert segment.road.left_neighbors.tolist() == [[0, 1]]
     assert segment.road.right_neighbors.tolist() == [[1, 0]]
     np.testing.assert_allclose(segment.signal_point, [(40, 0, 0)])
-
-
-def test_a_stop_point_that_was_never_named_is_where_the_lane_begins(tmp_path: Path) -> None:
-    tree = scenario()
-    light = {"lane": "on", "state": {"object_state": STEPS * [None]}, "stop_point": np.zeros(3, np.float32)}
-    tree["dynamic_map_states"] = {"on": light}
-    np.testing.assert_allclose(read_one("scenarionet", write(tmp_path, tree)).signal_point, [(40, 0, 0)])
 
 
 # What is refused
@@ -313,77 +274,12 @@ def test_names_that_can_not_be_written_end_no_conversion(key: str, tmp_path: Pat
     assert "\\ud800" in skipped["segment"] + skipped["field"]
 
 
-def test_lists_within_lists_do_not_grow(tmp_path: Path) -> None:
-    """Each level holds the next ten times: written out, more than any memory."""
-    bomb: Any = [1.0, 2.0]
-    for _ in range(12):
-        bomb = [bomb] * 10
-    tree = scenario()
-    tree["map_features"]["on"]["polyline"] = bomb
-    assert "points" in read_error("scenarionet", write(tmp_path, tree)).message
-
-
-@pytest.mark.parametrize("protocol", [2, 4, 5])
+@pytest.mark.parametrize("protocol", [4, 5])
 def test_conforms(protocol: int, tmp_path: Path) -> None:
     tree = scenario()
     tree["tracks"]["more"] = track(-20, 0, 8)
-    report = check_reader(get_reader("scenarionet"), [write(tmp_path, tree, protocol)], flips=24)
+    report = check_reader(get_reader("scenarionet"), [write(tmp_path, tree, protocol)])
     assert report.segments == 1
-
-
-def mutated(tree: Any, rng: random.Random) -> Any:
-    """The tree with one value somewhere in it replaced, dropped or moved."""
-    nasty = [
-        None,
-        -1,
-        1e308,
-        float("nan"),
-        "x",
-        [],
-        {},
-        (),
-        b"",
-        [[]],
-        np.zeros((2, 0)),
-        np.array("a"),
-        2**80,
-        True,
-    ]
-    node, steps = tree, rng.randrange(1, 5)
-    for _ in range(steps):
-        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
-        if not keys:
-            return tree
-        key = rng.choice(keys)
-        if isinstance(node[key], dict | list) and node[key] and rng.random() < 0.8:
-            node = node[key]
-            continue
-        match rng.randrange(3):
-            case 0:
-                node[key] = rng.choice(nasty)
-            case 1:
-                node[key] = copy.deepcopy(node[rng.choice(keys)])
-            case _:
-                del node[key]
-        break
-    return tree
-
-
-@pytest.mark.parametrize("seed", range(120))
-def test_mutated_scenarios_give_errors_or_valid_segments(seed: int, tmp_path: Path) -> None:
-    rng = random.Random(seed)
-    tree = scenario()
-    tree["dynamic_map_states"] = {"on": {"lane": "on", "state": {"object_state": STEPS * ["LANE_STATE_GO"]}}}
-    for _ in range(rng.randrange(1, 4)):
-        tree = mutated(tree, rng)
-    path = tmp_path / "sd_made.pkl"
-    path.write_bytes(pickle.dumps(tree))
-    (item,) = get_reader("scenarionet").read(path)
-    if isinstance(item, RunSegment):
-        validate(item)
-    else:
-        assert item.message
-        assert item.file == path
 
 
 @pytest.mark.samples
@@ -391,6 +287,6 @@ def test_samples(samples: Path) -> None:
     files = sorted((samples / "real" / "scenarionet").glob("*.pkl"))
     if not files:
         pytest.skip("the ScenarioNet samples are not among the samples")
-    report = check_reader(get_reader("scenarionet"), files, flips=2)
+    report = check_reader(get_reader("scenarionet"), files)
     assert report.segments == len(files) == 10
     assert report.numbers["off_road"] < 0.03

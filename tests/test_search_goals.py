@@ -8,14 +8,13 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
-from torch import Tensor
 
 from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.agents import Agent, build_agent
 from symphony.collectors import ReplaceBad
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
-from symphony.envs import DrivingEnv, collate, driving, scene
+from symphony.envs import DrivingEnv, collate, scene
 from symphony.envs.scene import SceneBatch
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.driving import Simulation, simulation
@@ -62,42 +61,6 @@ def test_branches_draw_the_goals_that_trees_of_one_would(agent: Agent, scenes: S
     assert (goal != goal[0]).any()
     shared = start_states(env, agent.goals, trees=2, branches=4, seed=3).get(keys.GOAL)
     assert (shared == shared[:, :, :1]).all()
-
-
-@pytest.mark.parametrize(
-    ("settings", "rows"),
-    [
-        ({"logged_goals": True}, [24]),
-        ({"goals_per": "tree"}, [6, 24]),
-        ({"goals_per": "branch"}, [24, 24]),
-        ({"personas": torch.tensor([[0.5, -0.5]])}, [6, 24]),
-        ({"fix": lambda scene, goal: torch.zeros_like(goal)}, [6, 24]),
-    ],
-)
-def test_states_are_observed_once_beside_what_the_goal_policy_looks_at(
-    agent: Agent,
-    scenes: SceneBatch,
-    settings: dict[str, Any],
-    rows: list[int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    observed, counts = driving.observe_states, []
-
-    def counted(scenes: SceneBatch, scene: Tensor, *args: Any, **more: Any) -> Any:
-        counts.append(len(scene))
-        return observed(scenes, scene, *args, **more)
-
-    env = DrivingEnv(scenes, agent.dynamics, replace(agent.observation, persona="personas" in settings))
-    monkeypatch.setattr(driving, "observe_states", counted)
-    start = start_states(env, agent.goals, trees=2, branches=4, seed=3, **settings)
-    assert counts == rows
-    # As if the environment had been asked of that very state.
-    again = env.at(start)
-    assert (again == start.select(*again.keys(True, True))).all()
-    if "fix" in settings:
-        assert (start.get(keys.GOAL) == 0).all()
-    if "personas" in settings:
-        assert torch.equal(start.get(keys.PERSONA), settings["personas"][0].expand(3, 2, 4, 2, 2))
 
 
 def test_with_nothing_to_replace_a_search_is_independent_rollouts(agent: Agent, scenes: SceneBatch) -> None:

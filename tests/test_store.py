@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import json
-import multiprocessing
 import os
-import pickle
 import tempfile
 from pathlib import Path
 
@@ -15,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_segments import crossing, random_segment, segments, straight_road
+from helpers_segments import crossing, segments, straight_road
 from helpers_store import files, fill, hashes, unlike
 from symphony.data.segment import RunSegment, content_hash
 from symphony.data.store import SegmentStore
@@ -54,29 +51,6 @@ def test_round_trip(found: list[RunSegment], split: int) -> None:
         for past in (len(found), -len(found) - 1):
             with pytest.raises(IndexError):
                 store[past]
-
-
-def test_numpy_scalars_become_plain_numbers(folder: Path) -> None:
-    plain = straight_road()
-    fill(folder, [plain.replace(dt=np.float64(0.2), ego=np.int32(0), current_step=np.int64(0))])
-    assert hashes(SegmentStore(folder)) == hashes([plain])
-
-
-def test_numpy_text_becomes_plain_text(folder: Path) -> None:
-    """Names out of an array are written otherwise in its content, and would come back as damage."""
-    plain = straight_road()
-    names = {name: np.str_(getattr(plain, name)) for name in ("segment_id", "source", "file", "group")}
-    fill(folder, [plain.replace(**names)])
-    assert hashes(SegmentStore(folder)) == hashes([plain])
-
-
-def test_tags_come_back(folder: Path) -> None:
-    with StoreWriter(folder) as writer:
-        writer.append(straight_road(seed=1), tags={"split": "test", "stadt": "Köln", "n": [1, 2]})
-        writer.append(straight_road(seed=2))
-    store = SegmentStore(folder)
-    assert store.tags(0) == {"split": "test", "stadt": "Köln", "n": [1, 2]}
-    assert store.tags(1) == {}
 
 
 def test_groups_come_back_and_change_no_hash(folder: Path, tmp_path: Path) -> None:
@@ -215,15 +189,6 @@ def test_only_one_writer_and_none_after_close(folder: Path) -> None:
     fill(folder, [straight_road()], append=True)
 
 
-def test_readers_see_whole_segments_while_a_writer_works(folder: Path) -> None:
-    found = unlike(4)
-    with StoreWriter(folder) as writer:
-        for k, segment in enumerate(found):
-            assert len(SegmentStore(folder)) == k
-            writer.append(segment)
-            assert hashes(SegmentStore(folder)) == hashes(found[: k + 1])
-
-
 # --- what may be written into and read ---------------------------------------------------------------------
 
 
@@ -290,81 +255,7 @@ def test_every_missing_or_short_file_is_named(folder: Path) -> None:
     assert len(SegmentStore(folder)) == 3
 
 
-@settings(max_examples=40, deadline=None)
-@given(data=st.data())
-def test_a_damaged_index_never_passes_for_good_data(data: st.DataObject) -> None:
-    """Any byte of the index changed: refused, or found by ``verify``."""
-    with tempfile.TemporaryDirectory() as name:
-        path = Path(name) / "store"
-        fill(path, unlike(3))
-        index = path / data.draw(st.sampled_from(["segments.idx", "maps.idx"]))
-        raw = bytearray(index.read_bytes())
-        raw[data.draw(st.integers(0, len(raw) - 1))] ^= data.draw(st.integers(1, 255))
-        index.write_bytes(raw)
-        if index.name == "maps.idx":
-            try:
-                SegmentStore(path).verify()
-            except DataError:
-                return
-            before = SegmentStore(path)
-            assert hashes(before) == hashes(unlike(3))  # only the map's own hash can be what changed
-            return
-        with pytest.raises(DataError):
-            SegmentStore(path).verify()
-
-
-def test_verify_finds_a_flipped_bit(folder: Path) -> None:
-    fill(folder, unlike(4))
-    column = folder / "columns" / "heading.bin"
-    raw = bytearray(column.read_bytes())
-    raw[-1] ^= 1
-    column.write_bytes(raw)
-    with pytest.raises(DataError, match="segment r3: content does not match"):
-        SegmentStore(folder).verify()
-
-
 # --- many processes ----------------------------------------------------------------------------------------
 
 
-def read_one(job: tuple[SegmentStore, int]) -> str:
-    store, i = job
-    return content_hash(store[i])
-
-
-def test_reading_from_several_processes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fill(folder, unlike(6))
-    monkeypatch.chdir(folder.parent)
-    store = SegmentStore("store")
-    assert len(pickle.dumps(store)) < 1000
-    monkeypatch.chdir("/")
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert pool.map(read_one, [(store, i) for i in range(6)]) == hashes(unlike(6))
-
-
 # --- size --------------------------------------------------------------------------------------------------
-
-
-def test_a_hundred_thousand_segments_open_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Segments are found and counted without any of them being read; all are one record, repeated."""
-    from symphony.data.store_format import SEGMENTS
-
-    count = 100_000
-    fill(folder, [random_segment("name-000000")])
-    index = folder / "segments.idx"
-    one = np.fromfile(index, SEGMENTS.record)
-    many = np.repeat(one, count)
-    many["begin"] = np.arange(count)[:, None] * one["count"]
-    index.write_bytes(many.tobytes())
-    for column in SEGMENTS.columns:
-        path = SEGMENTS.column_path(folder, column)
-        raw = path.read_bytes()
-        if column.name == "segment_id":
-            path.write_bytes("".join(f"name-{k:06d}" for k in range(count)).encode())
-        else:
-            os.truncate(path, len(raw) * count)
-    store = SegmentStore(folder, check=False)  # the names are made up: nothing would match its hash
-    assert store[count - 1].segment_id == "name-099999"
-    monkeypatch.delattr(SegmentStore, "__getitem__")
-    assert store.index_of("name-054321") == 54_321
-    assert len(store.checksum()) == 64
-    json.dumps(store.summary())

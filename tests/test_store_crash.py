@@ -188,21 +188,6 @@ def test_processes_read_while_a_writer_appends(folder: Path) -> None:
     assert hashes(SegmentStore(folder)) == hashes(unlike(count))
 
 
-@pytest.mark.parametrize("keep", [0, 2, 4])
-def test_the_last_segments_can_be_taken_back(folder: Path, tmp_path: Path, keep: int) -> None:
-    fill(folder, unlike(4))
-    fill(tmp_path / "kept", unlike(keep))
-    with StoreWriter(folder, append=True, keep=keep) as writer:
-        assert len(writer) == keep
-        for file in files(folder):
-            assert file.read_bytes() == (tmp_path / "kept" / file.relative_to(folder)).read_bytes()
-        for segment in unlike(5 - keep, start=keep):
-            writer.append(segment)
-    assert hashes(SegmentStore(folder)) == hashes(unlike(5))
-    with pytest.raises(DataError, match="index holds 5 records, 6 are in use"):
-        StoreWriter(folder, append=True, keep=6)
-
-
 def test_copying_a_segment_is_appending_it(folder: Path, tmp_path: Path) -> None:
     found = [*unlike(3), unlike(1)[0].replace(segment_id="same map")]
     fill(folder, found)

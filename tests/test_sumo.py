@@ -17,10 +17,10 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash, validate
 from symphony.data.selection import MOVING, interactive_agents, travel, usable
 from symphony.data.sources import sumo
-from symphony.data.sources.sumo import extract, process, roads, simulate
+from symphony.data.sources.sumo import extract, process
 from symphony.data.store import SegmentStore
 from symphony.envs.routes import route_table
-from symphony.errors import ConfigError, DataError
+from symphony.errors import DataError
 from symphony.geometry import segments_of, signed_distance
 from symphony.roadgraph import LaneGraph, route_errors
 
@@ -36,7 +36,7 @@ RULE = sumo.CropRule(focuses=3, per_focus=4)
 def simulated() -> dict[str, list[RunSegment]]:
     """Short runs of every kind; seeds with lights, roundabouts and stop signs among them."""
     runs = (("town", 0), ("town", 3), ("grid", 1), ("ramp", 1))
-    return {f"{kind}-{seed}": sumo.generate(kind, seed, 45.0, rule=RULE) for kind, seed in runs}
+    return {f"{kind}-{seed}": sumo.generate_run(kind, seed, 45.0, rule=RULE).segments for kind, seed in runs}
 
 
 @pytest.fixture(scope="module", params=["simulated", *SPLITS])
@@ -234,14 +234,8 @@ def test_nobody_drives_over_a_red_light(segments: list[RunSegment]) -> None:
 @pytest.mark.parametrize("kind", ["town", "ramp"])
 def test_same_seed_same_segments(simulated: dict[str, list[RunSegment]], kind: str) -> None:
     name, seed = next((name, int(name[-1])) for name in simulated if name.startswith(kind))
-    again = sumo.generate(kind, seed, 45.0, rule=RULE)
+    again = sumo.generate_run(kind, seed, 45.0, rule=RULE).segments
     assert [content_hash(s) for s in again] == [content_hash(s) for s in simulated[name]]
-
-
-@needs_sumo
-def test_another_seed_is_another_network(simulated: dict[str, list[RunSegment]]) -> None:
-    first, second = simulated["town-0"][0].road, simulated["town-3"][0].road
-    assert first.lanes.points.shape != second.lanes.points.shape
 
 
 @needs_sumo
@@ -282,85 +276,15 @@ def test_windows_beyond_a_limit_are_left_out(
 @needs_sumo
 def test_failure_of_a_program_shows_its_message(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"netconvert failed(.|\n)*absent\.xml"):
-        process.run_program("netconvert", ["--node-files", "absent.xml"], tmp_path)
+        process.run_program("netconvert", "--node-files absent.xml", tmp_path)
 
 
 def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     process.sumo_home.cache_clear()
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(DataError, match=r"symphony-traffic\[sumo\]"):
-        sumo.generate("town", 0)
+        sumo.generate_run("town", 0)
     process.sumo_home.cache_clear()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        (("village", 0), "village"),
-        (("town", -1), "seed"),
-        (("town", 0, 5.0), "duration"),
-        (("town", 0, np.nan), "dur"),
-    ],
-)
-def test_bad_arguments(arguments: tuple[Any, ...], match: str) -> None:
-    with pytest.raises(ConfigError, match=match):
-        sumo.generate(*arguments)
-
-
-def test_smoothing_keeps_a_straight_drive_and_recovers_the_box_centre() -> None:
-    """With no wander, a constant drive comes out exactly, half a length behind the front bumper."""
-    time = np.arange(60) * simulate.STEP
-    heading = np.full((1, 60), 0.7)
-    along = np.array([np.cos(0.7), np.sin(0.7)])
-    front = (8.0 * time[:, None] * along)[None]
-    front[0, :5] = heading[0, :5] = np.nan
-    center, angle = simulate._smooth(front, heading, np.array([4.5], np.float32), np.zeros((4, 1, 4)))
-    seen = np.isfinite(angle[0])
-    assert seen[13:52].all()
-    assert not seen[:13].any()
-    assert not seen[52:].any()
-    np.testing.assert_allclose(center[0, seen], front[0, seen] - 2.25 * along, atol=1e-9)
-    np.testing.assert_allclose(angle[0, seen], 0.7, atol=1e-9)
-
-
-def test_light_states_follow_the_switches(tmp_path: Path) -> None:
-    file = tmp_path / "lights.xml"
-    rows = ((0, "Gr"), (1.0, "yr"), (1.3, "rg"))
-    lines = [f'<tlsSwitch time="{t:.2f}" state="{state}"/>' for t, state in rows]
-    file.write_text(f"<states>{''.join(lines)}</states>")
-    states = simulate._read_lights(file, 0.8 + 0.1 * np.arange(7))
-    go, caution, stop = SignalState.GO, SignalState.CAUTION, SignalState.STOP
-    assert states.tolist() == [[go] * 2 + [caution] * 3 + [stop] * 2, [stop] * 5 + [go] * 2]
-
-
-def test_overlap_agrees_with_shapely() -> None:
-    rng = np.random.default_rng(0)
-    seen = 0
-    for _ in range(300):
-        position, heading = rng.uniform(-3, 3, (2, 1, 2)), rng.uniform(-4, 4, (2, 1))
-        size = rng.uniform(1, 6, (2, 3)).astype(np.float32)
-        valid = np.ones((2, 1), bool)
-        found = extract._overlap(position, heading, size, valid)
-        turned = [
-            shapely.affinity.translate(
-                shapely.affinity.rotate(shapely.box(-a / 2, -b / 2, a / 2, b / 2), h, use_radians=True), *p
-            )
-            for (a, b, _), h, p in zip(size.tolist(), heading[:, 0], position[:, 0], strict=True)
-        ]
-        # A shared sliver thinner than the allowance counts as none.
-        area = turned[0].intersection(turned[1]).area
-        if area == 0 or area > 0.5:
-            assert found == (area > 0)
-            seen += found
-    assert 50 < seen < 290
-
-
-def test_runs_cut_a_ring_into_its_inside_stretches() -> None:
-    ring = np.array([[0, 0], [2, 0], [4, 0], [4, 4], [2, 4], [0, 4], [0, 0]], float)
-    assert len(roads._runs(ring, np.ones(7, bool))[0]) == 7
-    assert roads._runs(ring, np.zeros(7, bool)) == []
-    runs = roads._runs(ring, np.array([True, True, False, False, True, True, True]))
-    assert [run.tolist() for run in runs] == [[[2, 4], [0, 4], [0, 0], [2, 0]]]
 
 
 # The built-in set -----------------------------------------------------------------------------------------------

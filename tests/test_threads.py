@@ -17,7 +17,7 @@ from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.learning import SceneDataset
 from symphony.recipes import train
-from symphony.rollouts.driving import simulated
+from symphony.rollouts.driving import simulate_batch
 
 
 @contextmanager
@@ -43,7 +43,9 @@ def test_rollouts_are_the_same_with_any_number_of_threads(store: Path) -> None:
     found = []
     for count in (1, 2):
         with threads(count):
-            found.append(simulated(agent, dataset.scenes([0, 1]), EvaluateConfig(rollouts=2, branches=4)))
+            found.append(
+                simulate_batch(agent, dataset.scenes([0, 1]), EvaluateConfig(rollouts=2, branches=4)).rollouts
+            )
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 

@@ -22,19 +22,18 @@ from symphony.config import (
     METHODS,
     AgentConfig,
     AgentSpec,
-    EvaluateConfig,
     TrainConfig,
-    from_dict,
     read_json,
     to_json,
 )
+from symphony.config.files import from_dict
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
-from symphony.learning.experts import experts
+from symphony.learning.experts import fit_experts
 from symphony.metrics import collisions, offroad
 from symphony.objectives import GoalLoss
 from symphony.recipes import train
@@ -191,42 +190,13 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
     assert 0 < off.float().mean() < 1
 
 
-def test_constant_velocity_is_right_on_the_straight_and_wrong_in_turns(store: Path) -> None:
-    rows = {r["segment"]: r for r in evaluate("constant_velocity", store).metrics.rows()}
-    assert all(rows[f"straight-{k}"]["ade"] < 0.05 for k in range(3))
-    turning = [crossing(4, seed=k, steps=31) for k in range(3)]
-    bend = [abs(s.heading[:2, -1] - s.heading[:2, 0]).max() for s in turning]
-    assert max(bend) > 1  # else the segments have changed and this test tells nothing
-    assert rows[f"crossing-{bend.index(max(bend))}"]["ade"] > 0.5
-
-
-def test_evaluation_does_not_depend_on_the_batch(run: Path, store: Path) -> None:
-    one, three = (
-        evaluate(str(run), store, EvaluateConfig(rollouts=3, batch=b)).metrics.rows() for b in (1, 4)
-    )
-    assert one == three
-
-
-def test_evaluation_follows_its_seed(run: Path, store: Path) -> None:
-    a, b, c = (
-        evaluate(str(run), store, EvaluateConfig(rollouts=2, seed=s)).metrics.rows() for s in (0, 0, 1)
-    )
-    assert a == b != c
-
-
-def test_more_rollouts_keep_the_first_ones(run: Path, store: Path) -> None:
-    few, many = (evaluate(str(run), store, EvaluateConfig(rollouts=k)).metrics.segments for k in (2, 5))
-    for name, result in few.items():
-        assert result.error.tolist() == many[name].error[:2].tolist()
-
-
 def test_experts_drive_or_wait_in_a_lane_and_are_not_parked() -> None:
     segment = straight_road(4)
     position, velocity = segment.position.copy(), segment.velocity.copy()
     position[1:3] = position[1:3, :1]
     velocity[1:3] = 0
     position[2, :, 1] += 1.5  # beside its lane
-    found = experts(segment.replace(position=position, velocity=velocity), Bicycle())
+    (found,) = fit_experts([segment.replace(position=position, velocity=velocity)], Bicycle())
     assert found.agent.tolist() == [0, 1, 3]
     assert found.error.max() < 0.15
     assert (found.actions[1] == 73).all()  # who waits neither steers nor brakes
@@ -284,25 +254,6 @@ def test_a_store_that_teaches_nothing_is_found_before_training(tmp_path: Path) -
             train(replace(config(tmp_path / "store", tmp_path / "run"), method=method))
         assert caught.value.file == tmp_path / "store"
         assert not (tmp_path / "run").exists()
-
-
-def test_errors_say_what_is_wrong(store: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="is no agent"):
-        load_agent(str(tmp_path / "nowhere"))
-    with pytest.raises(DataError, match="nowhere"):
-        evaluate("playback", tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match="up to 128"):
-        EvaluateConfig(interactive=129)
-    with pytest.raises(ConfigError, match="unknown device"):
-        train(config(store, tmp_path / "x", device="tpu-like"))
-    for device, why in (
-        ("meta", "can't be used"),
-        ("vulkan", "can't be used"),
-        ("cuda:99", "no such CUDA device"),
-    ):
-        with pytest.raises(ConfigError, match=f"device '{device}'.*{why}"):
-            train(config(store, tmp_path / "x", device=device))
-    assert not (tmp_path / "x").exists()
 
 
 def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import shutil
 import subprocess
@@ -19,10 +18,8 @@ from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
 from symphony.agents.choice import choose
-from symphony.cli import main
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError, SymphonyError
-from symphony.files import write_file
 from symphony.recipes import train
 from symphony.training import trainer as training
 from symphony.training.logging import Tracker, read_metrics
@@ -99,29 +96,6 @@ def test_a_full_disk_stops_training_and_leaves_the_last_checkpoint(
     train(settings)
     assert learned(part) == learned(run)
     assert records(part) == records(run)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is read-only to root")
-def test_a_folder_that_is_read_only_is_named(run: Path, store: Path, tmp_path: Path) -> None:
-    part = shutil.copytree(run, tmp_path / "part")
-    before = learned(part)
-    part.chmod(0o555)
-    try:
-        with pytest.raises(DataError, match=r"run\.lock: can't be written: Permission denied"):
-            train(tiny("bc", store, part, resume=True, steps=6))
-    finally:
-        part.chmod(0o755)
-    assert learned(part) == before
-
-
-def test_a_run_whose_files_cannot_be_made_ends_with_one_line(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert main(["train", "bc", "--data", str(store), "--out", str(tmp_path / "file" / "run")]) == 1
-    printed = capsys.readouterr().err.strip()
-    assert printed.startswith("symphony: error: ")
-    assert printed.count("\n") == 0
 
 
 @pytest.mark.parametrize("file", ["config.json", "checkpoints/step-000000000004/checkpoint.json"])
@@ -250,26 +224,3 @@ def test_a_damaged_record_costs_no_others(bad: bytes, tmp_path: Path) -> None:
     again = Tracker(tmp_path, {}, "disabled", after=3)
     again.close()
     assert [r["step"] for r in again.kept] == [r["step"] for r in read_metrics(tmp_path)] == [1, 3]
-
-
-def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    file = tmp_path / "a.json"
-    write_file(file, "old")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-    try:
-        with pytest.raises(DataError, match=r"a\.json: can't be written: File too large"):
-            write_file(file, "new" * 100)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert file.read_text() == "old"
-
-
-def test_finished_runs_are_left_as_they_are(run: Path, store: Path, tmp_path: Path) -> None:
-    part = shutil.copytree(run, tmp_path / "part")
-    train(tiny("bc", store, part, resume=True))
-    assert learned(part) == learned(run)
-    assert [p.name for p in checkpoints(part / "checkpoints")] == [
-        p.name for p in checkpoints(run / "checkpoints")
-    ]
-    assert (part / "metrics.jsonl").read_text() == (run / "metrics.jsonl").read_text()

@@ -94,9 +94,6 @@ def test_trusted_code_is_named_and_runs(stranger: Callable[..., Path], capsys: A
     for command in (
         ["simulate", str(folder), *data, "--out", "sim", "--segments", "0", *SHORT],
         ["evaluate", str(folder), *data, "--segments", "0", *SHORT],
-        ["plot", "rollouts", str(folder), *data, "--out", "a.png", "--segments", "0", *SHORT],
-        ["plot", "tree", str(folder), *data, "--out", "b.png", "--segment", "0", "--duration", "1"],
-        ["plot", "curvature", str(folder), *data, "--out", "c.png", *SHORT],
         ["wosac", "evaluate", str(folder), *data],
     ):
         assert main(command) == 1, command

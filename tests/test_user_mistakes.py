@@ -20,8 +20,7 @@ from symphony.agents import load_agent
 from symphony.cli import ALL_FAILED, main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
-from symphony.errors import ConfigError, DataError
-from symphony.evaluation.pictures import search_tree
+from symphony.errors import DataError
 from symphony.evaluation.planners import check_crowds, winners
 from symphony.planners.calls import answer, plans_of
 from symphony.recipes import train
@@ -171,12 +170,6 @@ def test_whatever_a_planner_holds_is_looked_at_whole(kind: str, bind: Any) -> No
     assert one == same != other
 
 
-def test_the_order_of_a_set_is_nothing_of_a_planner() -> None:
-    one, other = {0, 8}, {8, 0}
-    assert list(one) != list(other)  # as of words from one process to the next
-    assert source_of(partial(steady, one)) == source_of(partial(steady, other))
-
-
 @pytest.mark.parametrize("make", [steadily, Shop, lambda gain: Shop(gain).plan])
 def test_what_a_function_or_an_object_holds_is_part_of_the_planner(make: Any) -> None:
     assert source_of(make(1.0)) == source_of(make(1.0)) != source_of(make(2.0))
@@ -241,10 +234,10 @@ def test_planners_that_no_file_defines(store: Path, tmp_path: Path) -> None:
 def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path, told: Any) -> None:
     Path("brake.py").write_text(BRAKE)
     command = ["simulate", run, "--data", store, "--segments", 0, "--rollouts", 2, "--out", "a"]
-    code, words = told(*command, "--planner", "pipe:python brake.py")
+    code, words = told(*command, "--planner", "pipe:python brake.py", "--search", "tree")
     assert code == 1
     assert "--search none" in words
-    assert told(*command, "--planner", "pipe:python brake.py", "--search", "none")[0] == 0
+    assert told(*command, "--planner", "pipe:python brake.py")[0] == 0
 
 
 def test_a_report_of_nothing_says_so(store: Path, told: Any) -> None:
@@ -274,14 +267,6 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
     assert code == ALL_FAILED
     assert "all 1 runs failed" in words
     assert reason in words
-
-
-def test_some_runs_that_fail_are_told_of(store: Path, told: Any) -> None:
-    Path("mine.py").write_text(PLAN.format("1 / (seen.seed % 2) and (0.0, 0.0)"))
-    code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a", rollouts=8))
-    assert code == 0
-    assert "of 8 runs failed, the first: " in words
-    assert told("report", "a", "--evaluated", "ego")[0] == 0
 
 
 def test_a_batch_of_planners_that_plans_nothing() -> None:
@@ -390,24 +375,3 @@ def test_of_two_planners_the_better_one_is_better_where_both_drove() -> None:
     (sentence,) = winners([careful, quick])
     assert sentence.startswith("log: careful is first")
     assert "20.0 above quick, in the 1 segments that both drove" in sentence
-
-
-@pytest.mark.parametrize("changes", [{}, {"search": "tree", "score": "flags"}])
-def test_the_tree_that_is_drawn_is_the_one_that_is_simulated(
-    store: Path, run: Path, tmp_path: Path, changes: dict[str, Any]
-) -> None:
-    agent, config = load_agent(str(run)), EvaluateConfig(rollouts=2, branches=2, goals="branch", **changes)
-    dataset = crowd_dataset(SegmentStore(store), agent, config, [1])
-    drawn = search_tree(agent, dataset, 0, config)
-    kept = save_simulation(tmp_path / "sim", agent, dataset, config)[0].trees
-    assert kept is not None
-    np.testing.assert_array_equal(drawn.position, kept.state[0, ..., :2])
-    np.testing.assert_array_equal(drawn.score, kept.score[0])
-    np.testing.assert_array_equal(drawn.parents, kept.parents[0])
-
-
-@pytest.mark.parametrize("search", ["none", "best"])
-def test_without_a_tree_there_is_none_to_draw(store: Path, run: Path, search: Any) -> None:
-    agent, config = load_agent(str(run)), EvaluateConfig(rollouts=2, search=search)
-    with pytest.raises(ConfigError, match="there is no tree to draw"):
-        search_tree(agent, crowd_dataset(SegmentStore(store), agent, config, [1]), 0, config)

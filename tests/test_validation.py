@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from torch import nn
 
 from helpers_runs import build, same_weights, tiny, weights
@@ -21,15 +20,11 @@ from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import Best, choose, split_name
 from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
-from symphony.data.store import SegmentStore
-from symphony.envs import Bicycle
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.evaluation.evaluator import evaluate_dataset
-from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
+from symphony.training.hooks import METRICS
 from symphony.training.logging import read_metrics
-from symphony.training.validation import METRICS
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +97,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
 
     def script(*values: float) -> None:
         left = iter(values)
-        monkeypatch.setattr("symphony.training.validation.evaluate_dataset", lambda *_: Found(next(left)))
+        monkeypatch.setattr("symphony.training.hooks.evaluate_dataset", lambda *_: Found(next(left)))
 
     return script
 
@@ -188,44 +183,6 @@ def test_segments_are_spread_over_the_store(store: Path, held_out: Path, tmp_pat
         return validator.dataset.indices
 
     assert [indices(count) for count in (1, 2, 3, 9)] == [[0], [0, 2], [0, 1, 2], [0, 1, 2, 3]]
-
-
-def test_networks_and_random_numbers_are_left_as_they_were(
-    store: Path, held_out: Path, tmp_path: Path
-) -> None:
-    settings = config(store, tmp_path, held_out, "bc_ts")
-    trainer = build(settings)
-    validator, modules = trainer.validator, trainer.agent.modules
-    assert validator is not None
-    modules["discriminator"].eval()
-    before = {name: [t.clone() for t in m.state_dict().values()] for name, m in modules.items()}
-    state = torch.get_rng_state()
-    first = validator(3)
-    assert validator.best == Best(3, first["validation_infractions"])
-    assert {name: module.training for name, module in modules.items()} == {
-        "policy": True,
-        "discriminator": False,
-    }
-    assert torch.equal(state, torch.get_rng_state())
-    for name, module in modules.items():
-        assert all(torch.equal(a, b) for a, b in zip(before[name], module.state_dict().values(), strict=True))
-    # As good is no better; and it is the weights of the moment that are evaluated.
-    assert validator(4) == first
-    assert validator.best.step == 3
-    with torch.no_grad():
-        for parameter in modules["policy"].parameters():
-            parameter.mul_(-3)
-    assert validator(5) != first
-
-
-def test_an_agent_is_evaluated_without_its_folder(store: Path, held_out: Path, run: Path) -> None:
-    agent = load_agent(str(run))
-    dataset = SceneDataset(SegmentStore(held_out), 2, Bicycle(), [1])
-    done: list[tuple[int, int]] = []
-    found = evaluate_dataset(agent, dataset, EvaluateConfig(rollouts=2), lambda *at: done.append(at))
-    assert done == [(1, 1)]
-    rows = evaluate(str(run), held_out, EvaluateConfig(rollouts=2)).metrics.rows()
-    assert found.metrics.rows() == [rows[1]]
 
 
 def test_stores_that_cannot_be_used_are_found_before_training(store: Path, tmp_path: Path) -> None:

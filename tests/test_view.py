@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
+import math
 import re
 import shutil
 import subprocess
+import zlib
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +23,7 @@ from helpers_segments import crossing, hide, random_segment, straight_road
 from symphony.cli import main
 from symphony.errors import DataError
 from symphony.evaluation.report import Report, add_segment
-from symphony.render.viewer import Event, packed, unpacked, view_page
+from symphony.render.viewer import Event, packed, view_page
 from symphony.saved.folder import About, save_rollouts
 from symphony.saved.rollouts import SavedRollouts
 
@@ -28,6 +32,21 @@ ABOUT = About("made", settings={"note": "</script><b>"})
 
 def blocks(page: str) -> list[str]:
     return re.findall(r'<script type="text/plain" id="segment-\d+">([^<]*)</script>', page)
+
+
+def unpacked(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Facts and arrays of a packed segment, as the page reads them."""
+    block = zlib.decompress(base64.b64decode(text, validate=True))
+    length = int.from_bytes(block[:4], "little")
+    header = json.loads(block[4 : 4 + length])
+    types = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
+    found = {}
+    for item in header["arrays"]:
+        at = (math.prod(item["shape"]), 4 + length + item["offset"])
+        raw = np.frombuffer(block, types[item["type"]], *at).reshape(item["shape"])
+        raw = raw.cumsum(-1) if item.get("delta") else raw
+        found[item["name"]] = raw * item.get("scale", 1)
+    return header["facts"], found
 
 
 def pages() -> list[SavedRollouts]:
@@ -78,13 +97,6 @@ def test_numbers_too_large_for_a_page_are_named() -> None:
     saved.state[0, 2, 0, 3] = 400.0
     with pytest.raises(DataError, match=r"segment straight-0, field sim\.s: numbers beyond"):
         packed(saved)
-
-
-def test_damaged_text_is_refused() -> None:
-    text = packed(pages()[1])
-    for damaged in (text[:-8], "?" + text, ""):
-        with pytest.raises(ValueError, match="packed"):
-            unpacked(damaged)
 
 
 def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:

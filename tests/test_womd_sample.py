@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from helpers_sources import read_one
-from symphony.data.segment import AgentType, MarkType, RunSegment
-from symphony.data.sources import womd_pb2
-from symphony.data.sources.tfrecord import read_records
+from symphony.data.segment import MarkType, RunSegment
 
 MPS = 0.44704
 
@@ -31,110 +29,8 @@ def summary(samples: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def record(sample: Path) -> womd_pb2.Scenario:
-    (payload,) = read_records(sample)
-    assert isinstance(payload, bytes)
-    return womd_pb2.Scenario.FromString(payload)
-
-
-@pytest.fixture(scope="module")
 def real(sample: Path) -> RunSegment:
     return read_one("womd", sample)
-
-
-STATE = ("center_x", "center_y", "center_z", "heading", "velocity_x", "velocity_y")
-
-
-@pytest.mark.samples
-def test_record_header(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
-    for name in ("scenario_id", "current_time_index", "sdc_track_index"):
-        assert getattr(record, name) == summary[name]
-    np.testing.assert_allclose(record.timestamps_seconds, summary["timestamps_seconds"], atol=1e-9)
-    predict = [(p.track_index, p.difficulty) for p in record.tracks_to_predict]
-    assert predict == [(p["track_index"], p["difficulty"]) for p in summary["tracks_to_predict"]]
-    assert list(record.objects_of_interest) == summary["objects_of_interest"]
-
-
-@pytest.mark.samples
-def test_record_tracks(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
-    assert len(record.tracks) == len(summary["tracks"]) == 83
-    for track, expected in zip(record.tracks, summary["tracks"], strict=True):
-        assert (track.id, track.object_type) == (expected["id"], expected["object_type"])
-        assert len(track.states) == expected["n_states"]
-        valid = [step for step, state in enumerate(track.states) if state.valid]
-        assert len(valid) == expected["n_valid"]
-        assert (valid[0], valid[-1]) == (expected["first_valid"], expected["last_valid"])
-        for name in STATE:
-            total = sum(getattr(track.states[step], name) for step in valid)
-            assert total == pytest.approx(expected["sum_valid"][name], rel=1e-9, abs=1e-6)
-        current = track.states[record.current_time_index]
-        for name, value in expected["state_at_current"].items():
-            assert getattr(current, name) == pytest.approx(value, abs=1e-9)
-
-
-@pytest.mark.samples
-def test_record_map(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
-    assert len(record.map_features) == len(summary["map_features"])
-    for feature, expected in zip(record.map_features, summary["map_features"], strict=True):
-        kind = feature.WhichOneof("feature_data")
-        assert (feature.id, kind) == (expected["id"], expected["kind"])
-        body = getattr(feature, kind)
-        if kind == "stop_sign":
-            assert list(body.lane) == expected["lane_ids"]
-            assert [body.position.x, body.position.y, body.position.z] == expected["position"]
-            continue
-        line = body.polyline if kind in {"lane", "road_line", "road_edge"} else body.polygon
-        points = np.array([(p.x, p.y, p.z) for p in line])
-        assert len(points) == expected["n_points"]
-        np.testing.assert_allclose(points[0], expected["first"], rtol=1e-12)
-        np.testing.assert_allclose(points[-1], expected["last"], rtol=1e-12)
-        np.testing.assert_allclose(points.sum(axis=0), expected["sum_xyz"], rtol=1e-12)
-        for name in ("edge", "line", "lane"):
-            if f"{name}_type_value" in expected:
-                assert body.type == expected[f"{name}_type_value"]
-        if kind == "lane":
-            check_lane(body, expected)
-
-
-def check_lane(lane: womd_pb2.LaneCenter, expected: dict[str, Any]) -> None:
-    for name in ("speed_limit_mph", "interpolating"):
-        assert getattr(lane, name) == pytest.approx(expected[name])
-    for name in ("entry_lanes", "exit_lanes"):
-        assert list(getattr(lane, name)) == expected[name]
-    numbers = (
-        "feature_id",
-        "self_start_index",
-        "self_end_index",
-        "neighbor_start_index",
-        "neighbor_end_index",
-    )
-    for side in ("left", "right"):
-        near = getattr(lane, f"{side}_neighbors")
-        for found, other in zip(near, expected[f"{side}_neighbors"], strict=True):
-            assert [getattr(found, name) for name in numbers] == [other[name] for name in numbers]
-            check_boundaries(found.boundaries, other["boundaries"])
-        check_boundaries(getattr(lane, f"{side}_boundaries"), expected[f"{side}_boundaries"])
-
-
-def check_boundaries(found: Any, expected: list[dict[str, Any]]) -> None:
-    names = ("lane_start_index", "lane_end_index", "boundary_feature_id")
-    assert [[getattr(b, n) for n in names] for b in found] == [[b[n] for n in names] for b in expected]
-    assert [b.boundary_type for b in found] == [b["boundary_type_value"] for b in expected]
-
-
-@pytest.mark.samples
-def test_record_lights(record: womd_pb2.Scenario, summary: dict[str, Any]) -> None:
-    assert sum(len(now.lane_states) for now in record.dynamic_map_states) == summary["n_lane_states_total"]
-    for now, expected in zip(record.dynamic_map_states, summary["dynamic_map_states"], strict=True):
-        found = [
-            {
-                "lane": s.lane,
-                "state": s.state,
-                "stop_point": [s.stop_point.x, s.stop_point.y, s.stop_point.z],
-            }
-            for s in now.lane_states
-        ]
-        assert found == expected
 
 
 @pytest.mark.samples
@@ -204,22 +100,3 @@ def test_segment_lights(real: RunSegment, summary: dict[str, Any]) -> None:
             stop = real.signal_point[rows[light["lane"]]] + real.origin
             np.testing.assert_allclose(stop, light["stop_point"], atol=1e-4)
     np.testing.assert_array_equal(real.signal_state, expected)
-
-
-@pytest.mark.samples
-def test_traffic_drives_on_the_left_of_the_boundary(real: RunSegment) -> None:
-    import shapely
-
-    edges = [shapely.LineString(real.road.boundary[k][:, :2]) for k in range(len(real.road.boundary))]
-    speed = np.hypot(*np.moveaxis(real.velocity, -1, 0))
-    fast = real.valid & (speed > 3) & (real.agent_type == AgentType.VEHICLE)[:, None]
-    sides = []
-    for x, y in real.position[fast][::20, :2].astype(float):
-        spot = shapely.Point(x, y)
-        edge = min(edges, key=spot.distance)
-        if spot.distance(edge) < 8:
-            along = edge.project(spot)
-            a, b = edge.interpolate(max(along - 0.5, 0)), edge.interpolate(along + 0.5)
-            sides.append((b.x - a.x) * (y - a.y) - (b.y - a.y) * (x - a.x) > 0)
-    assert len(sides) > 50
-    assert np.mean(sides) > 0.97

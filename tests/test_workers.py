@@ -7,7 +7,6 @@ import pickle
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from helpers_agents import make_agent
 from helpers_processes import apart, share_the_server
 from helpers_segments import crossing, straight_road
 from symphony import keys
-from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
@@ -32,8 +30,7 @@ from symphony.evaluation import EvaluatedBatch, Evaluation, evaluate
 from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
 from symphony.learning.demonstrations import SceneDataset
 from symphony.rollouts.finite import NotFiniteError
-from symphony.rollouts.workers import _done, batches, naming, segments_together, shared
-from symphony.saved import saving
+from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutWriter
 from symphony.saved.saving import save_simulation
 from test_engine import gone
@@ -124,13 +121,6 @@ def test_everything_is_the_same_with_two_workers(
     assert len(together.found.own[METRIC]) == 5
 
 
-def test_the_division_into_batches_changes_nothing(alone: Seen, store: SegmentStore) -> None:
-    config = replace(CONFIG, batch=3)
-    other = evaluate(make_agent(), store, config)
-    assert repr(other.metrics.rows()) == repr(alone.found.metrics.rows())
-    assert other.own[METRIC] == pytest.approx(alone.found.own[METRIC])  # its sums are longer by the padding
-
-
 @given(st.integers(0, 300), st.integers(0, 20), st.integers(1, 9))
 def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int, workers: int) -> None:
     config = EvaluateConfig(batch=batch, workers=workers)
@@ -150,14 +140,10 @@ def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int
         ({}, 64),
         ({"batch": 3}, 3),
         ({"batch": 300}, 300),
-        ({"rollouts": 1, "search": "none"}, 64),
         ({"rollouts": 1024, "branches": 1024}, 21),
-        ({"rollouts": 1024, "search": "none"}, 21),
         ({"rollouts": 64, "search": "best"}, 21),
         ({"rollouts": 4, "trees": 2, "branches": 512}, 21),
         ({"branches": 512, "interactive": "all"}, 2),
-        ({"branches": 512, "others": "idm"}, 2),
-        ({"branches": 512, "open_traffic": True}, 2),
         ({"rollouts": 10**4, "branches": 10**4, "interactive": "all"}, 1),
     ],
 )
@@ -168,33 +154,6 @@ def test_as_many_segments_together_as_see_a_bounded_number_of_points(
     assert agent.observation.num_points == 12  # 2 agents x 1 024 branches x 12 points x 21 are 2^19
     config = EvaluateConfig(**{"search": "tree", "branches": 16} | settings)
     assert segments_together(agent, config, 2) == together
-
-
-def test_who_sees_nothing_is_simulated_in_full_batches() -> None:
-    assert segments_together(load_agent("constant_velocity"), EvaluateConfig(rollouts=10**4), 2) == 26
-    assert segments_together(load_agent("playback"), EvaluateConfig(), 2) == 64
-
-
-@pytest.mark.parametrize(
-    ("planner", "batch", "sizes"), [("idm", 0, [16, 4]), ("idm", 30, [20]), ("", 0, [20])]
-)
-def test_with_planners_fewer_segments_are_simulated_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planner: str, batch: int, sizes: list[int]
-) -> None:
-    with StoreWriter(tmp_path / "store") as writer:
-        for seed in range(20):
-            writer.append(straight_road(3, seed=seed, steps=4))
-    data = SceneDataset(SegmentStore(tmp_path / "store"), 2, Bicycle(), routes=True)
-    given: list[list[int]] = []
-
-    def nothing(_: Any, tasks: list[list[int]], *__: Any) -> Iterator[Any]:
-        given.extend(tasks)
-        yield from ()
-
-    monkeypatch.setattr(saving, "shared", nothing)
-    config = EvaluateConfig(rollouts=2, branches=2, batch=batch)
-    save_simulation(tmp_path / "out", make_agent(), data, config, planner=planner)
-    assert [len(items) for items in given] == sizes
 
 
 def spoiled() -> Any:
@@ -250,23 +209,6 @@ def test_what_is_sent_comes_back_whole(store: SegmentStore) -> None:
     assert (str(again), vars(again)) == (str(error), vars(error))
 
 
-def test_a_worker_opens_the_work_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SYMPHONY_MALLOPT", "0")  # this process is no worker
-    sent = pickle.dumps(Counting())
-    assert [pickle.loads(_done((bytes(sent), [k]))) for k in range(3)] == [1, 2, 3]  # noqa: S301
-
-
-class Counting:
-    """Counts its calls."""
-
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def __call__(self, items: list[int]) -> int:
-        self.calls += 1
-        return self.calls
-
-
 def test_what_cannot_be_sent_is_refused(store: SegmentStore) -> None:
     with pytest.raises(ConfigError, match="can't be shared among processes"):
         list(shared(lambda items: items, [[0]], EvaluateConfig(workers=2)))
@@ -293,12 +235,6 @@ def test_simulations_are_saved_the_same(store: SegmentStore, tmp_path: Path) -> 
     assert seen == [1, 2, 3, 4, 5]
     assert files(tmp_path / "one") == files(tmp_path / "two")
     assert len(files(tmp_path / "one")) > 5
-
-
-@pytest.mark.parametrize("bad", [{"workers": 0}, {"engine": "dask"}, {"engine": "ray", "device": "cuda"}])
-def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(bad))):
-        EvaluateConfig(**bad)
 
 
 def of_command(started: Path, arguments: list[str]) -> int:

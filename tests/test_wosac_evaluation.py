@@ -104,7 +104,7 @@ def test_settings_are_those_of_the_evaluation() -> None:
     # What is left open is the agent's own, and the record says what that is.
     agent = load_agent(AGENT)
     assert (agent.search.rule, agent.search.goals) == ("replace", "branch")
-    how = simulated_how(agent, WosacSettings.of(EvaluateConfig(action_temperature=0.5)))
+    how = simulated_how(agent, WosacSettings.of(EvaluateConfig(search="tree", action_temperature=0.5)))
     assert {"rule": "replace", "goals": "branch", "action_temperature": 0.5}.items() <= how.items()
     with pytest.raises(ConfigError, match="score is one of"):
         WosacSettings.of(EvaluateConfig(score="flags"))
@@ -247,7 +247,7 @@ def test_oracles_have_no_score(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "wosac",
     ]
     assert main(command) != 0
-    assert "score is one of discriminator, rule" in capsys.readouterr().err
+    assert "score is one of agent, discriminator, rule" in capsys.readouterr().err
 
 
 def test_the_table_of_scores(

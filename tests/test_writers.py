@@ -1,4 +1,4 @@
-"""One writer for each output: another one is refused by name (docs/hardening.md)."""
+"""One writer for each output: another one is refused by name (docs/determinism.md)."""
 
 from __future__ import annotations
 

@@ -2,9 +2,8 @@
 
 A step of a simulation frees tens of megabytes and asks for as much again. By default glibc returns large blocks to
 the kernel, which must clear every page before it hands it out again: half of a step's time at 1 000 points an agent.
-The ``symphony`` command calls :func:`tune`; programs of your own can do the same before their first large tensor, or
-be started with glibc's own ``MALLOC_MMAP_THRESHOLD_``, ``MALLOC_TRIM_THRESHOLD_`` and ``MALLOC_TOP_PAD_``, which take
-precedence. ``SYMPHONY_MALLOPT=0`` leaves everything as it is.
+The ``symphony`` command calls :func:`tune`; programs of your own can do the same before their first large tensor.
+glibc's own variables, such as ``MALLOC_TOP_PAD_``, take precedence; ``SYMPHONY_MALLOPT=0`` leaves all as it is.
 
 What stays, such as a segment that is kept for later updates, settles where a large block was freed, and the next
 large block no longer fits there: with kept memory the heap of a long training grows without end. So training gives
@@ -19,38 +18,25 @@ import platform
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
 _VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_TOP_PAD_", "MALLOC_MMAP_THRESHOLD_")
-
-KEPT = (1 << 31) - 1
-"""Bytes free at the end of the heap from which on they are given back."""
-MAPPED = 1 << 30
-"""Bytes of a block from which on it is a mapping of its own."""
-PAD = 1 << 26
-"""Bytes by which the heap grows beyond what is asked for."""
+KEPT, MAPPED, PAD = (1 << 31) - 1, 1 << 30, 1 << 26
+"""Bytes: free ones at the end of the heap from which on they are given back; of a block from which on it is a mapping
+of its own; by which the heap grows beyond what is asked for."""
 
 
 def tune() -> bool:
-    """Set the allocator of this process (Linux with glibc; elsewhere nothing happens).
-
-    Returns:
-        Whether it was set.
-    """
+    """Set the allocator of this process (Linux with glibc; elsewhere nothing happens); returns whether it was set."""
     library = _ours()
     if library is None:
         return False
-    mallopt = library.mallopt
-    mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
     # Older versions take no mapping threshold above 32 MiB.
-    mapped = mallopt(_MMAP_THRESHOLD, MAPPED) or mallopt(_MMAP_THRESHOLD, 1 << 25)
-    return bool(mapped and mallopt(_TRIM_THRESHOLD, KEPT) and mallopt(_TOP_PAD, PAD))
+    mapped = library.mallopt(_MMAP_THRESHOLD, MAPPED) or library.mallopt(_MMAP_THRESHOLD, 1 << 25)
+    return bool(mapped and library.mallopt(_TRIM_THRESHOLD, KEPT) and library.mallopt(_TOP_PAD, PAD))
 
 
 def release() -> bool:
     """Give pages that are free, wherever in the heap, back to the system (where :func:`tune` would set anything).
 
-    The next step asks for its part of them again, so once in many steps is enough.
-
-    Returns:
-        Whether any were given back.
+    The next step asks for its part of them again, so once in many steps is enough. Returns whether any were.
     """
     library = _ours()
     return library is not None and bool(library.malloc_trim(0))
@@ -62,9 +48,4 @@ def _ours() -> ctypes.CDLL | None:
         return None
     if platform.system() != "Linux" or platform.libc_ver()[0] != "glibc":
         return None
-    try:
-        library = ctypes.CDLL(None)
-        library.mallopt, library.malloc_trim  # noqa: B018
-    except (OSError, AttributeError):
-        return None
-    return library
+    return ctypes.CDLL(None)

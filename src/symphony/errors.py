@@ -24,6 +24,14 @@ class AllFailedError(SymphonyError):
     """Every run failed: there are results, but they only say why. The command line ends with a status of its own."""
 
 
+class ThresholdError(SymphonyError):
+    """A planner does not keep the thresholds of a suite."""
+
+
+class CouldNotRunError(SymphonyError):
+    """A suite could not run at all. The command line ends with the status of wrong usage."""
+
+
 class DataError(SymphonyError):
     """Bad or unusable data.
 

@@ -1,7 +1,8 @@
-"""Files that appear complete or not at all, and results as JSON."""
+"""Files that appear complete or not at all, locks, and results as JSON."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -16,11 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from symphony.errors import DataError
-
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -39,8 +35,8 @@ def replacing(path: Path) -> Iterator[Path]:
         if place.exists() and not place.is_file():
             yield place
             return
-        draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
-        _remove_left(place)
+        _remove_drafts(place)
+        draft = _draft(place)
         try:
             yield draft
             with draft.open("rb+") as file:
@@ -61,32 +57,28 @@ def check_writable(path: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         if place.is_dir():
             raise DataError("is a folder; name a file", file=path)
-        if place.exists() and not place.is_file():  # a terminal, a pipe
-            return
-        draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
-        draft.touch()
-        draft.unlink()
+        if place.is_file() or not place.exists():  # not a terminal, or a pipe
+            _draft(place).touch()
+            _draft(place).unlink()
 
 
-def _remove_left(place: Path) -> None:
-    """Drafts of this file by processes that were killed."""
-    if os.name != "posix":  # elsewhere there is no asking whether a process lives
-        return
+def _draft(place: Path) -> Path:
+    return place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
+
+
+def _remove_drafts(place: Path) -> None:
+    """Remove drafts of this file by processes that were killed."""
     pattern = re.compile(rf"\.{re.escape(place.stem)}\.(\d+)\.new{re.escape(place.suffix)}")
     for other in place.parent.iterdir():
         match = pattern.fullmatch(other.name)
-        if match is not None and not _lives(int(match[1])):
+        if match is None:
+            continue
+        try:
+            os.kill(int(match[1]), 0)
+        except (ProcessLookupError, OverflowError):
             other.unlink(missing_ok=True)
-
-
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass  # somebody else's
-    return True
+        except PermissionError:
+            pass  # somebody else's process lives
 
 
 def write_file(path: Path, text: str) -> None:
@@ -125,9 +117,12 @@ class Lock:
 
     def __init__(self, path: Path, output: Path | None = None) -> None:
         self.path, self.output, self.run = path, output or path.parent, uuid.uuid4().hex[:8]
+        program = Path(sys.argv[0])
+        name = program.parent.name if program.stem == "__main__" else program.name
+        command = " ".join([name, *sys.argv[1:2]])
         with naming(path):
             self._file = self._taken()
-            who = f"{os.getpid()} on {socket.gethostname()}, run {self.run} of {_program()}"
+            who = f"{os.getpid()} on {socket.gethostname()}, run {self.run} of {command}"
             os.ftruncate(self._file, 0)
             os.pwrite(self._file, who.encode(errors="replace"), 0)
         self._close = weakref.finalize(self, _release, path, self._file, os.getpid())
@@ -136,8 +131,7 @@ class Lock:
         while True:
             file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             try:
-                if fcntl is not None:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 who = os.pread(file, 500, 0).decode(errors="replace")
                 os.close(file)
@@ -170,6 +164,20 @@ class Lock:
         self.close()
 
 
+def _is_at(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _release(path: Path, file: int, process: int) -> None:
+    # A copy of the process that took it has no say.
+    if os.getpid() == process and _is_at(file, path):
+        path.unlink(missing_ok=True)
+    os.close(file)
+
+
 def lock_file(path: Path) -> AbstractContextManager[object]:
     """Keep other writers away from a file for as long as the work on it takes; makes its folder.
 
@@ -184,25 +192,6 @@ def lock_file(path: Path) -> AbstractContextManager[object]:
     with naming(path):
         place.parent.mkdir(parents=True, exist_ok=True)
     return Lock(place.with_name(f".{place.name}.lock"), path)
-
-
-def _program() -> str:
-    program = Path(sys.argv[0])
-    return " ".join([program.parent.name if program.stem == "__main__" else program.name, *sys.argv[1:2]])
-
-
-def _is_at(file: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file), os.stat(path))
-    except FileNotFoundError:
-        return False
-
-
-def _release(path: Path, file: int, process: int) -> None:
-    # A copy of the process that took it has no say.
-    if os.getpid() == process and _is_at(file, path):
-        path.unlink(missing_ok=True)
-    os.close(file)
 
 
 @contextmanager

@@ -27,17 +27,17 @@ def load_object(path: str, *, here: bool = True) -> Any:
         ConfigError: if there is no such module, file or name.
     """
     module, _, name = path.rpartition(":")
-    find = (
-        (lambda: _file(Path(module))) if module.endswith(".py") else lambda: importlib.import_module(module)
-    )
     try:
-        try:
-            found = find()
-        except ModuleNotFoundError:
-            if not here or os.getcwd() in sys.path or "" in sys.path:
-                raise
-            sys.path.append(os.getcwd())
-            found = find()
+        if module.endswith(".py"):
+            found: Any = _file(Path(module).resolve())
+        else:
+            try:
+                found = importlib.import_module(module)
+            except ModuleNotFoundError:
+                if not here or os.getcwd() in sys.path or "" in sys.path:
+                    raise
+                sys.path.append(os.getcwd())
+                found = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
     except ConfigError:
@@ -51,7 +51,6 @@ def load_object(path: str, *, here: bool = True) -> Any:
 
 def _file(path: Path) -> ModuleType:
     """A file as a module, run once."""
-    path = path.resolve()
     if str(path) in sys.modules:
         return sys.modules[str(path)]
     spec = importlib.util.spec_from_file_location(str(path), path)
@@ -59,8 +58,7 @@ def _file(path: Path) -> ModuleType:
         raise ConfigError(f"{path}: no such file")
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[str(path)] = module
+    module = sys.modules[str(path)] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except BaseException:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import itertools
 import logging
@@ -11,7 +10,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -27,8 +25,6 @@ R = TypeVar("R")
 
 Engine = Literal["local", "ray"]
 
-PATIENCE = 5.0
-"""Seconds that an interrupted task may take to end before its process does."""
 IN_FLIGHT = 2
 """Tasks per worker that are submitted and not yet collected."""
 # A worker has one core: OpenMP threads of several workers would only take the cores from each other.
@@ -120,19 +116,19 @@ def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterat
 def _local_map(
     function: Callable[[T], R], tasks: Iterator[T], workers: int, imports: Sequence[str]
 ) -> Generator[R, None, None]:
-    context = multiprocessing.get_context(_START)
     get_ready(imports)
-    lifeline, stop = context.Pipe(duplex=False)
+    context = multiprocessing.get_context(_START)
+    lifeline, ours = context.Pipe(duplex=False)
     # A server keeps the environment that it was started with.
     environment = {**os.environ, **WORKER_ENVIRONMENT}
-    pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment, PATIENCE))
+    pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
 
     def submit(task: T) -> Any:
         with (
             _environment(WORKER_ENVIRONMENT),
             _no_interrupts(),
         ):  # processes are started here, as they are needed
-            return pool.submit(_interruptible, function, task)
+            return pool.submit(function, task)
 
     pending: deque[Any] = deque()
     done = 0
@@ -144,65 +140,28 @@ def _local_map(
         lost = [done + k for k, task in enumerate(pending) if not task.done() or task.exception() is not None]
         raise WorkerError(lost[:workers]) from error  # they are begun in their order
     finally:
-        stop.close()
+        ours.close()
         pool.shutdown(wait=True, cancel_futures=True)
         lifeline.close()
 
 
-class _Worker:
-    """State of this process as a worker."""
+def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
+    """End at once, whatever the task, when the parent closes its end of the pipe or ends, in whatever way.
 
-    task: Literal["", "running", "interrupted"] = ""
-    stopped = False  # the parent wants no more results
-
-
-def _begin_worker(lifeline: Connection, environment: dict[str, str], patience: float) -> None:
-    """Stop when the parent closes its end of the pipe, and end when it ends, in whatever way."""
+    Interrupts stay put off, as they were when the process was started: the parent's are enough.
+    """
     os.environ.update(environment)
-    signal.signal(signal.SIGINT, _interrupt)
-    _mask(signal.SIG_UNBLOCK)
-    threading.Thread(target=_watch, args=(lifeline, patience), daemon=True).start()
 
+    def watch() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            lifeline.recv_bytes()
+        os._exit(1)
 
-def _interrupt(number: int, frame: object) -> None:
-    # Only a task, once: a result that is half sent would hang the parent.
-    if _Worker.task == "running":
-        _Worker.task = "interrupted"
-        raise KeyboardInterrupt
-
-
-def _watch(lifeline: Connection, patience: float) -> None:
-    with contextlib.suppress(EOFError, OSError):
-        lifeline.recv_bytes()
-    _Worker.stopped = True
-    until = time.monotonic() + patience
-    parent = multiprocessing.parent_process()
-    while parent is not None and parent.is_alive():
-        if _Worker.task == "running":
-            if hasattr(signal, "pthread_kill"):  # a real signal also ends a sleep or a read
-                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-            else:
-                _thread.interrupt_main()
-        elif _Worker.task and time.monotonic() > until:
-            break  # the task caught the interrupt, or it was raised where Python ignores it: in a destructor
-        parent.join(0.05)  # and again: a signal just before a sleep would not end it
-    os._exit(1)
-
-
-def _interruptible(function: Callable[[T], R], task: T) -> R:
-    """One task in a worker."""
-    try:
-        _Worker.task = "running"
-        if _Worker.stopped:
-            raise KeyboardInterrupt
-        return function(task)
-    finally:
-        _Worker.task = ""
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _mask(how: int) -> None:
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(how, {signal.SIGINT})
+    signal.pthread_sigmask(how, {signal.SIGINT})
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ from torch import Tensor
 
 @unique
 class Stream(IntEnum):
-    """What draws from a stream of its own, derived from that of a scene or a rollout.
+    """Uses of random numbers with a stream of their own, derived from that of a scene or a rollout.
 
     The numbers lie far above those of rollouts, branches and agents, which are counted from 0 and fold into the same
     streams. A number stays with its use, or a seed would give other rollouts: 2 belonged to a use that is gone.
@@ -70,31 +70,19 @@ def stream_of(text: str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-def uniform(
-    seed: int,
-    stream: Int[Tensor, "*#b"],
-    step: Int[Tensor, "*#b"] | int,
-    *,
-    dtype: torch.dtype = torch.float32,
-) -> Float[Tensor, "*b"]:
-    """Uniform numbers in the open interval (0, 1), a pure function of the three arguments.
+def uniform(seed: int, stream: Int[Tensor, "*#b"], step: Int[Tensor, "*#b"] | int) -> Float[Tensor, "*b"]:
+    """Uniform float32 numbers in the open interval (0, 1), a pure function of the three arguments, with the same bits
+    on every device.
 
     Args:
         seed: of the whole run.
         stream: int64, one per independent sequence, e.g. made by :func:`fold_in` from segment, branch, agent.
         step: int64 or int, counter within a sequence; broadcast against `stream`.
-        dtype: float32 (23 random bits) or float64 (52).
-
-    Returns:
-        Float tensor of the broadcast shape, with the same bits on every device.
     """
     if stream.dtype != torch.int64:
         raise ValueError(f"streams are int64, got {stream.dtype}")
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype must be float32 or float64, got {dtype}")
-    bits = 23 if dtype == torch.float32 else 52
     start = torch.full((), _signed(seed), dtype=torch.int64, device=stream.device)
     hashed = fold_in(fold_in(_mix(start), stream), step)
-    top = (hashed >> (64 - bits)) & ((1 << bits) - 1)
-    # The middle of one of 2^bits equal cells: exact in this dtype, and never 0 or 1.
-    return (2 * top + 1).to(dtype) * 2.0 ** -(bits + 1)
+    top = (hashed >> 41) & ((1 << 23) - 1)
+    # The middle of one of 2^23 equal cells: exact in this dtype, and never 0 or 1.
+    return (2 * top + 1).to(torch.float32) * 2.0**-24

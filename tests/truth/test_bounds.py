@@ -19,7 +19,7 @@ from helpers_saved import played
 from helpers_store import fill
 from symphony.cli import main
 from symphony.cli.planners import table_text
-from symphony.cli.tables import number_cell
+from symphony.cli.shared import number_cell
 from symphony.config import EvaluateConfig
 from symphony.evaluation import evaluate
 from symphony.evaluation.planners import winners

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -21,7 +21,7 @@ from symphony.agents.networks import (
     observation_of,
     policy_network,
 )
-from symphony.config import AgentSpec, SearchConfig, read_json
+from symphony.config import AgentSpec, EvaluateConfig, SearchConfig, read_json
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError, DataWarning
@@ -30,7 +30,25 @@ from symphony.imports import load_object
 PLAYBACK = "playback"
 """Name of the logged trajectories themselves, evaluated like an agent."""
 FILE = "agent.json"
-"""Of a run's folder: the agent's specification."""
+"""File in a run's folder that holds the agent's specification."""
+
+
+class SearchPlan(NamedTuple):
+    """How the rollouts of a run segment come about, with nothing left open.
+
+    Attributes:
+        kind: of search; ``log`` for playback.
+        trees: of the run segment; independent rollouts are trees of one branch.
+        branches: of each tree.
+        taken: rollouts taken from each tree.
+        search: how branches are pruned.
+    """
+
+    kind: Literal["log", "none", "tree", "backtrack", "best"]
+    trees: int
+    branches: int
+    taken: int
+    search: SearchConfig
 
 
 @dataclass(frozen=True)
@@ -66,12 +84,12 @@ class Agent:
 
     @property
     def interactive(self) -> int:
-        """How many agents a segment it was trained with (2 for baselines)."""
+        """How many agents of a run segment it was trained with (2 for baselines)."""
         return 2 if self.spec is None else self.spec.agent.interactive
 
     @property
     def duration(self) -> int:
-        """Seconds of a segment it was trained with; 0 for all."""
+        """Seconds of a run segment it was trained with; 0 for all."""
         return 0 if self.spec is None else self.spec.duration
 
     @property
@@ -96,9 +114,36 @@ class Agent:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Those of its networks that there are, by name."""
+        """The networks that it has, by name."""
         parts = {"policy": self.policy, "goals": self.goals, "discriminator": self.discriminator}
         return {name: module for name, module in parts.items() if module is not None}
+
+    def plan(self, config: EvaluateConfig) -> SearchPlan:
+        """How the rollouts of a run segment come about.
+
+        Raises:
+            ConfigError: the search needs a discriminator and the agent has none, or trees are too small.
+        """
+        search = config.pruning(self.search)
+        blind = search.score == "discriminator" and self.discriminator is None
+        kind: Literal["log", "none", "tree", "backtrack", "best"] = "log"
+        if self.policy is not None and config.search != "agent":
+            kind = config.search
+        elif self.policy is not None:
+            kind = search.way if self.searches and not blind else "none"
+        if kind not in ("log", "none") and blind:
+            raise ConfigError(
+                f"search '{kind}' needs an agent with a discriminator, {self.name} has none, or another "
+                "score: --score flags or rule"
+            )
+        if kind != "tree":
+            return SearchPlan(kind, config.rollouts, search.test_branches if kind == "best" else 1, 1, search)
+        branches, taken = search.test_branches, config.rollouts // config.trees
+        if taken > branches:
+            raise ConfigError(
+                f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
+            )
+        return SearchPlan(kind, config.trees, branches, taken, search)
 
     def to(self, device: torch.device) -> Agent:
         """Move its networks to a device, in place."""

@@ -19,9 +19,9 @@ import re
 import shutil
 import uuid
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,40 +30,23 @@ from safetensors.torch import save as encode_tensors
 from torch import Tensor, nn
 
 from symphony.agents.codec import decode, encode
-from symphony.agents.fitting import CheckpointError, check_random_states, match_module, match_optimizer
+from symphony.errors import DataError
 
 FORMAT = 1
 MANIFEST = "checkpoint.json"
 _NAME = re.compile(r"step-(\d{12})")
-_PART = re.compile(r"[A-Za-z0-9_-]+")
-_CHECKSUM = "sha256"
 
 
-class Stateful(Protocol):
-    """An optimizer, a learning-rate schedule, or whatever else keeps a state of tensors and plain values."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """The state."""
-        ...
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> Any:
-        """Take the state over."""
-        ...
+class CheckpointError(DataError):
+    """A checkpoint that can't be written, read, or fitted to what it is loaded into."""
 
 
 @dataclass(frozen=True)
 class LoadedCheckpoint:
-    """What a checkpoint holds besides the states that were restored.
+    """The step that a checkpoint was saved at, and the caller's own values in it."""
 
-    Attributes:
-        path: folder of the checkpoint.
-        step: the step it was saved at.
-        extra: the caller's own values.
-    """
-
-    path: Path
     step: int
-    extra: dict[str, Any] = field(default_factory=dict)
+    extra: dict[str, Any]
 
 
 def save_checkpoint(
@@ -71,8 +54,7 @@ def save_checkpoint(
     *,
     step: int,
     modules: Mapping[str, nn.Module],
-    optimizers: Mapping[str, Stateful] | None = None,
-    generators: Mapping[str, torch.Generator] | None = None,
+    optimizers: Mapping[str, Any] | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write `folder/step-<step>`, with the global random states of Python, numpy and torch.
@@ -83,24 +65,17 @@ def save_checkpoint(
     Args:
         folder: of all checkpoints of the run, made if absent.
         step: updates done so far.
-        modules: by name (letters, digits, `-`, `_`), saved by their `state_dict`.
-        optimizers: likewise, learning-rate schedules included.
-        generators: torch generators other than the global ones.
+        modules: by name, saved by their `state_dict`.
+        optimizers: by name, or whatever else keeps a state, such as a schedule of learning rates.
         extra: JSON-like values (also tuples and tensors), handed back by :func:`load_checkpoint`.
 
     Raises:
         CheckpointError: if something can't be stored or the disk refuses; earlier checkpoints stay as they are.
     """
-    folder = Path(folder)
     final = folder / f"step-{step:012d}"
-    states = {"rng": _rng_state(generators or {}), "extra": dict(extra or {})}
-    for kind, items in (("module", modules), ("optimizer", optimizers or {})):
-        for name, item in items.items():
-            if not _PART.fullmatch(name):
-                raise CheckpointError(
-                    "names are made of letters, digits, '-' and '_'", field=f"{kind} {name!r}"
-                )
-            states[f"{kind}.{name}"] = item.state_dict()
+    states: dict[str, Any] = {"rng": _rng_state(), "extra": dict(extra or {})}
+    states |= {f"module.{name}": module.state_dict() for name, module in modules.items()}
+    states |= {f"optimizer.{name}": item.state_dict() for name, item in (optimizers or {}).items()}
     manifest: dict[str, Any] = {"format": FORMAT, "step": step, "torch": torch.__version__, "parts": {}}
     files: dict[str, bytes] = {}
     for part, state in states.items():
@@ -114,7 +89,7 @@ def save_checkpoint(
             files[f"{part}.safetensors"] = content
             entry |= {"file": f"{part}.safetensors", "sha256": hashlib.sha256(content).hexdigest()}
         manifest["parts"][part] = entry
-    manifest[_CHECKSUM] = _checksum(manifest)
+    manifest["sha256"] = _checksum(manifest)
     files[MANIFEST] = (json.dumps(manifest, indent=1, allow_nan=False) + "\n").encode()
     try:
         _publish(folder, final, files)
@@ -127,19 +102,17 @@ def load_checkpoint(
     path: Path,
     *,
     modules: Mapping[str, nn.Module] | None = None,
-    optimizers: Mapping[str, Stateful] | None = None,
-    generators: Mapping[str, torch.Generator] | None = None,
+    optimizers: Mapping[str, Any] | None = None,
     partial: bool = False,
     restore_rng: bool = True,
     widen: bool = False,
 ) -> LoadedCheckpoint:
-    """Restore what is passed from the checkpoint folder `path`; nothing is changed unless everything fits.
+    """Restore what is passed from the checkpoint folder `path`; no module is changed unless all fit.
 
     Args:
         path: one checkpoint, as returned by :func:`save_checkpoint` or :func:`latest`.
         modules: by the names they were saved under.
-        optimizers: likewise.
-        generators: likewise.
+        optimizers: by the names they were saved under.
         partial: allow the checkpoint to hold more than is asked for (evaluation needs the policy only).
         restore_rng: also set the global random states of Python, numpy and torch.
         widen: let modules have further inputs after those that were saved: columns that a saved matrix lacks are 0,
@@ -147,63 +120,45 @@ def load_checkpoint(
 
     Raises:
         CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, names, shapes or
-            types differ, or a number is not finite; names the file and the field.
+            types differ, or a weight is not finite; names the file and the field.
     """
-    path = Path(path)
-    manifest = _read_manifest(path)
+    manifest, file = _read_manifest(path), path / MANIFEST
     asked: dict[str, Any] = {f"module.{name}": item for name, item in (modules or {}).items()}
     asked |= {f"optimizer.{name}": item for name, item in (optimizers or {}).items()}
     held = {part for part in manifest["parts"] if part not in ("rng", "extra")}
-    _match_names(path / MANIFEST, set(asked), held, partial, what="part")
+    if absent := sorted(asked.keys() - held):
+        raise CheckpointError(f"not in the checkpoint, which has {sorted(held)}", file=file, field=absent[0])
+    if not partial and (surplus := sorted(held - asked.keys())):
+        raise CheckpointError("in the checkpoint but not asked for", file=file, field=surplus[0])
     states = {part: _read_part(path, manifest, part) for part in ("rng", "extra", *asked)}
     rng = states["rng"]
-    own = generators or {}
-    check_random_states(path / MANIFEST, rng, own)
-    _match_names(path / MANIFEST, set(own), set(rng["generators"]), partial, what="generator")
     if restore_rng and len(rng["cuda"]) not in (0, torch.cuda.device_count()):
         raise CheckpointError(
-            f"random states of {len(rng['cuda'])} CUDA devices saved, {torch.cuda.device_count()} present; "
-            "pass restore_rng=False to do without",
-            file=path / MANIFEST,
+            f"random states of {len(rng['cuda'])} CUDA devices saved, {torch.cuda.device_count()} present",
+            file=file,
             field="rng",
         )
     for part, item in asked.items():
-        where = path / f"{part}.safetensors"
         if isinstance(item, nn.Module):
-            if widen:
-                states[part] = _widened(item, states[part])
-            match_module(where, item, states[part])
-        elif isinstance(item, torch.optim.Optimizer):
-            match_optimizer(where, item, states[part])
-    for part, item in asked.items():
+            states[part] = _widened(item, states[part]) if widen else states[part]
+            _match(path / f"{part}.safetensors", item.state_dict(), states[part])
+    for part, item in reversed(asked.items()):  # optimizers first, of which one may still dislike its state
         try:
             item.load_state_dict(states[part])
-        except Exception as error:  # whatever a schedule, say, makes of values it did not write
-            raise CheckpointError(f"does not fit: {error!r}", file=path / MANIFEST, field=part) from error
-    for name, generator in own.items():
-        generator.set_state(rng["generators"][name])
+        except Exception as error:  # each kind of optimizer has its own
+            raise CheckpointError(f"does not fit: {error!r}", file=file, field=part) from error
     if restore_rng:
-        _set_rng_state(rng)
-    return LoadedCheckpoint(path, manifest["step"], states["extra"])
-
-
-def _widened(module: nn.Module, saved: dict[str, Any]) -> dict[str, Any]:
-    """A state with the columns and buffers that a module has beyond it."""
-    found, buffers = dict(saved), {name for name, _ in module.named_buffers()}
-    for name, own in module.state_dict().items():
-        there = saved.get(name)
-        if there is None and name in buffers:
-            found[name] = own.clone()
-        elif isinstance(there, Tensor) and there.ndim == own.ndim == 2:
-            missing = own.shape[1] - there.shape[1]
-            found[name] = nn.functional.pad(there, (0, missing)) if missing > 0 else there
-    return found
+        random.setstate(rng["python"])
+        np.random.set_state(rng["numpy"])  # noqa: NPY002
+        torch.set_rng_state(rng["torch"])
+        if rng["cuda"]:
+            torch.cuda.set_rng_state_all(rng["cuda"])
+    return LoadedCheckpoint(manifest["step"], states["extra"])
 
 
 def checkpoints(folder: Path) -> list[Path]:
     """All complete checkpoints in `folder`, by ascending step."""
     found: dict[int, Path] = {}
-    folder = Path(folder)
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         # A parked one, which sorts first, counts only if the crash came before its successor took its place.
         match = _NAME.fullmatch(path.name.removeprefix(".old-"))
@@ -218,38 +173,34 @@ def parts_of(path: Path) -> set[str]:
     Raises:
         CheckpointError: if the folder is no complete checkpoint of this format.
     """
-    parts = _read_manifest(Path(path))["parts"]
+    parts = _read_manifest(path)["parts"]
     return {name.removeprefix("module.") for name in parts if name.startswith("module.")}
 
 
 def latest(folder: Path) -> Path | None:
     """The complete checkpoint of the highest step in `folder`, or None."""
-    found = checkpoints(folder)
-    return found[-1] if found else None
+    return next(reversed(checkpoints(folder)), None)
 
 
-def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> list[Path]:
-    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`; return them.
+def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> None:
+    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`.
 
     What a kill in an earlier deletion has left goes too.
 
     Raises:
         CheckpointError: if the disk refuses.
     """
-    if keep < 1:
-        raise ValueError(f"keep must be at least 1, is {keep}")
-    gone = [path for path in checkpoints(folder)[:-keep] if int(path.name[-12:]) not in protect]
     try:
-        for path in gone:
-            # Without its manifest it counts no longer, however far the deletion gets.
-            (path / MANIFEST).unlink()
-            shutil.rmtree(path.with_name(f".old-{path.name}"), ignore_errors=True)
-        for path in Path(folder).iterdir() if Path(folder).is_dir() else []:
+        for path in checkpoints(folder)[:-keep]:
+            if int(path.name[-12:]) not in protect:
+                # Without its manifest it counts no longer, however far the deletion gets.
+                (path / MANIFEST).unlink()
+                shutil.rmtree(path.with_name(f".old-{path.name}"), ignore_errors=True)
+        for path in folder.iterdir() if folder.is_dir() else []:
             if _NAME.fullmatch(path.name) and path.is_dir() and not (path / MANIFEST).is_file():
                 shutil.rmtree(path)
     except OSError as error:
         raise CheckpointError(f"can't delete the checkpoint: {error}", file=folder) from error
-    return gone
 
 
 def _publish(folder: Path, final: Path, files: Mapping[str, bytes]) -> None:
@@ -295,7 +246,7 @@ def _flush_folder(folder: Path) -> None:
 def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / MANIFEST
     try:
-        manifest = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+        manifest = json.loads(file.read_text(encoding="utf-8"))
         checksum = _checksum(manifest) if isinstance(manifest, dict) else ""
     except OSError as error:
         raise CheckpointError(f"no checkpoint here: {error.strerror}", file=file) from error
@@ -304,6 +255,12 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     version = manifest.get("format") if isinstance(manifest, dict) else None
     if type(version) is not int or version != FORMAT:
         raise CheckpointError(f"format {version!r}, this version reads {FORMAT}", file=file, field="format")
+    # Earlier versions wrote no checksum. Its own name may be what was changed, hence no others are known.
+    strange = set(manifest) - {"format", "step", "torch", "parts", "sha256"}
+    if strange or manifest.get("sha256", checksum) != checksum:
+        raise CheckpointError(
+            "damaged: its checksum differs from the recorded one", file=file, field="sha256"
+        )
     step, parts = manifest.get("step"), manifest.get("parts")
     if type(step) is not int or not 0 <= step < 10**12:
         raise CheckpointError(f"no number of updates: {str(step)[:40]!r}", file=file, field="step")
@@ -314,45 +271,20 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             "parts missing: at least rng and extra are in every checkpoint", file=file, field="parts"
         )
-    for part, entry in parts.items():
-        if not _is_entry(part, entry):
-            raise CheckpointError("no part of a checkpoint", file=file, field=f"parts.{part[:80]}")
-    # Earlier versions wrote none. Its own name may be what was changed, hence no others are known.
-    strange = set(manifest) - {"format", "step", "torch", "parts", _CHECKSUM}
-    if strange or manifest.get(_CHECKSUM, checksum) != checksum:
-        raise CheckpointError(
-            "damaged: its checksum differs from the recorded one", file=file, field=_CHECKSUM
-        )
     return manifest
 
 
 def _checksum(manifest: Mapping[str, Any]) -> str:
-    """Of all other values that a manifest holds."""
-    held = {name: value for name, value in manifest.items() if name != _CHECKSUM}
+    """The checksum of all other values that a manifest holds."""
+    held = {name: value for name, value in manifest.items() if name != "sha256"}
     return hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()
 
 
-def _refuse(text: str) -> None:
-    raise ValueError(f"{text} is no JSON")
-
-
-def _is_entry(part: str, entry: Any) -> bool:
-    """Whether this is how :func:`save_checkpoint` describes a part."""
-    kind, _, name = part.partition(".")
-    known = part in ("rng", "extra") or (kind in ("module", "optimizer") and _PART.fullmatch(name))
-    if not known or not isinstance(entry, dict) or "state" not in entry:
-        return False
-    if "file" not in entry:
-        return set(entry) == {"state"}
-    checksum = entry.get("sha256")
-    return entry["file"] == f"{part}.safetensors" and isinstance(checksum, str) and len(checksum) == 64
-
-
-def _read_part(path: Path, manifest: dict[str, Any], part: str) -> Any:
-    entry = manifest["parts"][part]
+def _read_part(path: Path, manifest: dict[str, Any], part: str) -> dict[str, Any]:
     file = path / f"{part}.safetensors"
     tensors: dict[str, Tensor] = {}
     try:
+        entry = manifest["parts"][part]
         if "file" in entry:
             content = file.read_bytes()
             if hashlib.sha256(content).hexdigest() != entry["sha256"]:
@@ -372,29 +304,41 @@ def _read_part(path: Path, manifest: dict[str, Any], part: str) -> Any:
     return state
 
 
-def _match_names(file: Path, asked: set[str], held: set[str], partial: bool, *, what: str) -> None:
-    absent, surplus = sorted(asked - held), sorted(held - asked)
-    if absent:
-        raise CheckpointError(
-            f"not in the checkpoint, which has {sorted(held)}", file=file, field=f"{what} {absent[0]}"
-        )
-    if surplus and not partial:
-        raise CheckpointError("in the checkpoint but not asked for", file=file, field=f"{what} {surplus[0]}")
+def _match(file: Path, own: Mapping[str, Any], saved: Mapping[str, Any]) -> None:
+    """See that a saved state has the tensors of a module, and that all are finite."""
+    for name in [*own, *saved]:
+        if name not in saved or name not in own:
+            where = "the module" if name in own else "the checkpoint"
+            raise CheckpointError(f"only {where} has it", file=file, field=str(name))
+        mine, other = own[name], saved[name]
+        if not isinstance(other, Tensor) or mine.shape != other.shape or mine.dtype != other.dtype:
+            found = (
+                f"{other.dtype} {tuple(other.shape)}" if isinstance(other, Tensor) else type(other).__name__
+            )
+            raise CheckpointError(
+                f"saved as {found}, expected {mine.dtype} {tuple(mine.shape)}", file=file, field=name
+            )
+        if bad := int((~torch.isfinite(other)).sum()):
+            raise CheckpointError(f"{bad} of {other.numel()} numbers are not finite", file=file, field=name)
 
 
-def _rng_state(generators: Mapping[str, torch.Generator]) -> dict[str, Any]:
+def _widened(module: nn.Module, saved: dict[str, Any]) -> dict[str, Any]:
+    """A state with the columns and buffers that a module has beyond it."""
+    found, buffers = dict(saved), {name for name, _ in module.named_buffers()}
+    for name, own in module.state_dict().items():
+        there = saved.get(name)
+        if there is None and name in buffers:
+            found[name] = own.clone()
+        elif isinstance(there, Tensor) and there.ndim == own.ndim == 2:
+            missing = own.shape[1] - there.shape[1]
+            found[name] = nn.functional.pad(there, (0, missing)) if missing > 0 else there
+    return found
+
+
+def _rng_state() -> dict[str, Any]:
     return {
         "python": random.getstate(),
         "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - whoever uses the global state must get it back
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
-        "generators": {name: generator.get_state() for name, generator in generators.items()},
     }
-
-
-def _set_rng_state(state: dict[str, Any]) -> None:
-    random.setstate(state["python"])
-    np.random.set_state(state["numpy"])  # noqa: NPY002
-    torch.set_rng_state(state["torch"])
-    if state["cuda"]:
-        torch.cuda.set_rng_state_all(state["cuda"])

@@ -12,17 +12,10 @@ from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, l
 from symphony.agents.included import is_pretrained, pretrained_folder
 from symphony.errors import ConfigError
 
-_STEP = re.compile(r"(?:step-)?(\d+)")
-
 
 @dataclass(frozen=True)
 class Best:
-    """The best checkpoint so far.
-
-    Attributes:
-        step: updates it was made after.
-        infractions: its collision rate plus its off-road time, percent.
-    """
+    """The best checkpoint so far: its step, and its collision rate plus its off-road time, percent."""
 
     step: int
     infractions: float
@@ -88,16 +81,13 @@ def choose(folder: Path, which: str = "") -> Path:
         raise ConfigError(f"{folder}: the run has no checkpoint yet")
     steps = {int(path.name[-12:]): path for path in found}
     held = f"it has those of the steps {', '.join(map(str, steps))}"
-    named = _STEP.fullmatch(which)
-    if named is not None:
+    if named := re.fullmatch(r"(?:step-)?(\d+)", which):
         if int(named[1]) not in steps:
             raise ConfigError(f"{folder}: no checkpoint of step {int(named[1])}, {held}")
         return steps[int(named[1])]
     if which not in ("", "best", "last"):
         raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
-    if which == "last":
-        return found[-1]
-    best = best_of(found[-1])
+    best = None if which == "last" else best_of(found[-1])
     if best is None:
         if which == "best":
             raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")

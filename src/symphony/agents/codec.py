@@ -23,21 +23,15 @@ def encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, Mapping):
-        return _encode_mapping(value, tensors, name)
+        if all(isinstance(key, str) for key in value) and TAG not in value:
+            return {key: encode(item, tensors, f"{name}.{key}") for key, item in value.items()}
+        items = [encode(item, tensors, f"{name}.{key}") for key, item in value.items()]
+        return {TAG: "dict", "keys": encode(list(value), tensors, f"{name} (keys)"), "items": items}
     if isinstance(value, list):
         return [encode(item, tensors, f"{name}.{index}") for index, item in enumerate(value)]
     if isinstance(value, tuple):
-        kind = "size" if isinstance(value, torch.Size) else "tuple"
-        return {TAG: kind, "items": encode(list(value), tensors, name)}
+        return {TAG: "tuple", "items": encode(list(value), tensors, name)}
     return _encode_leaf(value, tensors, name)
-
-
-def _encode_mapping(value: Mapping[Any, Any], tensors: dict[str, Tensor], name: str) -> dict[str, Any]:
-    if all(isinstance(key, str) for key in value) and TAG not in value:
-        return {key: encode(item, tensors, f"{name}.{key}") for key, item in value.items()}
-    keys = encode(list(value), tensors, f"{name} (keys)")
-    items = [encode(item, tensors, f"{name}.{key}") for key, item in value.items()]
-    return {TAG: "dict", "keys": keys, "items": items}
 
 
 def _encode_leaf(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
@@ -48,10 +42,6 @@ def _encode_leaf(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
         return {TAG: "tensor", "value": _store(value.detach(), tensors, name)}
     if isinstance(value, np.ndarray):
         return {TAG: "array", "value": _store(torch.from_numpy(value.copy()), tensors, name)}
-    if isinstance(value, torch.device):
-        return {TAG: "device", "value": str(value)}
-    if isinstance(value, torch.dtype):
-        return {TAG: "dtype", "value": str(value).removeprefix("torch.")}
     raise TypeError(f"{name}: a value of type {type(value).__name__} can't be stored")
 
 
@@ -81,20 +71,13 @@ def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     items = decode(value["items"], tensors)
     if kind == "dict":
         return dict(zip(decode(value["keys"], tensors), items, strict=True))
-    return {"tuple": tuple, "size": torch.Size}[kind](items)
-
-
-def _dtype(name: str) -> torch.dtype:
-    found = getattr(torch, name, None)
-    if not isinstance(found, torch.dtype):
-        raise ValueError(f"unknown dtype {name!r}")
-    return found
+    if kind != "tuple":
+        raise ValueError(f"unknown kind {kind!r}")
+    return tuple(items)
 
 
 _LEAVES: dict[str, Callable[[str, Mapping[str, Tensor]], Any]] = {
     "array": lambda text, tensors: tensors[text].numpy(),
-    "device": lambda text, _: torch.device(text),
-    "dtype": lambda text, _: _dtype(text),
     "float": lambda text, _: float(text),
     "tensor": lambda text, tensors: tensors[text],
 }

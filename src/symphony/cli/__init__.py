@@ -29,27 +29,37 @@ from symphony.cli import (
     export,
     planners,
     plot,
-    profiles,
     report,
     simulate,
     table,
+    test,
     train,
     view,
     wosac,
 )
-from symphony.cli.helps import PARAGRAPHS
-from symphony.errors import AllFailedError, ConfigError, DataWarning, SymphonyError, printable
+from symphony.cli.shared import PARAGRAPHS, warn
+from symphony.config.profiles import expanded
+from symphony.errors import (
+    AllFailedError,
+    ConfigError,
+    CouldNotRunError,
+    DataWarning,
+    SymphonyError,
+    printable,
+)
 from symphony.files import check_writable, lock_file
 
 __all__ = ["main"]
 
 FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
 
-RESULTS = ("json", "figure", "out")
-"""Fields of commands: files that are written once everything is done, those whose metavar is FILE."""
-
-RENAMED: dict[str, str] = {}
-"""Options that the last release called otherwise, such as ``{"evaluate --old": "--new"}``; they go with the next."""
+GONE = {
+    "plot tree": "`symphony simulate RUN --data DIR --out SIM` and `symphony view SIM` show the branches of a search",
+    "plot rollouts": "`symphony evaluate RUN --data DIR --figure FILE` draws rollouts, and so does `symphony view`",
+    "plot curvature --data": "evaluate the runs first: `symphony evaluate RUN --data DIR`",
+    "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
+}
+"""Commands and options that are gone, and what takes their place."""
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
@@ -69,6 +79,7 @@ app.command(name="view")(view.View)
 app.command(name="report")(report.Report)
 app.command(name="export")(export.Export)
 app.command(name="planners")(planners.Planners)
+app.command(name="test")(test.Test)
 app.command(wosac.app, name="wosac", help=wosac.__doc__)
 app.command(name="agents")(agents.Agents)
 app.command(name="demo")(demo.Demo)
@@ -91,10 +102,13 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
-        args = _renamed(args)
+        for gone, instead in GONE.items():
+            *command, last = gone.split()
+            if args[: len(command)] == command and last in args[len(command) :]:
+                raise ConfigError(f"`symphony {gone}` is gone: {instead}")
         if args[:1] == ["train"]:
-            args = profiles.expanded(args)
-        command = app.cli(
+            args = expanded(args)
+        chosen = app.cli(
             prog="symphony",
             description=DESCRIPTION,
             args=args,
@@ -106,39 +120,23 @@ def main(args: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         # Help or a complaint was printed; whoever read it may have gone, say `head`.
         return guarded(lambda: None) or int(stop.code or 0)
-    except BrokenPipeError:
-        return guarded(_gone)
 
     def run() -> None:
         with contextlib.ExitStack() as held:
-            for path in results_of(command):
+            for path in results_of(chosen):
                 check_writable(path)
                 held.enter_context(lock_file(path))
-            command.run()
+            chosen.run()
 
     return guarded(run)
 
 
-def _renamed(args: list[str]) -> list[str]:
-    """Arguments with options by their names of today."""
-    for old, new in RENAMED.items():
-        *command, name = old.split()
-        for place, word in enumerate(args if args[: len(command)] == command else ()):
-            given, *value = word.split("=", 1)
-            if given.replace("_", "-") == name:
-                sys.stderr.write(
-                    f"symphony: warning: {name} is called {new} now, and won't be known much longer\n"
-                )
-                args = [*args[:place], "=".join([new, *value]), *args[place + 1 :]]
-    return args
-
-
 def results_of(command: Any) -> Iterator[Path]:
-    """Files that a command writes."""
+    """Files that a command writes once everything is done: its results whose metavar is FILE."""
     for name, hint in get_type_hints(type(command), include_extras=True).items():
         path, extras = getattr(command, name), getattr(hint, "__metadata__", ())
         named = any(getattr(extra, "metavar", None) == "FILE" for extra in extras)
-        if name in RESULTS and named and path is not None and str(path) != "-":
+        if name in ("json", "figure", "out", "junit") and named and path is not None and str(path) != "-":
             yield path
 
 
@@ -147,10 +145,6 @@ def settle() -> None:
     allocator.tune()
     # Threads of OpenMP that spin while they wait take the cores of a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-
-def _gone() -> None:
-    raise BrokenPipeError
 
 
 class Terminated(KeyboardInterrupt):
@@ -191,6 +185,8 @@ def guarded(action: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except (SymphonyError, OSError) as error:
+        if isinstance(error, CouldNotRunError):
+            return _complain(error, USAGE)
         return _complain(error, ALL_FAILED if isinstance(error, AllFailedError) else FAILED)
     return 0
 
@@ -203,9 +199,9 @@ def _warn(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Ours in one line; those of libraries as they are."""
+    """Show our warnings in one line, those of libraries as they are."""
     if issubclass(category, DataWarning):
-        sys.stderr.write(f"symphony: warning: {printable(str(message))}\n")
+        warn(str(message))
     else:
         (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
 

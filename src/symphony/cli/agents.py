@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from symphony.cli.tables import COLUMNS, number_cell, print_table, write_numbers
+from symphony.cli.shared import ResultFile, metrics_table, print_table, write_numbers
 
 
 @dataclass(frozen=True)
@@ -18,8 +17,8 @@ class Agents:
     names: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[pretrained:NAME ...]")
     ] = ()
-    """Only these agents; by default all."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Names of the agents to print; by default all."""
+    json: ResultFile = None
     """File to write all numbers to; - for standard output, in place of the cards."""
 
     def run(self) -> None:
@@ -28,8 +27,7 @@ class Agents:
 
         names = self.names or tuple(PREFIX + name for name in pretrained_names())
         cards = [read_card(pretrained_folder(name)) for name in names]
-        if self.json is not None:
-            write_numbers(self.json, {"agents": cards})
+        write_numbers(self.json, {"agents": cards})
         if str(self.json) != "-":
             for card in cards:
                 print_card(card)
@@ -37,28 +35,19 @@ class Agents:
 
 def print_card(card: dict[str, Any]) -> None:
     """Print one model card."""
-    from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
     console = Console(highlight=False)
 
     def words(text: str, style: str = "") -> None:
-        console.print(escape(text.replace("`", "")), style=style)
+        console.print(text.replace("`", ""), style=style, markup=False)
 
-    console.print(escape(card["name"]), style="bold")
+    words(card["name"], "bold")
     words(card["about"])
     words(f"Training: {card['training']['words']}")
     for found in card["scores"]:
-        table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-        table.add_column(escape(found["data"]), no_wrap=True)
-        for _, heading, _ in COLUMNS:
-            table.add_column(heading, justify="right", no_wrap=True)
-        for label, row in found["rows"].items():
-            cells = [number_cell(row[name], row[f"{name}_se"], digits) for name, _, digits in COLUMNS]
-            table.add_row(escape(label or card["name"]), *cells)
-        print_table(table, console)
+        rows = [{**row, "agent": label or card["name"]} for label, row in found["rows"].items()]
+        print_table(metrics_table(rows, first=found["data"]), console)
         words(
             f"{found['segments']} run segments of {found['groups']} recordings, {found['interactive']} interactive "
             f"agents each; per segment {found['how']}; ± standard error over recordings; seed {found['seed']}",

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from symphony.cli.tables import write_numbers
+from symphony.cli.shared import ResultFile, write_numbers
 from symphony.errors import ConfigError
 
 
@@ -29,10 +29,10 @@ class Planners:
     """Folders of rollouts that `symphony simulate --planner` made, or records that `symphony evaluate --planner
     --json` wrote."""
     format: Literal["text", "markdown"] = "text"
-    """How the table is written."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File to write it to; otherwise it is printed."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Format of the table."""
+    out: ResultFile = None
+    """File to write the table to; otherwise it is printed."""
+    json: ResultFile = None
     """File to write all numbers to; - for standard output, in place of the table."""
 
     def __post_init__(self) -> None:
@@ -50,8 +50,7 @@ class Planners:
             for path in self.found
         ]
         check_crowds(records)
-        if self.json is not None:
-            write_numbers(self.json, {"records": records})
+        write_numbers(self.json, {"records": records})
         text = table_text(records, self.format)
         if self.out is not None:
             write_file(self.out, text)

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from symphony.cli import guarded, settle
-from symphony.cli.evaluate import evaluate_with_bar, print_evaluation
-from symphony.cli.helps import PARAGRAPHS
-from symphony.cli.profiles import WORDS, expanded
+from symphony.cli.shared import PARAGRAPHS, print_evaluation, progress
 from symphony.config import EvaluateConfig, Profile, TrainConfig
+from symphony.config.profiles import WORDS, expanded
 
 if TYPE_CHECKING:
     from symphony.recipes import Recipe
@@ -27,9 +26,9 @@ class Arguments:
     training: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """The training run."""
     test: Path
-    """Store of run segments to evaluate it on."""
+    """Store of run segments to evaluate the agent on."""
     rollouts: int = 16
-    """Simulations per run segment."""
+    """Rollouts per run segment in the evaluation."""
     profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
 
 
@@ -40,17 +39,18 @@ def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = N
         sys.exit(guarded(lambda: main(recipe, description, sys.argv[1:])))
     from symphony.agents import load_agent
     from symphony.data.store import SegmentStore
+    from symphony.evaluation import evaluate
     from symphony.evaluation.records import evaluation_record, keep_evaluation
     from symphony.recipes import train
 
-    words = [recipe.__name__, *args]
-    settings = tyro.cli(Arguments, description=description, args=expanded(words), registry=PARAGRAPHS)
+    words = expanded([recipe.__name__, *args])
+    settings = tyro.cli(Arguments, description=description, args=words, registry=PARAGRAPHS)
     store = SegmentStore(settings.test)  # or complain now, not after the training
-    folder = train(settings.training, recipe)
-    config = EvaluateConfig(
-        rollouts=settings.rollouts, seed=settings.training.seed, device=settings.training.device
-    )
+    training = settings.training
+    folder = train(training, recipe)
+    config = EvaluateConfig(rollouts=settings.rollouts, seed=training.seed, device=training.device)
     agent = load_agent(str(folder), config.device, trust_code=True)  # the user's own words a moment ago
-    found = evaluate_with_bar(agent, store, config, baselines=True)
+    with progress(f"evaluating {agent.name}") as advance:
+        found = evaluate(agent, store, config, advance, baselines=True)
     print_evaluation(found, settings.test)
     keep_evaluation(agent.name, evaluation_record(agent, found, store))

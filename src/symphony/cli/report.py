@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from symphony.cli.tables import number_cell, print_table
+from symphony.cli.shared import number_cell, print_table, progress, say
 from symphony.errors import AllFailedError
 
 if TYPE_CHECKING:
@@ -26,9 +26,9 @@ class Report:
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SIM")]
     """Folder of saved rollouts."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Where the report goes; by default the same folder."""
+    """Folder of the report; by default the same folder."""
     evaluated: Literal["interactive", "ego"] = "interactive"
-    """Which of the driven agents are evaluated: all, or only the ego."""
+    """Agents that are evaluated: all that are driven, or only the ego."""
     view: bool = True
     """Leave the page that plays the rollouts unwritten."""
 
@@ -45,15 +45,9 @@ class Report:
             out.mkdir(parents=True, exist_ok=True)
         with Lock(out / "report.lock"):
             found = self._written(folder, out)
-        plain = found.plain()
-        table = Table(
-            "",
-            "",
-            "",
-            title=f"{found.agent}: {plain['runs']} runs, {plain['failed_runs']} failed",
-            show_header=False,
-        )
-        totals = found.totals()
+        totals, plain = found.totals(), found.plain()
+        runs, failed = plain["runs"], plain["failed_runs"]
+        table = Table("", "", "", title=f"{found.agent}: {runs} runs, {failed} failed", show_header=False)
         for name, value in totals.items():
             if name.endswith(("_se", "_bound", "_segments")) or not (
                 isinstance(value, float) or f"{name}_segments" in totals
@@ -64,32 +58,20 @@ class Report:
             cell = number_cell(value, totals.get(f"{name}_se"), 2, totals.get(f"{name}_bound"))
             table.add_row(name, cell, of)
         print_table(table, Console())
-        if plain["runs"] == plain["failed_runs"]:
-            Console().print("no run could be evaluated")
-        Console().print(f"written: {out / 'report.html'}", soft_wrap=True, markup=False)
-        if plain["runs"] and plain["failed_runs"] == plain["runs"]:
-            raise AllFailedError(f"all {plain['runs']} runs failed; report.json says why each did")
+        if runs == failed:
+            say("no run could be evaluated")
+        say(f"written: {out / 'report.html'}")
+        if runs and runs == failed:
+            raise AllFailedError(f"all {runs} runs failed; report.json says why each did")
 
     def _written(self, folder: RolloutFolder, out: Path) -> Found:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
         from symphony.evaluation.report import report
         from symphony.files import write_file, write_json
         from symphony.render.report_page import report_page
         from symphony.render.viewer import view_page
 
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("segments"),
-        )
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task("Evaluating", total=len(folder))
-            found = report(
-                folder, self.evaluated, lambda done, total: bar.update(task, completed=done, total=total)
-            )
+        with progress("evaluating") as advance:
+            found = report(folder, self.evaluated, advance)
         plain = found.plain()
         write_json(out / "report.json", plain)
         write_file(out / "report.csv", found.csv())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from symphony.cli.helps import TrustCode
+from symphony.cli.shared import Names, TrustCode, progress, say, segment_indices
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import AllFailedError, ConfigError
@@ -26,24 +26,23 @@ class Simulate:
     `symphony report`, hand them on with `symphony export`.
     """
 
+    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
+    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
     data: Path
     """Store of run segments."""
     out: Path
     """Folder of the rollouts."""
-    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")] = ""
-    """Folder of a run (see `symphony train`), `pretrained:NAME`, `playback`, `constant_velocity` or `idm`."""
-    agents: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
-    """The same, by name."""
-    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
-    """Only these run segments, by their ids or their numbers in the store."""
+    segments: Names = ()
+    """Ids of the only run segments to simulate, or their numbers in the store."""
     runs: int = 0
-    """Simulate so many runs (a run is one rollout of one segment) in place of `rollouts`: of as many segments as
+    """Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: of as many segments as
     there are, evenly spread, and as few of each as it takes; a few more where the number can't be divided so. 0: all
     segments, `rollouts` of each."""
     planner: str = ""
-    """What drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your own: a
-    file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as the
-    agent all others play back the log."""
+    """Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
+    own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback` as
+    the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say so: a
+    search asks the planner once for each branch."""
     planner_seconds: float = 60.0
     """Seconds that a planner has for one answer; a longer one fails the run."""
     goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID=PLACE ...")] = ()
@@ -55,8 +54,6 @@ class Simulate:
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def __post_init__(self) -> None:
-        if bool(self.agent) == bool(self.agents):
-            raise ConfigError("one agent is simulated: RUN or --agents RUN")
         if self.runs < 0 or (self.runs and self.segments):
             raise ConfigError("--runs is a number of runs, and goes without --segments")
         if self.runs and self.config.rollouts != EvaluateConfig.rollouts:
@@ -66,34 +63,25 @@ class Simulate:
     def simulated(self) -> RolloutFolder:
         """Simulate and save."""
         from symphony.agents import load_agent
-        from symphony.cli.evaluate import segments_bar
-        from symphony.cli.plot import segment_indices
         from symphony.data.store import SegmentStore
         from symphony.learning.demonstrations import evenly_spaced
         from symphony.rollouts.crowd import crowd_dataset
-        from symphony.rollouts.driving import spread_runs
+        from symphony.rollouts.driving import beside_planner, spread_runs
         from symphony.saved.saving import save_simulation
 
-        agent, store, config = (
-            load_agent(self.agent or self.agents, self.config.device, trust_code=self.trust_code),
-            SegmentStore(self.data),
-            self.config,
-        )
+        agent = load_agent(self.agent, self.config.device, trust_code=self.trust_code)
+        store, config = SegmentStore(self.data), self.config
+        if self.planner:
+            config = beside_planner(config)
         # Beside log playback nobody else is simulated.
         others = 1 if self.planner and agent.policy is None else agent.interactive
         chosen = segment_indices(store, self.segments)
         if self.runs:
             count, config = spread_runs(agent, config, self.runs, len(store))
             chosen = evenly_spaced(len(store), count)
-        dataset = crowd_dataset(
-            store,
-            agent,
-            config,
-            chosen or None,
-            default=others,
-            routes=bool(self.planner or self.goal),
-        )
-        with segments_bar(f"simulating {agent.name}") as advance:
+        routes = bool(self.planner or self.goal)
+        dataset = crowd_dataset(store, agent, config, chosen or None, default=others, routes=routes)
+        with progress(f"simulating {agent.name}") as advance:
             return save_simulation(
                 self.out,
                 agent,
@@ -108,12 +96,9 @@ class Simulate:
 
     def run(self) -> None:
         """Simulate, save, and say where."""
-        from rich.console import Console
-
-        found, console = self.simulated(), Console()
-        line = f"{len(found)} run segments in {self.out}: symphony view {self.out}"
-        console.print(line, soft_wrap=True, markup=False)
-        tell_failed(found, lambda line: console.print(line, soft_wrap=True, markup=False))
+        found = self.simulated()
+        say(f"{len(found)} run segments in {self.out}: symphony view {self.out}")
+        tell_failed(found, say)
 
 
 def tell_failed(folder: RolloutFolder, tell: Callable[[str], object]) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from symphony.cli.shared import ResultFile
 from symphony.config import Method, PaperData, Setting, TableColumns, TableFormat
 from symphony.errors import ConfigError
 from symphony.files import write_file
@@ -26,14 +27,14 @@ class Table:
     """
 
     setting: Setting
-    """`main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents."""
+    """Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="(required)")] = ()
     """Folders of runs, or folders that hold some."""
     evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """Which evaluation of a run counts, where it keeps several (in its folder `evaluations`); * and ? stand for
-    anything. Of several names, the first that fits one decides."""
+    """Name of the evaluation of a run that counts, where it keeps several (in its folder `evaluations`); * and ?
+    stand for anything. Of several names, the first that fits one decides."""
     each: bool = False
-    """A row for each way that a method was simulated in (of those that `evaluation` fits), with the cost of each."""
+    """Write a row for each way that a method was simulated in (of those that `evaluation` fits), with its cost."""
     columns: tuple[TableColumns, ...] = ()
     """More columns: `split`, collisions with playback agents and the rest; `standing`, agents that stand at the end;
     `corrected`, the divergence without its bias; `goals`, what the search made of the drawn goals."""
@@ -44,9 +45,9 @@ class Table:
     relations: bool = False
     """Print, instead of the table, which of the paper's relations between the methods hold, with paired errors."""
     format: TableFormat = "text"
-    """How it is written."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File to write it to; otherwise it is printed."""
+    """Format of the table."""
+    out: ResultFile = None
+    """File to write the table to; otherwise it is printed."""
 
     def __post_init__(self) -> None:
         if not self.runs:

@@ -9,8 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from symphony.cli.profiles import WORDS
+from symphony.cli.shared import say
 from symphony.config import Profile, TrainConfig
+from symphony.config.profiles import WORDS
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,13 @@ class Train:
         folder = train(self.config)
         # Of the processes that torchrun starts, one speaks.
         if os.environ.get("RANK", "0") == "0":
-            for line in last_words(folder, self.config):
-                print(line)  # noqa: T201
+            say("\n".join(last_words(folder, self.config)))
 
 
 def last_words(folder: Path, config: TrainConfig) -> list[str]:
     """Which checkpoint of a run is its agent and how good it is, where its pictures are, and what to do next."""
     from symphony.agents.choice import best_of, choose
 
-    chosen = choose(folder)
     best = best_of(choose(folder, "last"))
     if best is None:
         score = "the last one; nothing was validated, see --validation.data"
@@ -48,7 +47,7 @@ def last_words(folder: Path, config: TrainConfig) -> list[str]:
     shown = f"{pictures[-1]}, the newest of {len(pictures)}" if pictures else "none, see --preview.every"
     return [
         f"trained agent  {folder}",
-        f"checkpoint     {chosen.name}: {score}",
+        f"checkpoint     {choose(folder).name}: {score}",
         f"pictures       {shown}",
         f"curves         symphony plot curves {folder} --out curves.png",
         f"evaluate it    symphony evaluate {folder} --data DIR",

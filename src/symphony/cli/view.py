@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from symphony.cli.tables import short_name
+from symphony.cli.shared import Names, ResultFile, at_least, say, short_name
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -29,22 +29,19 @@ class View:
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SIM")]
     """Folder of saved rollouts."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    out: ResultFile = None
     """File to write: a page (.html), a picture (.png, .pdf or .svg), an animation (.gif) or a film (.mp4, which needs
     `pip install 'symphony-traffic[video]'`). By default view.html in the folder."""
-    segments: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()
-    """Only these run segments, by their ids; of a picture by default the first few."""
+    segments: Names = ()
+    """Ids of the run segments to show; by default all, in a picture the first few."""
     rollouts: int = 0
-    """Of each segment in a picture or film, at most; 0: all in a picture, the first one in a film."""
+    """Rollouts of each run segment in a picture or film, at most; 0: all in a picture, the first one in a film."""
 
     def __post_init__(self) -> None:
-        if self.rollouts < 0:
-            raise ConfigError(f"--rollouts must not be negative, is {self.rollouts}")
+        at_least(0, rollouts=self.rollouts)
 
     def run(self) -> None:
         """Write the page, the picture or the film."""
-        from rich.console import Console
-
         from symphony.files import lock_file
         from symphony.saved.folder import load_rollouts
 
@@ -55,34 +52,26 @@ class View:
                 write_view(folder, out, self.segments)
             else:
                 self._draw(folder, out)
-        Console().print(f"written: {out}", soft_wrap=True, markup=False)
+        say(f"written: {out}")
 
     def _draw(self, folder: RolloutFolder, out: Path) -> None:
-        from symphony.evaluation.pictures import saved_clip
-        from symphony.render import animate_rollouts, plot_grid, plot_rollout
-        from symphony.render.film import FILMS, write_film
-        from symphony.render.style import ANIMATIONS, FORMATS, picture_path
+        from symphony.render.plots import saved_clip
+        from symphony.render.style import ANIMATIONS, FILMS, FORMATS, picture_path
+        from symphony.render.video import draw_clips
 
         kind = picture_path(out, (*FORMATS, *ANIMATIONS, *FILMS)).suffix[1:].lower()
-        moving = kind in (*ANIMATIONS, *FILMS)
         names = self.segments or tuple(folder.ids[:PANELS])
         if not names:
             raise ConfigError(f"{self.folder} holds no rollouts to draw")
-        count, agent = self.rollouts or (1 if moving else None), title_of(folder.about.agent)
-        clips = [saved_clip(folder.of(name), count, f"{agent}: {name}") for name in names]
-        if kind in FILMS:
-            write_film(clips, out)
-        elif moving:
-            animate_rollouts(clips, out)
-        else:
-            panels = [lambda axes, clip=clip: plot_rollout(target=axes, **vars(clip)) for clip in clips]
-            plot_grid(panels, out)
+        count = self.rollouts or (None if kind in FORMATS else 1)
+        agent = " among ".join(short_name(part) for part in folder.about.agent.split(" among "))
+        draw_clips([saved_clip(folder.of(name), count, f"{agent}: {name}") for name in names], out)
 
 
-def write_view(folder: RolloutFolder, out: Path, segments: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Write the page with what the report found marked in it; returns the report."""
+def write_view(folder: RolloutFolder, out: Path, segments: tuple[str, ...] = ()) -> None:
+    """Write the page with what the report found marked in it."""
     from symphony.evaluation.report import Report, add_segment
-    from symphony.files import naming, write_file
+    from symphony.files import write_file
     from symphony.render.viewer import view_page
 
     found = Report(folder.about.agent, "interactive")
@@ -91,13 +80,4 @@ def write_view(folder: RolloutFolder, out: Path, segments: tuple[str, ...] = ())
         saved = folder.of(name)
         add_segment(found, saved)
         replays.append((saved, found.events[name]))
-    page = view_page(folder.about.agent, replays, folder.about.settings)
-    with naming(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-    write_file(out, page)
-    return found.totals()
-
-
-def title_of(agent: str) -> str:
-    """Who drove, without folders, to be put before the name of a segment."""
-    return " among ".join(short_name(part) for part in agent.split(" among "))
+    write_file(out, view_page(folder.about.agent, replays, folder.about.settings))

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from symphony.cli.helps import TrustCode
-from symphony.cli.tables import write_numbers
+from symphony.cli.shared import TrustCode, write_numbers
 from symphony.cli.wosac_score import print_left_out
 from symphony.config import WosacSettings
 
@@ -47,15 +46,14 @@ class Evaluate:
     def run(self) -> None:
         """Simulate and score, showing how far it is, and report."""
         from symphony.agents import load_agent
-        from symphony.cli.evaluate import segments_bar
-        from symphony.cli.plot import segment_indices
+        from symphony.cli.shared import progress, segment_indices
         from symphony.data.store import SegmentStore
         from symphony.wosac.evaluate import evaluate_wosac
 
         agent = load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
         store = SegmentStore(self.data)
         items = segment_indices(store, self.segments) or list(range(len(store)))
-        with segments_bar(f"scoring {agent.name}") as advance:
+        with progress(f"scoring {agent.name}") as advance:
             found = evaluate_wosac(
                 agent,
                 store,

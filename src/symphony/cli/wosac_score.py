@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from symphony.cli.tables import write_numbers
+from symphony.cli.shared import write_numbers
 from symphony.errors import ConfigError, printable
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from symphony.cli.helps import TrustCode
+from symphony.cli.shared import TrustCode
 from symphony.config import WosacSettings
 from symphony.config.wosac import FUTURE
 from symphony.errors import ConfigError, DataError
@@ -59,7 +59,7 @@ class Submit:
         import sys
 
         from symphony.agents import load_agent
-        from symphony.cli.evaluate import segments_bar
+        from symphony.cli.shared import progress
         from symphony.wosac.submission import write_submission
         from symphony.wosac.submission_check import required_agents
 
@@ -69,7 +69,7 @@ class Submit:
         shards = self.shards or min(SHARDS, total)
         if shards > total:
             raise ConfigError(f"{total} scenarios don't fill {shards} shards")
-        with segments_bar(f"simulating {agent.name}") as advance:
+        with progress(f"simulating {agent.name}") as advance:
             found = simulated_scenarios(agent, self.data, self.settings, lambda done: advance(done, total))
             write_submission(found, self.meta, self.out, shards)
         sys.stdout.write(

@@ -11,18 +11,10 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
-    from symphony.config.evaluation import (
-        EvaluateConfig,
-        PaperData,
-        Score,
-        Search,
-        Setting,
-        TableColumns,
-        TableFormat,
-    )
-    from symphony.config.files import FORMAT, from_dict, read_json, to_json
-    from symphony.config.profiles import PROFILES, Profile
+    from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, Score, SearchConfig
+    from symphony.config.evaluation import EvaluateConfig, PaperData, Setting, TableColumns, TableFormat
+    from symphony.config.files import read_json, to_json
+    from symphony.config.profiles import Profile
     from symphony.config.training import (
         METHODS,
         Method,
@@ -36,9 +28,7 @@ if TYPE_CHECKING:
     from symphony.config.wosac import WosacSettings
 
 __all__ = [
-    "FORMAT",
     "METHODS",
-    "PROFILES",
     "AgentConfig",
     "AgentSpec",
     "DiscriminatorConfig",
@@ -51,7 +41,6 @@ __all__ = [
     "Profile",
     "RunConfig",
     "Score",
-    "Search",
     "SearchConfig",
     "Setting",
     "TableColumns",
@@ -59,7 +48,6 @@ __all__ = [
     "TrainConfig",
     "ValidationConfig",
     "WosacSettings",
-    "from_dict",
     "read_json",
     "to_json",
 ]

@@ -12,6 +12,7 @@ from symphony.errors import ConfigError
 
 ActionSpace = Literal["bicycle", "displacement"]
 Features = Literal["clearance", "paper", "foresight"]
+Score = Literal["discriminator", "flags", "rule"]
 RULES = ("best", "systematic", "replace")
 
 
@@ -22,32 +23,33 @@ class AgentConfig:
     interactive: Annotated[int, arg(aliases=("--interactive",))] = 2
     """Interactive agents per run segment (the paper uses 2 and 8)."""
     num_points: int = 200
-    """Nearest map and light points it observes (the paper: 1 000)."""
+    """Nearest map and light points that the agent observes (the paper: 1 000)."""
     num_lights: int = 0
-    """Nearest lights it sees beside the points, as a group of their own, however far they are (the paper: none)."""
+    """Nearest lights that the agent observes beside the points, however far they are (the paper: none)."""
     features: Literal["paper", "gaps"] = "paper"
-    """`paper`: objects and points around; `gaps`: also how far it is from the boxes of objects, now and within the
-    next 2 s, were everyone to keep speed and course, and with goals where they are along its route."""
+    """Inputs of the policy. `paper`: objects and points around; `gaps`: also how far the agent is from the boxes of
+    objects, now and within the next 2 s, were everyone to keep speed and course, and with goals where they are along
+    its route."""
     goal_features: Annotated[Literal["points", "turns"], Fixed, Suppress] = field(
         default="turns", metadata={"before": "points"}
     )
     """What the goal policy observes of each route. `points`, of agents from before it could see more: where it is
     every 12 m; `turns`: also where it begins and how much it turns every 3 m, which tells where it changes lanes."""
     accelerations: int = 7
-    """Levels of acceleration, an odd number (methods bc*; the paper has 7)."""
+    """Levels of acceleration, an odd number (methods bc*; the paper: 7)."""
     cells: int = 0
     """Cells along and across of a histogram that displacements are drawn from, an odd number (methods mgail*; 0: one
     Gaussian instead, as in the paper)."""
     persona: bool = False
-    """Drive in a style of one's own: the policy is told how closely the vehicle follows and how fast it drives among
-    those of the log; in simulations that is drawn for each rollout, or given."""
+    """Drive in styles: the policy is told how closely the vehicle follows and how fast it drives among those of the
+    log; in simulations that is drawn for each rollout, or given."""
     hidden: int = 64
     """Width of the element encoders; the action head is twice as wide."""
     encoder: str = "paper"
-    """`paper`: element MLPs and max-pool; or the import path of your own, with the signature of
-    `symphony.modules.SceneEncoder`, for policy and goal policy."""
+    """Encoder of policy and goal policy. `paper`: element MLPs and max-pool; or the import path of your own, with the
+    signature of `symphony.modules.SceneEncoder`."""
     policy: str = "paper"
-    """`paper`; or the import path of a function from an `AgentSpec` to a policy module."""
+    """Policy: `paper`, or the import path of a function from an `AgentSpec` to a policy module."""
     GONE: ClassVar[dict[str, Any]] = {"num_objects": 16, "head": lambda values: 2 * values.get("hidden", 64)}
 
     def __post_init__(self) -> None:
@@ -70,19 +72,18 @@ class DiscriminatorConfig:
     """The network that scores realism, and how it learns."""
 
     features: Features = "clearance"
-    """`paper`: objects and points around; `clearance`: also gaps between boxes and distances to the road's edge;
-    `foresight`: also the gaps within the next 2 s, were everyone to keep speed and course."""
+    """Inputs of the discriminator. `paper`: objects and points around; `clearance`: also gaps between boxes and
+    distances to the road's edge; `foresight`: also the gaps within the next 2 s, were everyone to keep speed and
+    course."""
     hidden: Annotated[int, Suppress] = 32
-    """Width of its encoders; its head is twice as wide."""
+    """Width of the discriminator's encoders; its head is twice as wide."""
     network: str = "paper"
-    """`paper`; or the import path of a function from an `AgentSpec` to a module that writes one logit per agent."""
-    GONE: ClassVar[dict[str, Any]] = {"radius": 20.0, "head": lambda values: 2 * values.get("hidden", 32)}
-    GONE_IN_TRAINING: ClassVar[dict[str, Any]] = {
-        "states": 256,
-        "learning_rate": 1e-3,
-        "gradient_penalty": 0.0,
-        "instance_noise": 0.0,
-    }
+    """Discriminator: `paper`, or the import path of a function from an `AgentSpec` to a module that writes one logit
+    per agent."""
+    GONE: ClassVar[dict[str, Any]] = {
+        "radius": 20.0,
+        "head": lambda values: 2 * values.get("hidden", 32),
+    } | dict.fromkeys(("states", "learning_rate", "gradient_penalty", "instance_noise"), ...)
 
     def __post_init__(self) -> None:
         one_of(self, "features", get_args(Features))
@@ -101,30 +102,37 @@ class SearchConfig:
     prune_every: int = 2
     """Steps between prunings (T_p; 10 in the paper)."""
     rule: str = "systematic"
-    """`best`: the better half of the branches survives (the paper); `systematic`: every branch gets copies in
-    proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings; `replace`:
-    only branches above `threshold` make room, for copies of others, of the same goals where there are any; or the
-    import path of a pruning rule of your own."""
+    """Rule that prunes. `best`: the better half of the branches survives (the paper); `systematic`: every branch gets
+    copies in proportion to exp(-score / temperature), as in a particle filter, which bears and wants more prunings;
+    `replace`: only branches above `threshold` make room, for copies of others, of the same goals where there are any;
+    or the import path of a pruning rule of your own."""
     temperature: float = 0.6
-    """Of rule `systematic`: the lower, the stricter."""
+    """Temperature of rule `systematic`: the lower, the stricter."""
     threshold: float = 1.0
-    """Of rule `replace`: the highest total, in logits of the discriminator, that a branch goes on with."""
+    """Highest total, in logits of the discriminator, that a branch goes on with under rule `replace`."""
     goals: Literal["tree", "branch"] = "tree"
-    """Who draws goals together in evaluation: all branches of a `tree` (the paper), or each `branch` alone. In
-    training all follow the routes of the log."""
+    """Branches that draw goals together: all of a `tree` (the paper), or each `branch` alone."""
+    way: Annotated[Literal["tree", "backtrack"], Fixed, Suppress] = "tree"
+    """Search that the agent is simulated with unless something else is asked for: `tree` (the paper), `backtrack`."""
+    score: Annotated[Score, Fixed, Suppress] = "discriminator"
+    """Score that this search lowers."""
     updates: int = 10
     """Updates made from the results of one search before the next."""
     states: int = 256
     """States per update of the surviving rollouts for the policy, and of the simulated and the logged ones each for
     the discriminator; every state is of all its interactive agents."""
-    GONE: ClassVar[dict[str, Any]] = {"keep": 0.5, "aggregate": "max_then_sum"}
-    GONE_IN_TRAINING: ClassVar[dict[str, Any]] = {"segments": 16, "weight": 1.0, "survivors": "all"}
+    GONE: ClassVar[dict[str, Any]] = {
+        "keep": 0.5,
+        "aggregate": "max_then_sum",
+    } | dict.fromkeys(("segments", "weight", "survivors"), ...)
 
     def __post_init__(self) -> None:
         positive(self, "branches", "test_branches", "prune_every", "temperature", "updates", "states")
         at_most(self, 10_000, "branches", "test_branches")
         one_of(self, "goals", ["tree", "branch"])
         one_of(self, "rule", RULES, path=True)
+        one_of(self, "way", ["tree", "backtrack"])
+        one_of(self, "score", get_args(Score))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,13 +158,12 @@ class AgentSpec:
     discriminator: DiscriminatorConfig | None = None
     searches: bool = False
     search: SearchConfig = field(default_factory=SearchConfig)
-    TRAINS: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         one_of(self, "action_space", get_args(ActionSpace))
         positive(self, "dt")
         not_negative(self, "duration")
-        if self.searches and self.discriminator is None:
+        if self.searches and self.discriminator is None and self.search.score == "discriminator":
             raise ConfigError("an agent that searches needs a discriminator")
         if self.agent.cells and self.action_space != "displacement":
             raise ConfigError(

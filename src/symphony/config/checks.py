@@ -11,26 +11,23 @@ from symphony.errors import ConfigError
 
 def positive(config: Any, *names: str) -> None:
     """Raise ConfigError for a setting that is not positive and finite."""
-    for name in names:
-        value = getattr(config, name)
-        if not (value > 0 and math.isfinite(value)):
-            raise ConfigError(f"{option(name)} must be positive, is {value}")
+    _check(config, names, "be positive", lambda value: value > 0 and math.isfinite(value))
 
 
 def not_negative(config: Any, *names: str) -> None:
     """Raise ConfigError for a setting that is negative or not finite."""
-    for name in names:
-        value = getattr(config, name)
-        if not (value >= 0 and math.isfinite(value)):
-            raise ConfigError(f"{option(name)} must not be negative, is {value}")
+    _check(config, names, "not be negative", lambda value: value >= 0 and math.isfinite(value))
 
 
 def at_most(config: Any, limit: int, *names: str) -> None:
     """Raise ConfigError for a count beyond what any machine could hold, say in the file of an agent."""
+    _check(config, names, f"be at most {limit}", lambda value: value <= limit)
+
+
+def _check(config: Any, names: Iterable[str], rule: str, holds: Any) -> None:
     for name in names:
-        value = getattr(config, name)
-        if value > limit:
-            raise ConfigError(f"{option(name)} must be at most {limit}, is {value}")
+        if not holds(value := getattr(config, name)):
+            raise ConfigError(f"{name.replace('_', '-')} must {rule}, is {value}")
 
 
 def one_of(config: Any, name: str, known: Iterable[str], *, path: bool = False) -> None:
@@ -38,9 +35,4 @@ def one_of(config: Any, name: str, known: Iterable[str], *, path: bool = False) 
     value, known = getattr(config, name), list(known)
     if value not in known and not (path and ":" in value):
         more = " or an import path such as my.module:Name" if path else ""
-        raise ConfigError(f"{option(name)} is one of {', '.join(known)}{more}, not '{value}'")
-
-
-def option(name: str) -> str:
-    """A setting as the command line spells it."""
-    return name.replace("_", "-")
+        raise ConfigError(f"{name.replace('_', '-')} is one of {', '.join(known)}{more}, not '{value}'")

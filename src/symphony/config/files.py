@@ -7,7 +7,7 @@ import difflib
 import functools
 import json
 import types
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from pathlib import Path
 from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
@@ -18,17 +18,8 @@ FORMAT = 3
 
 
 def to_json(config: Any) -> str:
-    """A configuration as text that :func:`from_dict` reads back."""
-    return json.dumps({"format": FORMAT, **_values(config)}, indent=2) + "\n"
-
-
-def _values(config: Any) -> dict[str, Any]:
-    def value(item: Any) -> Any:
-        if dataclasses.is_dataclass(item):
-            return _values(item)
-        return str(item) if isinstance(item, Path) else item
-
-    return {f.name: value(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    """A configuration as text that :func:`read_json` reads back."""
+    return json.dumps({"format": FORMAT, **dataclasses.asdict(config)}, indent=2, default=str) + "\n"
 
 
 def read_json(kind: type[Any], file: Path) -> Any:
@@ -47,28 +38,24 @@ def read_json(kind: type[Any], file: Path) -> Any:
         raise ConfigError(f"{file}: not a JSON object")
     if values.pop("format", None) != FORMAT:
         raise ConfigError(f"{file}: configuration of another version, expected format {FORMAT}")
-    _adapt(kind, values, f"{file}: ", trains=getattr(kind, "TRAINS", True))
+    _adapt(kind, values, f"{file}: ")
     return from_dict(kind, values, where=f"{file}: ")
 
 
-def _adapt(kind: Any, values: dict[str, Any], where: str, *, trains: bool) -> None:
-    """Make of an older file's settings today's.
+def _adapt(kind: Any, values: dict[str, Any], where: str) -> None:
+    """Make of an older agent's settings today's.
 
     Settings that the file is too old to have, and that meant something else then than by default now, are added.
     Settings that are gone are left out where they said what always holds now: ``GONE`` of a class has these values
-    by name, ``...`` for a setting that changed no result, and a function where the value follows from the others.
-    ``GONE_IN_TRAINING`` has those that matter to a training only, so that an agent can be read whatever they were.
+    by name, ``...`` for what mattered to the training only, and a function where the value follows from the others.
 
     Raises:
         ConfigError: a setting that is gone said something else.
     """
-    gone, of_training = (getattr(kind, name, {}) for name in ("GONE", "GONE_IN_TRAINING"))
-    for name, held in (gone | of_training).items():
+    for name, held in getattr(kind, "GONE", {}).items():
         meant = held(values) if callable(held) else held
         found = values.pop(name, meant)
-        # Of settings that went together, a file may be too old to have all.
-        same = found.items() <= meant.items() if isinstance(found, dict) else meant is ... or found == meant
-        if not same and (trains or name in gone):
+        if meant is not ... and found != meant:
             raise ConfigError(f"{where}setting '{name}' is gone: this version reads only {meant!r}")
     for field in dataclasses.fields(kind):
         hint, value = _hints(kind)[field.name], values.get(field.name)
@@ -76,7 +63,7 @@ def _adapt(kind: Any, values: dict[str, Any], where: str, *, trains: bool) -> No
             values.setdefault(field.name, field.metadata["before"])
         for nested in (hint, *get_args(hint)):
             if isinstance(nested, type) and dataclasses.is_dataclass(nested) and isinstance(value, dict):
-                _adapt(nested, value, f"{where}{field.name}.", trains=trains)
+                _adapt(nested, value, f"{where}{field.name}.")
 
 
 def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> Any:
@@ -95,9 +82,7 @@ def from_dict(kind: type[Any], values: dict[str, Any], *, where: str = "") -> An
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:
         if name not in fields:
-            close = difflib.get_close_matches(str(name), fields, 1)
-            hint = f", did you mean '{close[0]}'?" if close else ""
-            raise ConfigError(f"{where}unknown setting '{name}'{hint}")
+            raise ConfigError(f"{where}unknown setting '{name}'{_nearest(str(name), fields)}")
     for name, field in fields.items():
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if needed and name not in values:
@@ -114,6 +99,11 @@ def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind)  # compiles every annotation anew
 
 
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, known, 1)
+    return f", did you mean '{close[0]}'?" if close else ""
+
+
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
     """A value as its annotation wants it."""
     origin, options = get_origin(hint), get_args(hint)
@@ -127,9 +117,8 @@ def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
         return tuple(_typed(options[0], item, where, name) for item in value)
     if origin is Literal and isinstance(value, str):
         if value not in options:
-            close = difflib.get_close_matches(value, options, 1)
-            nearest = f", did you mean '{close[0]}'?" if close else ""
-            raise ConfigError(f"{where}{name} is one of {', '.join(options)}, not '{value}'{nearest}")
+            known = f"{', '.join(options)}, not '{value}'{_nearest(value, options)}"
+            raise ConfigError(f"{where}{name} is one of {known}")
         return value
     return _plain(hint, value, where, name)
 

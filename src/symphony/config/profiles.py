@@ -1,128 +1,62 @@
-"""Settings that go together, as functions from a configuration to another."""
+"""Settings of a training that go together, as options of the command line."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal
+import difflib
+from collections.abc import Sequence
+from typing import Any, Literal
 
-from symphony.config.training import TrainConfig
+from symphony.errors import ConfigError
 
 Profile = Literal["default", "paper", "recommended", "laptop", "tiny", "smoke"]
-
-
-def paper(config: TrainConfig) -> TrainConfig:
-    """Section V-A: 70 000 updates of 16 segments, S 4 and 16, a checkpoint every 2 000 chosen on 200 segments."""
-    return replace(
-        config,
-        steps=70_000,
-        segments=16,
-        checkpoint_every=2000,
-        agent=replace(config.agent, num_points=1000),
-        discriminator=replace(config.discriminator, features="paper"),
-        search=replace(
-            config.search,
-            branches=4,
-            test_branches=16,
-            prune_every=10,
-            rule="best",
-            updates=1,
-        ),
-        mgail=replace(
-            config.mgail,
-            cost="log_d",
-            regression=0,
-            head_start=0,
-            rollouts=64,
-            react=True,
-            expert_weight=0.0,
-            discriminator_updates=1,
-        ),
-        validation=replace(config.validation, segments=200, rollouts=16),
-    )
-
-
-def recommended(config: TrainConfig) -> TrainConfig:
-    """What gave the best agents so far: inputs beyond the paper's, displaced states once the policy drives, a search
-    that replaces only bad branches; of MGAIL the regression that its adversarial updates start from.
-    """
-    return replace(
-        config,
-        steps=3000,
-        checkpoint_every=500,
-        agent=replace(config.agent, num_points=200, num_lights=4, features="gaps", accelerations=21),
-        perturb=replace(config.perturb, share=0.5, begin=1500),
-        discriminator=replace(config.discriminator, features="foresight"),
-        search=replace(config.search, rule="replace", goals="branch"),
-        mgail=replace(config.mgail, regression=3000, learning_rate=5e-4, truncate=10),
-        validation=replace(config.validation, segments=60, rollouts=4),
-    )
-
-
-def laptop(config: TrainConfig) -> TrainConfig:
-    """Meant for two cores and about an hour."""
-    return replace(
-        config,
-        steps=3000,
-        checkpoint_every=1000,
-        agent=replace(config.agent, num_points=128),
-        discriminator=replace(config.discriminator, features="foresight"),
-        # Of all that goes beyond the paper's inputs, what lowers collisions most.
-        perturb=replace(config.perturb, share=0.5, begin=1500),
-        validation=replace(config.validation, segments=48, rollouts=4),
-    )
-
-
-def tiny(config: TrainConfig) -> TrainConfig:
-    """About half a minute for a method: what `make table` runs."""
-    return replace(
-        smoke(config),
-        steps=120,
-        segments=8,
-        states=256,
-        checkpoint_every=60,
-        agent=replace(config.agent, num_points=64, hidden=32),
-        search=replace(config.search, branches=4, test_branches=4, updates=10, states=64),
-        mgail=replace(config.mgail, regression=80, head_start=10, rollouts=4),
-    )
-
-
-def smoke(config: TrainConfig) -> TrainConfig:
-    """Seconds, to see that all runs."""
-    return replace(
-        config,
-        steps=4,
-        segments=2,
-        states=16,
-        checkpoint_every=2,
-        agent=replace(config.agent, num_points=16, hidden=8),
-        search=replace(config.search, branches=2, test_branches=2, updates=2, states=8),
-        mgail=replace(config.mgail, regression=2, head_start=0, rollouts=2),
-        validation=replace(config.validation, segments=2, rollouts=2),
-        wandb="disabled",
-    )
-
-
-def demo(config: TrainConfig) -> TrainConfig:
-    """What `symphony demo` runs, minutes on a laptop.
-
-    Half the states and fewer points than by default: more, cheaper updates suit the few segments of the package. So
-    do inputs beyond the paper's, and displaced states once it drives.
-    """
-    return replace(
-        config,
-        agent=replace(config.agent, num_points=128, num_lights=4, features="gaps", accelerations=21),
-        perturb=replace(config.perturb, share=0.5, begin=config.steps // 3),
-        states=512,
-        wandb="disabled",
-    )
-
-
-PROFILES: dict[Profile, Callable[[TrainConfig], TrainConfig]] = {
-    "default": lambda config: config,
-    "paper": paper,
-    "recommended": recommended,
-    "laptop": laptop,
-    "tiny": tiny,
-    "smoke": smoke,
+WORDS = (
+    "Settings that go together. default: the values shown; paper: the protocol of the paper (70 000 updates, 1 "
+    "000 points, its discriminator, batch 16, S 4 and 16, 200 validation segments); recommended: what gave the "
+    "best agents so far (inputs beyond the paper's, displaced states, only bad branches replaced, goals of each "
+    "branch; 3 000 updates, 200 points); laptop: meant for two cores and about an hour (3 000 updates, 128 "
+    "points, 48 validation segments of 4 rollouts); tiny: half a minute, what `make table` runs; smoke: seconds, "
+    "to see that all runs. What is given beside it has precedence; the best checkpoint is chosen where "
+    "--validation.data is given."
+)
+PROFILES: dict[Profile, str] = {
+    "default": "",
+    "paper": """--steps 70000 --batch 16 --checkpoint-every 2000 --agent.num-points 1000
+        --discriminator.features paper --search.branches 4 --search.test-branches 16 --search.prune-every 10
+        --search.rule best --search.updates 1 --mgail.cost log_d --mgail.regression 0 --mgail.head-start 0
+        --mgail.rollouts 64 --mgail.react --mgail.expert-weight 0 --mgail.discriminator-updates 1
+        --validation.segments 200 --validation.rollouts 16""",
+    "recommended": """--steps 3000 --checkpoint-every 500 --agent.num-points 200 --agent.num-lights 4
+        --agent.features gaps --agent.accelerations 21 --perturb.share 0.5 --perturb.begin 1500
+        --discriminator.features foresight --search.rule replace --search.goals branch --mgail.regression 3000
+        --mgail.learning-rate 5e-4 --mgail.truncate 10 --validation.segments 60 --validation.rollouts 4""",
+    # Of all that goes beyond the paper's inputs, foresight and displaced states lower collisions most.
+    "laptop": """--steps 3000 --checkpoint-every 1000 --agent.num-points 128 --discriminator.features foresight
+        --perturb.share 0.5 --perturb.begin 1500 --validation.segments 48 --validation.rollouts 4""",
+    "tiny": """--steps 120 --batch 8 --states 256 --checkpoint-every 60 --agent.num-points 64 --agent.hidden 32
+        --search.branches 4 --search.test-branches 4 --search.updates 10 --search.states 64 --mgail.regression 80
+        --mgail.head-start 10 --mgail.rollouts 4 --validation.segments 2 --validation.rollouts 2 --wandb disabled""",
+    "smoke": """--steps 4 --batch 2 --states 16 --checkpoint-every 2 --agent.num-points 16 --agent.hidden 8
+        --search.branches 2 --search.test-branches 2 --search.updates 2 --search.states 8 --mgail.regression 2
+        --mgail.head-start 0 --mgail.rollouts 2 --validation.segments 2 --validation.rollouts 2 --wandb disabled""",
 }
+
+
+def expanded(args: Sequence[str]) -> list[str]:
+    """Arguments of a training command with the options of their ``--profile`` that are not among them.
+
+    Raises:
+        ConfigError: for an unknown profile.
+    """
+    name: Any = "default"
+    for word, after in zip(args, [*args[1:], ""], strict=True):
+        if word == "--profile" and after:
+            name = after
+        elif word.startswith("--profile="):
+            name = word.removeprefix("--profile=")
+    if name not in PROFILES:
+        close = difflib.get_close_matches(name, PROFILES, 1)
+        hint = f", did you mean '{close[0]}'?" if close else ""
+        raise ConfigError(f"profile is one of {', '.join(PROFILES)}, not '{name}'{hint}")
+    given = {word.split("=")[0].replace("_", "-") for word in args}
+    options = (f"--{option}".split() for option in PROFILES[name].split("--") if option.strip())
+    return [*args, *(word for words in options if words[0] not in given for word in words)]

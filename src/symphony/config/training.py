@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import Positional, Suppress, arg
 
@@ -25,7 +25,7 @@ GOALS = 128
 DISCRIMINATOR_RATE = 1e-3
 """Learning rate of the discriminator's Adam, falling to a tenth along a cosine."""
 MAX_SEED = (1 << 40) - 1
-"""Of a training, which derives a number from it for every update."""
+"""Largest seed of a training, which derives a number from it for every update."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,25 +36,23 @@ class MGAILConfig:
     """Updates of plain regression to the log before the adversarial ones, which need a start that stays on the road
     (0: none, as in the paper)."""
     head_start: int = 30
-    """Updates of the discriminator alone after them."""
+    """Updates of the discriminator alone after those of regression."""
     rollouts: int = 16
     """Rollouts per update that the gradient goes through, drawn from those of the last search; all of them, if it has
-    fewer.
-    """
+    fewer."""
     learning_rate: float = 2e-4
-    """Of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
+    """Learning rate of the policy's Adam in the adversarial updates, falling to a tenth along a cosine."""
     cost: Cost = "non_saturating"
-    """What the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient vanishes
-    in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
+    """Cost that the policy lowers, D the probability that a state is simulated: `log_d` (the paper; its gradient
+    vanishes in the worst states), `non_saturating` -log(1 - D), or the `logit` of D."""
     expert_weight: float = 0.2
-    """Weight of the regression to the log beside it (the paper: 0, which here ends in standing still)."""
+    """Weight of the regression to the log beside that cost (the paper: 0, which here ends in standing still)."""
     discriminator_updates: int = 2
     """Updates of the discriminator per update of the policy."""
     react: bool = False
     """Let the gradient also pass through the policy's reactions to what earlier actions changed."""
     truncate: int = 0
     """Steps after which the gradient is cut (0: never)."""
-    GONE: ClassVar[dict[str, Any]] = {"checkpoint": ...}
 
     def __post_init__(self) -> None:
         one_of(self, "cost", get_args(Cost))
@@ -76,12 +74,11 @@ class ValidationConfig:
     """How checkpoints are evaluated while training; the best of them is the agent."""
 
     data: Path | None = None
-    """Store of run segments to evaluate them on; without one the last checkpoint is the agent."""
+    """Store of run segments to evaluate checkpoints on; without one the last checkpoint is the agent."""
     segments: int = 200
-    """Run segments of it, evenly spaced (all, if there are fewer)."""
+    """Run segments of that store, evenly spaced (all, if there are fewer)."""
     rollouts: int = 4
-    """Simulations of each."""
-    GONE: ClassVar[dict[str, Any]] = {"every": ...}
+    """Rollouts of each run segment."""
 
     def __post_init__(self) -> None:
         positive(self, "segments", "rollouts")
@@ -92,10 +89,9 @@ class PerturbConfig:
     """Logged states displaced, labelled with the action of a smooth return to the log."""
 
     share: float = 0.0
-    """Of the expert states of an update (0: none, as in the paper)."""
+    """Share of the expert states of an update that are displaced (0: none, as in the paper)."""
     begin: int = 0
-    """Updates before the first: a policy learns more from displaced states when it drives already."""
-    GONE: ClassVar[dict[str, Any]] = {"along": 1.5, "across": 0.5, "heading": 0.1, "speed": 1.5}
+    """Updates before the first with displaced states, from which a policy learns more when it drives already."""
 
     def __post_init__(self) -> None:
         not_negative(self, "share", "begin")
@@ -114,7 +110,6 @@ class PreviewConfig:
     every: int = 2000
     """Updates between previews, and one at the end of a run that has so many (0: never); by default this takes about
     a hundredth of the time on a CPU, or less."""
-    GONE: ClassVar[dict[str, Any]] = {"segments": ...}
 
     def __post_init__(self) -> None:
         not_negative(self, "every")
@@ -131,7 +126,7 @@ class RunConfig:
     steps: int = 3000
     """Updates (the paper: 70 000)."""
     seed: int = 0
-    """Of the weights and of the order of the data."""
+    """Seed of the weights and of the order of the data."""
     warm_start: Path | None = None
     """Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its last
     (`RUN@last` or `RUN@3000` names another), or `pretrained:NAME`; new ones where that run has none."""
@@ -149,13 +144,7 @@ class RunConfig:
     """Where Weights & Biases keeps the curves; a plain file has them in any case. Its own variables (WANDB_PROJECT,
     WANDB_RUN_GROUP, WANDB_TAGS) name project, group and tags."""
     device: str = "cpu"
-    """`cpu`, `cuda` or `cuda:N`."""
-    GONE: ClassVar[dict[str, Any]] = {
-        "clip": 1.0,
-        "wandb_project": ...,
-        "wandb_group": ...,
-        "wandb_tags": ...,
-    }
+    """Device that learns: `cpu`, `cuda` or `cuda:N`."""
 
     def __post_init__(self) -> None:
         positive(self, "steps", "checkpoint_every", "log_every")
@@ -180,18 +169,13 @@ class TrainConfig(RunConfig):
     perturb: PerturbConfig = field(default_factory=PerturbConfig)
     """Displaced expert states."""
     learning_rate: float = 1e-2
-    """Of Adam, falling to a tenth along a cosine."""
+    """Learning rate of Adam, falling to a tenth along a cosine."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """The beam search (methods with TS; MGAIL without TS simulates as many rollouts and keeps all)."""
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     """The discriminator (methods with TS, and MGAIL)."""
     mgail: MGAILConfig = field(default_factory=MGAILConfig)
     """Adversarial learning (methods mgail*)."""
-    GONE: ClassVar[dict[str, Any]] = RunConfig.GONE | {
-        "most_interactive": 0,
-        "goals": GOALS,
-        "sampling": {"interactive": 1.0, "standing": 1.0, "hard": None, "even_sources": False, "share": 0.5},
-    }
 
     def __post_init__(self) -> None:
         super().__post_init__()

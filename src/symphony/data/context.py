@@ -18,30 +18,20 @@ from symphony.data.segment import RunSegment
 Reals = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-HALF_LANE = 1.5
-"""Metres sideways within which two paths are one. Vehicles in neighbouring lanes are about 3.5 m apart."""
-APART = 2.5
-"""Metres between two paths that count as different lanes before they become one."""
+HALF_LANE, APART = 1.5, 2.5
+"""Metres sideways within which two paths are one, and from which on they are in different lanes before that."""
 SAME_WAY = np.deg2rad(30)
-"""Heading difference below which two vehicles at the same place go the same way. From there to 150 degrees they
-cross; what is beyond are vehicles that meet head on."""
-SHARED = 5.0
-"""Metres of path two vehicles must have in common."""
-LOOKBACK = 50.0
-"""Metres before the place where two paths become one in which they are compared. A lane change takes about 4 s."""
+"""Heading difference below which two vehicles at the same place go the same way; up to 150 degrees they cross."""
+SHARED, LOOKBACK = 5.0, 50.0
+"""Metres of path two vehicles must have in common, and before the place where two become one that are compared."""
 TIME_GAP = 3.0
 """Seconds between two vehicles at the same place within which one follows the other."""
 CONFLICT_GAP = 4.0
-"""Seconds between two vehicles at the place where their paths cross or become one within which they interact,
-centre to centre. Enough for giving way at a stop; between two customary limits: 3 s on the difference in time to
-the conflict point (INTERACTION data set, Zhan et al., 2019, arXiv:1910.03088) and 5 s on the post-encroachment
-time (SSAM, FHWA-HRT-08-051, 2008)."""
-QUEUE_SPEED = 5.0
-"""m/s; slower vehicles follow within the distance that is driven in ``TIME_GAP`` at this speed."""
-KEPT = 1.0
-"""Seconds for which a vehicle must be that close in the same lane."""
-
-
+"""Seconds between two vehicles at the place where their paths cross or become one within which they interact.
+Between two customary limits: 3 s on the difference in time to the conflict point (INTERACTION data set, Zhan et al.,
+2019, arXiv:1910.03088) and 5 s on the post-encroachment time (SSAM, FHWA-HRT-08-051, 2008)."""
+QUEUE_SPEED, KEPT = 5.0, 1.0
+"""m/s at which ``TIME_GAP`` is the distance of slower vehicles, and seconds for which it must be kept in one lane."""
 TILE = 1_000_000
 """Pairs of steps that are compared at a time."""
 
@@ -60,20 +50,20 @@ class Context(StrEnum):
     LEADER = "leader"
     """It drives ahead on the ego's path, a short time gap away."""
     FOLLOWER = "follower"
-    """It drives behind on the ego's path, likewise."""
+    """It drives behind on the ego's path, a short time gap away."""
     NEAREST = "nearest"
     """None of these: the nearest that moves."""
 
 
 @dataclass(frozen=True)
 class Relations:
-    """What each of K vehicles is to the ego; infinite gaps where it is not.
+    """What each of K vehicles is to the ego: seconds [K] between the two, infinite where it is not.
 
     Attributes:
-        merge: [K] seconds between the two where their paths become one.
-        crossing: [K] seconds between the two where their paths cross.
-        leader: [K] smallest time gap to it, on the path in common.
-        follower: [K] likewise.
+        merge: where their paths become one.
+        crossing: where their paths cross.
+        leader: smallest time gap to it, on the path in common.
+        follower: smallest time gap from it to the ego.
     """
 
     merge: Reals
@@ -83,12 +73,7 @@ class Relations:
 
 
 def relations(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Relations:
-    """Relate vehicles to the ego by the paths that were logged.
-
-    Args:
-        segment: the segment.
-        others: [K] agents, without the ego.
-    """
+    """Relate vehicles [K] to the ego, which is none of them, by the paths that were logged."""
     merge, crossing = np.full(len(others), np.inf), np.full(len(others), np.inf)
     leader, follower = _queue_gap(segment, others, -1), _queue_gap(segment, others, 1)
     rows = np.flatnonzero(_boxes_meet(segment, others))
@@ -171,8 +156,7 @@ def _places(
 ) -> tuple[Reals, Bools, Bools]:
     """Each of the ego's steps [t] with each of the others' [k, t, T].
 
-    Returns:
-        Metres the ego is ahead of the other; both at the same place, going the same way; both there at an angle.
+    Gives metres the ego is ahead, whether both are at one place the same way, and whether both are there at an angle.
     """
     ego, position = segment.ego, segment.position[..., :2]
     delta = position[ego, None, steps, None] - position[others][:, None]
@@ -212,12 +196,7 @@ def _queue_gap(segment: RunSegment, others: NDArray[np.integer[Any]], sign: int)
     """[K] smallest time gap kept for a while by two in one lane at the same step; infinite if they don't.
 
     In a queue, paths in common are too short to tell and time gaps grow without limit: there the distance counts,
-    as if the one behind drove ``QUEUE_SPEED``.
-
-    Args:
-        segment: the segment.
-        others: [K] agents.
-        sign: -1 for those ahead of the ego, 1 for those behind it.
+    as if the one behind drove ``QUEUE_SPEED``. The sign is -1 for those ahead of the ego, 1 for those behind it.
     """
     ego = segment.ego
     delta = sign * (segment.position[ego, :, :2] - segment.position[others, :, :2])
@@ -235,11 +214,9 @@ def _queue_gap(segment: RunSegment, others: NDArray[np.integer[Any]], sign: int)
 
 
 def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float:
-    """Seconds between the ego and another where their paths become one, at a step of each; infinite if they
-    always were one.
+    """Seconds between the ego and another where their paths become one; infinite if they always were one.
 
-    Both paths are followed backwards from that place by the same distances: they must have been apart or at an
-    angle. What one of them did before the log begins is unknown, so a short way back proves nothing.
+    Both paths are followed backwards from that place by the same distances: they must have been apart or at an angle.
     """
     ahead, beside = _way_back(segment, segment.ego, mine), _way_back(segment, other, theirs)
     reach = min(ahead[0][-1], beside[0][-1], LOOKBACK)

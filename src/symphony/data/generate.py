@@ -7,12 +7,12 @@ the order of the plan, so a store depends on the plan alone.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,15 +45,9 @@ BARREN = 50
 
 @dataclass(frozen=True)
 class Harvest:
-    """What one network gave.
+    """What one network gave: the segments taken, how many could have been, and why windows were left out.
 
-    Attributes:
-        task: the network.
-        segments: those taken.
-        accepted: how many could have been.
-        reasons: how many windows were left out, and why.
-        seconds: of one core that it took.
-        error: why the network gave nothing at all, if it failed.
+    ``error`` is why it gave nothing at all, if it failed; ``seconds`` of one core is what it took.
     """
 
     task: Task
@@ -86,10 +80,9 @@ def harvest(task: Task) -> Harvest:
 
 
 def _cpu_seconds() -> float:
-    """Of this process and the programs it ran: unlike the clock, it doesn't depend on who else uses the cores."""
-    spent = os.times()
+    """Seconds of this process and the programs it ran: unlike the clock, they don't depend on who else is there."""
     # Windows does not know its children's.
-    return sum(spent[:4]) if os.name == "posix" else time.perf_counter()
+    return sum(os.times()[:4]) if os.name == "posix" else time.perf_counter()
 
 
 def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
@@ -97,17 +90,12 @@ def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) ->
     by_map: dict[int, list[RunSegment]] = {}
     for segment in segments:
         by_map.setdefault(id(segment.road), []).append(segment)
-    groups = list(by_map.values())
-    turns = [
-        (turn, k, group[i]) for k, group in enumerate(groups) for turn, i in enumerate(_shuffled(group, rng))
-    ]
+    groups = [[group[i] for i in rng.permutation(len(group))] for group in by_map.values()]
     first = rng.permutation(len(groups))
-    turns.sort(key=lambda entry: (entry[0], first[entry[1]]))
-    return [segment for _, _, segment in turns[:count]]
-
-
-def _shuffled(items: list[Any], rng: np.random.Generator) -> list[int]:
-    return rng.permutation(len(items)).tolist()
+    turns = [
+        (turn, first[k], segment) for k, group in enumerate(groups) for turn, segment in enumerate(group)
+    ]
+    return [segment for *_, segment in sorted(turns, key=lambda entry: entry[:2])[:count]]
 
 
 @dataclass
@@ -154,15 +142,8 @@ def generate(
 ) -> Generation:
     """Carry out a plan, or continue one that was interrupted at any moment; a finished store is left as it is.
 
-    Args:
-        plan: what to make.
-        out: directory of the store.
-        workers: processes; their number changes nothing in the store.
-        engine: where they are, see :func:`symphony.parallel.ordered_map`.
-        progress: told how far it is.
-
-    Returns:
-        How the store was made, from its beginning.
+    The number of workers changes nothing in the store; for where they are, see :func:`symphony.parallel.ordered_map`.
+    Returns how the store was made, from its beginning.
 
     Raises:
         ConfigError: the store is being made with other arguments; names the first that differs.
@@ -170,19 +151,18 @@ def generate(
     """
     settings = plan.settings()
     if (Path(out) / store_format.HEADER).is_file():
-        state = _begin(SegmentStore(out), settings)
+        state = _begun(SegmentStore(out), settings)
         if state.complete:
             return state
     with StoreWriter(out, append=True) as writer:
         # Read once more under the lock: another run may have gone on in between.
-        state = _begin(SegmentStore(out), settings)
+        state = _begun(SegmentStore(out), settings)
         if state.complete:
             return state
         _report(writer, settings, state)
         barren = 0
-        with _closing(
-            ordered_map(harvest, plan.networks(state.networks), workers=workers, engine=engine)
-        ) as found:
+        tasks = plan.networks(state.networks)
+        with closing(ordered_map(harvest, tasks, workers=workers, engine=engine)) as found:
             for result in found:
                 before = len(writer)
                 for segment in result.segments:
@@ -195,69 +175,41 @@ def generate(
                 _report(writer, settings, state)
                 if progress is not None:
                     progress(len(writer), state)
-                barren = 0 if len(writer) > before or result.segments else barren + 1
                 if state.complete:
                     break
+                barren = 0 if len(writer) > before or result.segments else barren + 1
                 if barren == BARREN:
-                    raise DataError(_in_vain(state), file=writer.path)
+                    why = [f"  {count} x {reason}" for reason, count in list(state.reasons.items())[:5]]
+                    why += [f"  {name}: {message}" for name, message in list(state.failed.items())[-2:]]
+                    text = f"{BARREN} networks in a row gave no segment; windows were left out because:"
+                    raise DataError("\n".join([text, *why]), file=writer.path)
     return state
 
 
-def _begin(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
+def _begun(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
     """Where to continue, after a look at whether this is the store of the same plan."""
     report = store.report
     if not report and not len(store):
         return Generation()
-    there = report.get("settings")
-    there = there if isinstance(there, dict) else {}
+    there = report.get("settings") or {}
     if "generation" not in report or there.get("reader") != "generate":
-        raise DataError(
-            "is a segment store that was not generated: refusing to write into it", file=store.path
-        )
+        message = "is a segment store that was not generated: refusing to write into it"
+        raise DataError(message, file=store.path)
     for name, value in {**_BEFORE, **settings}.items():
         made = there.get(name, _BEFORE.get(name))
         if made != value:
+            old, new = (",".join(map(str, v)) if isinstance(v, list) else v for v in (made, value))
             raise ConfigError(
-                f"{store.path} was made with {name} {_plain(made)}, not {_plain(value)}: "
+                f"{store.path} was made with {name} {old}, not {new}: "
                 "give the same arguments to continue it, or choose another folder"
             )
-    found, state = report["generation"], Generation()
-    for name, value in vars(state).items():
-        kind = (int, float) if isinstance(value, float) else type(value)
-        if not isinstance(found, dict) or not isinstance(found.get(name, value), kind):
-            raise DataError("not how far a generation is", file=store.path / store_format.REPORT, field=name)
-    return Generation(**{name: found[name] for name in vars(state) if name in found})
-
-
-def _plain(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+    found = report["generation"]
+    return Generation(**{item.name: found[item.name] for item in fields(Generation) if item.name in found})
 
 
 def _report(writer: StoreWriter, settings: Mapping[str, Any], state: Generation) -> None:
-    writer.write_report(
-        {
-            "converted": len(writer),
-            "files": state.networks,
-            "settings": settings,
-            "generation": asdict(state),
-        }
-    )
-
-
-def _in_vain(state: Generation) -> str:
-    why = [f"  {count} x {reason}" for reason, count in list(state.reasons.items())[:5]]
-    why += [f"  {name}: {message}" for name, message in list(state.failed.items())[-2:]]
-    return "\n".join([f"{BARREN} networks in a row gave no segment; windows were left out because:", *why])
-
-
-@contextlib.contextmanager
-def _closing(results: Iterable[Harvest]) -> Iterator[Iterable[Harvest]]:
-    try:
-        yield results
-    finally:
-        close = getattr(results, "close", None)
-        if close is not None:
-            close()
+    counts = {"converted": len(writer), "files": state.networks}
+    writer.write_report({**counts, "settings": settings, "generation": asdict(state)})
 
 
 def add_to_report(path: str | Path, name: str, value: Any) -> None:

@@ -41,9 +41,7 @@ def joined(road: RoadMap) -> tuple[RoadMap, int]:
     gap = np.linalg.norm(first[start] - last[end], axis=1)
     bicycle = road.lane_type == LaneType.BIKE_LANE
     straight = (outward[end] * inward[start]).sum(1) >= np.cos(TURN)
-    ahead = (gap < np.linalg.norm(first[start] - first[end], axis=1)) & (
-        gap < np.linalg.norm(last[start] - last[end], axis=1)
-    )
+    ahead = gap < np.minimum(*(np.linalg.norm(p[start] - p[end], axis=1) for p in (first, last)))
     good = (gap <= REACH) & straight & ahead & known[end] & known[start] & (bicycle[end] == bicycle[start])
     end, start, gap = end[good], start[good], gap[good]
     count = len(road.lanes)

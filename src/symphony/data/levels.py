@@ -3,7 +3,7 @@
 Heights alone do not tell: a car 60 m up a steep street is as high as one on a bridge. Where the lines of a map lie
 above each other they are counted from below, and each number spreads along the surface it is on, up to where it meets
 another. Two places are on different levels if their numbers differ, and their heights by
-:data:`symphony.geometry.LEVEL`: so cars that follow each other up a ramp are never apart. Places that no such surface
+:data:`LEVEL`: so cars that follow each other up a ramp are never apart. Places that no such surface
 reaches have no level and see all others.
 """
 
@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import Polylines, RunSegment
-from symphony.geometry.levels import LEVEL
 
+LEVEL = 2.5
+"""Metres of height, at one place, from which on two things are on different levels (as in ``symphony.geometry``)."""
 CELL = 5.0
 """Metres of the columns in which heights are compared."""
 RISE = 1.5
@@ -73,11 +74,10 @@ class Levels:
         one, other = [], []
         for dx, dy in _NEAR[1:]:
             for row, found in self._among(self._key + dx * _WIDE + dy):
-                gap = np.maximum(self._low[row], self._low[found]) - np.minimum(
-                    self._high[row], self._high[found]
-                )
-                one.append(row[gap < RISE])
-                other.append(found[gap < RISE])
+                high = np.minimum(self._high[row], self._high[found])
+                near = np.maximum(self._low[row], self._low[found]) - high < RISE
+                one.append(row[near])
+                other.append(found[near])
         here, there = np.concatenate(one), np.concatenate(other)
         while True:
             new = (self._level[here] == 0) & (self._level[there] > 0)
@@ -146,8 +146,12 @@ def dense(lines: Polylines) -> NDArray[np.float64]:
     if count.max() == 1:
         return points
     point = np.repeat(np.arange(len(points)), count)
-    share = (np.arange(len(point)) - np.repeat(np.cumsum(count) - count, count)) / count[point]
-    return points[point] + share[:, None] * step[point]
+    return points[point] + shares(count)[:, None] * step[point]
+
+
+def shares(count: NDArray[np.int64]) -> NDArray[np.float64]:
+    """0, 1 / n, 2 / n, ... (n - 1) / n for each number n, one after the other."""
+    return (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
 
 
 def _columns(points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:

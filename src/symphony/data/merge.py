@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from symphony.data import store_format
+from symphony.data.convert import folder_of, read_job
 from symphony.data.report import Report
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.data.unfinished import folder_of, read_journal
 from symphony.errors import DataError
 
 
@@ -20,12 +20,7 @@ def merge(
 ) -> SegmentStore:
     """Copy all segments of some stores, in their order, into a new one, which appears once it is complete.
 
-    Its report joins theirs.
-
-    Args:
-        paths: the stores.
-        out: folder of the new store; must not exist.
-        progress: told how many segments are done, of how many.
+    Its report joins theirs. ``progress`` is told how many segments are done, of how many.
 
     Raises:
         DataError: ``out`` exists or is being made, a segment is in two stores, the generation of one is not
@@ -40,7 +35,7 @@ def merge(
     if len(steps) > 1:
         listed = ", ".join(f"{dt:g} s" for dt in sorted(steps))
         raise DataError(f"stores with different time steps don't go together: {listed}", file=paths[0])
-    if read_journal(folder_of(out)) is not None:
+    if read_job(folder_of(out)) is not None:
         raise DataError(f"an unfinished conversion to that name lies in {folder_of(out)}", file=out)
     draft = out.with_name(f"{out.name}.merging")
     if (draft / store_format.HEADER).is_file():  # of a merge that was killed, or goes on, which is told

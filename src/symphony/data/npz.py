@@ -25,14 +25,8 @@ def read_npz(path: Path, names: Collection[str] = (), *, most: int = MOST) -> di
     How much memory they take is checked before any of it is asked for: what their headers claim must be what the
     archive holds, and that no more than is allowed.
 
-    Args:
-        path: the file.
-        names: only these, of those that are there; by default all.
-        most: bytes of all together.
-
-    Raises:
-        DataError: it is no such archive, or damaged, or holds more; names file and field.
-        OSError: the file can't be opened.
+    With ``names``, only these are read. A :class:`DataError` names file and field of what is no archive, damaged,
+    or of more than ``most`` bytes in all.
     """
     found: dict[str, NDArray[Any]] = {}
     left, name = most, None
@@ -51,9 +45,8 @@ def read_npz(path: Path, names: Collection[str] = (), *, most: int = MOST) -> di
         except DataError:
             raise
         except Exception as error:  # each way of packing has its own
-            raise DataError(
-                f"expected an .npz archive of arrays; it is none, or damaged: {error}", file=path, field=name
-            ) from None
+            message = f"expected an .npz archive of arrays; it is none, or damaged: {error}"
+            raise DataError(message, file=path, field=name) from None
     return found
 
 

@@ -17,7 +17,7 @@ from symphony.data.bounds import (
     MAX_SPEED,
     MIN_SIZE,
 )
-from symphony.data.segment import Bools, Polylines, RunSegment
+from symphony.data.segment import Bools, Polylines, RunSegment, jumps, largest
 from symphony.data.subset import lines_of, with_agents, with_lanes
 
 LATE = 1.0
@@ -31,6 +31,11 @@ NO_LINE = "a line of the map left out: not finite, or beyond what is plausible"
 LATE_EGO = "steps left out before the ego comes"
 
 
+ODD_SPEED, ODD_JUMP, ODD_HEADING, ODD_FAR = 70.0, 100.0, 8 * np.pi, 5_000.0
+ODD_SMALL, ODD_LARGE = 0.2, 30.0
+ODD_DT = (0.02, 1.0)
+
+
 def noted(segment: RunSegment, found: Mapping[str, str]) -> RunSegment:
     """The segment with more oddities, kind -> example; the first example of a kind stays."""
     return segment.replace(odd={**found, **segment.odd}) if found else segment
@@ -39,12 +44,32 @@ def noted(segment: RunSegment, found: Mapping[str, str]) -> RunSegment:
 def mended(segment: RunSegment) -> RunSegment:
     """What remains of a segment that breaks the schema once single agents, states and lines are left out.
 
-    Left out are agents without a size, or of 100 m and more; states that are not finite or that nothing on wheels can
-    have (see :mod:`symphony.data.bounds`), and of a track that jumps those that are a jump away from its longest
-    piece; lines of the map with such points. The ego stays, whatever it is, so that the result may break the schema
-    still.
+    Left out are agents without a size, or of 100 m and more; states that are not finite or beyond
+    :mod:`symphony.data.bounds`, and of a track that jumps those that are a jump away from its longest piece; lines of
+    the map with such points. The ego stays, so that the result may still break the schema.
     """
     return _agents(_states(_lines(segment)))
+
+
+def oddities(segment: RunSegment) -> list[str]:
+    """What is unusual about a valid segment: worth a look where it is frequent, no reason to leave it out."""
+    s, seen = segment, segment.valid
+    sides = s.size[seen.any(1), :2]
+    points = (s.road.lanes.points, s.road.boundary.points, s.road.marks.points)
+    lit = (s.signal_state != 0).mean(1)
+    found = {
+        f"an agent faster than {ODD_SPEED:g} m/s": largest(s.velocity[seen]) > ODD_SPEED,
+        f"an agent that jumps, at over {ODD_JUMP:g} m/s": bool((jumps(s) > ODD_JUMP * s.dt + 1).any()),
+        f"a box with a side under {ODD_SMALL:g} m": bool((sides < ODD_SMALL).any()),
+        f"a box with a side over {ODD_LARGE:g} m": bool((sides > ODD_LARGE).any()),
+        f"a time step outside {ODD_DT[0]:g} to {ODD_DT[1]:g} s": not ODD_DT[0] <= s.dt <= ODD_DT[1],
+        "a heading that has turned more than 4 times": largest(s.heading[seen]) > ODD_HEADING,
+        f"a map that reaches beyond {ODD_FAR / 1000:g} km": max(map(largest, points)) > ODD_FAR,
+        "lights known for less than half of the time (see --hold-lights)": bool(
+            ((lit > 0) & (lit < 0.5)).any()
+        ),
+    }
+    return [what for what, applies in found.items() if applies]
 
 
 def _lines(segment: RunSegment) -> RunSegment:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from symphony.data.levels import ground
+from symphony.data.levels import LEVEL, ground
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
-from symphony.geometry import boxes_overlap
-from symphony.geometry.levels import LEVEL
+
+Doubles = NDArray[np.float64]
 
 MANY = 0.05
 """Share of a store's segments with overlaps above which a conversion warns."""
@@ -26,7 +25,7 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
     """[P, 2] pairs of agents, rows in order, whose oriented boxes overlap at some step.
 
     At least one of the two is a vehicle that moves (more than :data:`~symphony.data.selection.MOVING` metres).
-    Touching does not count, nor do boxes whose logged heights differ by :data:`~symphony.geometry.LEVEL`.
+    Touching does not count, nor do boxes whose logged heights differ by :data:`~symphony.data.levels.LEVEL`.
     """
     drivers = np.flatnonzero((segment.agent_type == AgentType.VEHICLE) & (travel(segment) > MOVING))
     rows = max(BLOCK // segment.valid.size, 1)
@@ -37,6 +36,7 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
 def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]:
     """[P, 2] pairs of one of the drivers and anybody, each in order, once for each step of an overlap."""
     position = segment.position[..., :2].astype(np.float64)
+    heading = segment.heading.astype(np.float64)
     size = segment.size[:, :2].astype(np.float64)
     radius = np.hypot(*size.T) / 2
     away = position[drivers, None] - position[None]
@@ -49,16 +49,38 @@ def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]
     near[np.arange(len(drivers)), drivers] = False
     driver, other, step = near.nonzero()
     one = drivers[driver]
-
-    def boxes(rows: NDArray[np.integer[Any]]) -> tuple[torch.Tensor, ...]:
-        heading = segment.heading[rows, step].astype(np.float64)
-        return tuple(map(torch.from_numpy, (position[rows, step], heading, size[rows])))
-
-    hit = boxes_overlap(*boxes(one), *boxes(other)).numpy()
+    way = position[other, step] - position[one, step]
+    hit = box_depth(way, heading[one, step], size[one], heading[other, step], size[other]) > 1e-9
     return np.sort(np.stack([one[hit], other[hit]], axis=-1), axis=1)
 
 
-def tags(segment: RunSegment) -> dict[str, int] | None:
-    """What a store notes of a segment with overlaps; None for one without."""
+def box_depth(
+    way: Doubles, heading_a: Doubles, size_a: Doubles, heading_b: Doubles, size_b: Doubles
+) -> Doubles:
+    """[N] metres by which two boxes are in each other, by the separating-axis test; 0 or less if they are not.
+
+    Args:
+        way: [N, 2] from the centre of the one to that of the other.
+        heading_a: [N] of the one.
+        size_a: [N, 2] length and width of the one.
+        heading_b: [N] of the other.
+        size_b: [N, 2] length and width of the other.
+    """
+    boxes: Any = ((heading_a, size_a / 2), (heading_b, size_b / 2))
+    depth = np.full(len(way), np.inf)
+    for owner, _ in boxes:
+        for turn in (0.0, np.pi / 2):
+            angle = owner + turn
+            axis = np.stack([np.cos(angle), np.sin(angle)], -1)
+            extent = np.zeros(len(way))
+            for heading, half in boxes:
+                relative = heading - angle
+                extent += half[:, 0] * np.abs(np.cos(relative)) + half[:, 1] * np.abs(np.sin(relative))
+            depth = np.minimum(depth, extent - np.abs((way * axis).sum(-1)))
+    return depth
+
+
+def tags(segment: RunSegment) -> dict[str, int]:
+    """What a store notes of a segment with overlaps; nothing for one without."""
     found = len(overlapping(segment))
-    return {TAG: found} if found else None
+    return {TAG: found} if found else {}

@@ -1,7 +1,7 @@
 """From the records of log files to segments ready for a store, here or in a worker process.
 
-A worker converts a *part*, some consecutive files, into a small store of its own, record by record: what
-passes between processes is a path, and no process holds more than one record in memory.
+A *part* is some consecutive files, converted record by record into a small store of its own: what passes between
+processes is a path, no process holds more than one record in memory, and what is done is not done again.
 """
 
 from __future__ import annotations
@@ -10,16 +10,13 @@ import functools
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from symphony.data import joins, overlaps
 from symphony.data import resample as resampling
-from symphony.data.bounds import oddities
-from symphony.data.crop import crop
-from symphony.data.odd import from_ego
+from symphony.data.odd import from_ego, oddities
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
@@ -27,36 +24,15 @@ from symphony.data.sources import Reader
 from symphony.data.sources.base import unexpected
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
+from symphony.data.subset import crop
 from symphony.errors import ConfigError, DataError
-from symphony.parallel import Engine, ordered_map
 
 PART_BYTES, PART_FILES = 8 << 20, 64
 """Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""
 PRESENT = "present"
+"""Entry of a part for a segment that the store held before."""
 ODD = "odd"
-"""Tag of a segment with something unusual: what it is -> an example (a list of what it is in older stores)."""
-
-
-@dataclass(frozen=True)
-class Stored:
-    """A segment that a worker left in a part."""
-
-    store: SegmentStore
-    index: int
-
-    @property
-    def segment_id(self) -> str:
-        """Its id."""
-        return self.store.ids[self.index]
-
-    @property
-    def tags(self) -> dict[str, Any]:
-        """What it is tagged with."""
-        return self.store.tags(self.index)
-
-
-Outcome = RunSegment | Stored | Skip | None
-"""What became of a record; None where the store held the segment before."""
+"""Tag of a segment with something unusual: what it is -> an example."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +46,7 @@ class Preparation:
         interactive: interactive agents a segment must have (N_I).
         before: path of the store that is added to, and the segments it held; their ids are passed over.
         exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
-        radius: metres around the ego's path that are kept (see :mod:`symphony.data.crop`); None for all.
+        radius: metres around the ego's path that are kept (see :func:`symphony.data.subset.crop`); None for all.
         hold_lights: keep the state of lights where the log has none.
         strict: leave out records of which something odd would be (see :mod:`symphony.data.odd`).
     """
@@ -85,8 +61,8 @@ class Preparation:
     hold_lights: bool = False
     strict: bool = False
 
-    def outcomes(self, path: str) -> Iterator[Outcome]:
-        """One for each record of a file, in its order."""
+    def outcomes(self, path: str) -> Iterator[RunSegment | Skip | None]:
+        """What becomes of each record of a file, in its order; None where the store held the segment before."""
         before = frozenset[str]() if self.before is None else _ids(*self.before)
         for record in self.reader.read(path):
             if isinstance(record, DataError):
@@ -130,7 +106,7 @@ def tags_of(segment: RunSegment) -> dict[str, Any]:
     """What a segment is tagged with that has something unusual, boxes that overlap, or lanes that were joined."""
     odd = {**segment.odd, **dict.fromkeys(oddities(segment), "")}
     gaps = {joins.TAG: segment.joined_gaps} if segment.joined_gaps else {}
-    return ({ODD: odd} if odd else {}) | (overlaps.tags(segment) or {}) | gaps
+    return ({ODD: odd} if odd else {}) | overlaps.tags(segment) | gaps
 
 
 @functools.lru_cache(maxsize=1)
@@ -138,54 +114,39 @@ def _ids(path: str, count: int) -> frozenset[str]:
     return frozenset(SegmentStore(path).ids[:count])
 
 
-def divide(sizes: list[int]) -> list[range]:
-    """Consecutive files, by number, that are converted in one go; depends on nothing but their sizes in bytes."""
-    parts: list[range] = []
-    begin, total = 0, 0
-    for k, size in enumerate(sizes):
-        if k > begin and (total + size > PART_BYTES or k - begin == PART_FILES):
-            parts.append(range(begin, k))
-            begin, total = k, 0
-        total += size
-    return [*parts, range(begin, len(sizes))] if sizes else parts
-
-
 @dataclass(frozen=True)
 class Task:
-    """A part to make.
-
-    Attributes:
-        recipe: how.
-        files: paths of its files.
-        start: number of the first of them among all files.
-        folder: where parts lie.
-    """
+    """A part to make: how, from which files, and where it lies once it is complete."""
 
     recipe: Preparation
     files: tuple[str, ...]
-    start: int
-    folder: Path
+    path: Path
 
-    @property
-    def stop(self) -> int:
-        """Number of the file after the last."""
-        return self.start + len(self.files)
 
-    @property
-    def path(self) -> Path:
-        """Where the finished part lies."""
-        return self.folder / f"{self.start:08d}"
+def tasks_of(recipe: Preparation, files: list[tuple[str, int]], folder: Path) -> list[Task]:
+    """The parts that files of so many bytes are converted in; they depend on nothing but the sizes."""
+    groups: list[list[str]] = []
+    total = 0
+    for name, size in files:
+        if not groups or total + size > PART_BYTES or len(groups[-1]) == PART_FILES:
+            groups.append([])
+            total = 0
+        groups[-1].append(name)
+        total += size
+    return [Task(recipe, tuple(names), folder / f"{k:08d}") for k, names in enumerate(groups)]
 
 
 def make_part(task: Task) -> Path:
-    """Convert the files of a task, unless that was done before; the part appears once it is complete."""
+    """Convert the files of a task, unless that was done before; the part appears once it is complete.
+
+    Its report has a list of ``entries`` for each file: the number of a segment in the part, a skipped record, or
+    :data:`PRESENT`.
+    """
     if task.path.exists():
         return task.path
-    draft = Path(tempfile.mkdtemp(prefix=f"{task.path.name}.", dir=task.folder))
+    draft = Path(tempfile.mkdtemp(prefix=f"{task.path.name}.", dir=task.path.parent))
     with StoreWriter(draft) as writer:
-        entries = [
-            [_entry(outcome, writer, file) for outcome in task.recipe.outcomes(file)] for file in task.files
-        ]
+        entries = [[_entry(o, writer, file) for o in task.recipe.outcomes(file)] for file in task.files]
         writer.write_report({"entries": entries})
     try:
         draft.rename(task.path)
@@ -196,7 +157,7 @@ def make_part(task: Task) -> Path:
     return task.path
 
 
-def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
+def _entry(outcome: RunSegment | Skip | None, writer: StoreWriter, file: str) -> Any:
     if isinstance(outcome, RunSegment):
         # Of a name that comes twice the first is kept; whoever takes them out of the part sees it twice.
         if writer.has(outcome.segment_id):
@@ -206,29 +167,3 @@ def _entry(outcome: Outcome, writer: StoreWriter, file: str) -> Any:
         except DataError as error:
             outcome = Skip.of(error, file, outcome.segment_id)
     return outcome.to_json() if isinstance(outcome, Skip) else PRESENT
-
-
-def open_part(path: Path) -> list[Iterator[Outcome]]:
-    """For each file of a part, what :meth:`Preparation.outcomes` gave."""
-    store = SegmentStore(path)
-
-    def outcome(entry: Any) -> Outcome:
-        if isinstance(entry, int):
-            return Stored(store, entry)
-        return None if entry == PRESENT else Skip(**entry)
-
-    return [map(outcome, entries) for entries in store.report["entries"]]
-
-
-def here(task: Task) -> list[Iterator[Outcome]]:
-    """The same in this process, from one record to the next; from a part only if there is one already."""
-    if task.path.exists():
-        return open_part(task.path)
-    return [task.recipe.outcomes(file) for file in task.files]
-
-
-def elsewhere(tasks: list[Task], workers: int, engine: Engine) -> Iterator[list[Iterator[Outcome]]]:
-    """The same for many tasks, made by worker processes."""
-    with closing(ordered_map(make_part, tasks, workers=workers, engine=engine)) as made:
-        for path in made:
-            yield open_part(path)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, Literal, get_args
 
-from symphony.data.sources.sumo import KINDS, sumo_version
+from symphony.data.sources.sumo import KINDS, is_own, kind_name, sumo_version
 from symphony.errors import ConfigError
 
 Split = Literal["train", "validation", "test"]
@@ -31,7 +33,8 @@ class Plan:
         segments: how many.
         seed: another seed is another set of networks.
         split: training, validation and test sets never share a network, whatever their seeds.
-        kinds: of networks, which take turns; one named twice comes twice as often.
+        kinds: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
+            kind, too; its roads are the same for every split and seed, the traffic is another.
         duration: seconds of a segment, one of :data:`DURATIONS`.
         interactive: moving vehicles a segment must have at its first step (N_I).
 
@@ -47,38 +50,29 @@ class Plan:
     interactive: int = 2
 
     def __post_init__(self) -> None:
-        if self.segments < 1:
-            raise ConfigError(f"segments must be at least 1, is {self.segments}")
-        if not 0 <= self.seed <= MAX_SEED:
-            raise ConfigError(f"seed must be between 0 and {MAX_SEED}, is {self.seed}")
-        if self.split not in SPLITS:
-            raise ConfigError(f"unknown split {self.split!r} (known: {', '.join(SPLITS)})")
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
-        if unknown or not self.kinds:
-            known = f"(known: {', '.join(KINDS)})"
-            raise ConfigError(
-                f"kinds: unknown kind of network {unknown[0]!r} {known}" if unknown else f"no kinds {known}"
-            )
-        if self.duration not in DURATIONS:
-            raise ConfigError(f"duration must be one of {DURATIONS}, is {self.duration}")
-        if self.interactive < 2:
-            raise ConfigError(f"interactive must be at least 2, is {self.interactive}")
+        unknown = [kind for kind in self.kinds if kind not in KINDS and not is_own(kind)]
+        missing = [kind for kind in self.kinds if is_own(kind) and not Path(kind).is_file()]
+        known = f"(known: {', '.join(KINDS)}, and files of roads: .xodr, .osm, .net.xml)"
+        for wrong, message in (
+            (self.segments < 1, f"segments must be at least 1, is {self.segments}"),
+            (not 0 <= self.seed <= MAX_SEED, f"seed must be between 0 and {MAX_SEED}, is {self.seed}"),
+            (self.split not in SPLITS, f"unknown split {self.split!r} (known: {', '.join(SPLITS)})"),
+            (unknown, f"kinds: unknown kind of network {', '.join(unknown)!r} {known}"),
+            (not self.kinds, f"no kinds {known}"),
+            (self.duration not in DURATIONS, f"duration must be one of {DURATIONS}, is {self.duration}"),
+            (self.interactive < 2, f"interactive must be at least 2, is {self.interactive}"),
+            (missing, f"kinds: there is no file {', '.join(missing)}"),
+        ):
+            if wrong:
+                raise ConfigError(message)
 
     def network(self, number: int) -> Task:
-        """The plan's network of that number, counted from 0.
-
-        Raises:
-            ConfigError: the seed has no more networks.
-        """
+        """The plan's network of that number, counted from 0."""
         if not 0 <= number < BLOCK:
             raise ConfigError(f"one seed has {BLOCK} networks for each split: make more stores instead")
         first = FIRST_NETWORK + (self.seed * len(SPLITS) + SPLITS.index(self.split)) * BLOCK
-        return Task(
-            self.kinds[number % len(self.kinds)],
-            first + number,
-            float(self.duration),
-            self.interactive,
-        )
+        kind = self.kinds[number % len(self.kinds)]
+        return Task(kind, first + number, float(self.duration), self.interactive)
 
     def networks(self, start: int = 0) -> Iterator[Task]:
         """The plan's networks from one number on."""
@@ -86,13 +80,9 @@ class Plan:
 
     def settings(self) -> dict[str, Any]:
         """As kept with the store: the arguments, and the versions that decide what they give."""
-        return {
-            **asdict(self),
-            "kinds": list(self.kinds),
-            "reader": "generate",
-            "generator": VERSION,
-            "sumo": sumo_version(),
-        }
+        own = {kind: sha256(Path(kind).read_bytes()).hexdigest() for kind in self.kinds if is_own(kind)}
+        found = {**asdict(self), "kinds": list(self.kinds), **({"roads": own} if own else {})}
+        return found | {"reader": "generate", "generator": VERSION, "sumo": sumo_version()}
 
 
 @dataclass(frozen=True)
@@ -107,32 +97,25 @@ MADE_WITH = "SUMO 1.28.0 on Linux, x86-64"
 """What the checksums of the standard sets were taken with: other versions or processors may give others."""
 
 
-def _preset(train: int, validation: int, test: int, checksums: dict[Split, str]) -> Preset:
-    counts: dict[Split, int] = {"train": train, "validation": validation, "test": test}
-    return Preset({split: Plan(count, split=split) for split, count in counts.items()}, checksums)
+def _preset(train: int, validation: int, test: int, *checksums: str) -> Preset:
+    counts = dict(zip(SPLITS, (train, validation, test), strict=True))
+    plans = {split: Plan(count, split=split) for split, count in counts.items()}
+    return Preset(plans, dict(zip(SPLITS, checksums, strict=True)))
 
 
 # Both use seed 0, so the smaller set is the beginning of the larger one.
 PRESETS: dict[str, Preset] = {
     "town-small": _preset(
-        2_000,
-        200,
-        500,
-        {
-            "train": "bc250bfc215864d18e132821f7a9eb786dd5ed51f20f3a06aba403eabf700a07",
-            "validation": "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
-            "test": "0cfa3e8c082441702d7cc19962bbda606b9941f7434c8c8837f5ef39ad20bbe2",
-        },
+        *(2_000, 200, 500),
+        "bc250bfc215864d18e132821f7a9eb786dd5ed51f20f3a06aba403eabf700a07",
+        "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
+        "0cfa3e8c082441702d7cc19962bbda606b9941f7434c8c8837f5ef39ad20bbe2",
     ),
     "town": _preset(
-        10_000,
-        200,
-        1_000,
-        {
-            "train": "5fcd71bef8cc5ea81c118cd28b933280b344eb492a98caba9fcc3a8e1235b141",
-            "validation": "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
-            "test": "c2c4a0677f9b780f20f23af5d57b00dc5961d840bcc8b4d95eacc7ff3f0d032d",
-        },
+        *(10_000, 200, 1_000),
+        "5fcd71bef8cc5ea81c118cd28b933280b344eb492a98caba9fcc3a8e1235b141",
+        "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
+        "c2c4a0677f9b780f20f23af5d57b00dc5961d840bcc8b4d95eacc7ff3f0d032d",
     ),
 }
 """The standard sets: towns with signals, all kinds of unsignalled control and roundabouts, 10 s, N_I = 2."""
@@ -150,4 +133,4 @@ class Task:
     @property
     def name(self) -> str:
         """As in the segments' tags."""
-        return f"{self.kind}-{self.seed}"
+        return f"{kind_name(self.kind)}-{self.seed}"

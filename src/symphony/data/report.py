@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from symphony.data.overlaps import MANY
@@ -41,14 +41,12 @@ class Skip:
     @classmethod
     def of(cls, error: DataError, path: object = "", segment: str = "", exclusion: str = "") -> Skip:
         """What a report says of an error."""
-        found = cls(error.message, str(path), error.segment or segment, error.field or "", exclusion)
+        texts = (error.message, str(path), error.segment or segment, error.field or "", exclusion)
         # Half a character, as damaged text may hold, could not be written, and would end the conversion.
-        return cls(
-            **{name: text.encode(errors="backslashreplace").decode() for name, text in vars(found).items()}
-        )
+        return cls(*(text.encode(errors="backslashreplace").decode() for text in texts))
 
     def to_json(self) -> dict[str, str]:
-        """Without ``exclusion`` where there is none."""
+        """As kept in a report: without ``exclusion`` where there is none."""
         found = asdict(self)
         return found if self.exclusion else {k: v for k, v in found.items() if k != "exclusion"}
 
@@ -73,10 +71,10 @@ class Report:
         skipped: what was left out, the paper's exclusions included.
         settings: arguments of the conversion.
         odd: what is unusual or was left out, and about how many of the segments added.
-        odd_examples: the first of each.
         overlaps: segments added in whose log a moving vehicle's box overlaps another (see
             :mod:`symphony.data.overlaps`).
         joined_gaps: links between lanes that were added, summed over the segments (see :mod:`symphony.data.joins`).
+        odd_examples: the first of each kind of ``odd``.
     """
 
     converted: int = 0
@@ -89,9 +87,9 @@ class Report:
     joined_gaps: int = 0
     odd_examples: dict[str, str] = field(default_factory=dict)
 
-    def note(self, odd: Mapping[str, str] | list[str], segment: str) -> None:
-        """Count what is odd about a segment: kind -> example, or a list of kinds as older stores have them."""
-        for kind, example in (odd if isinstance(odd, Mapping) else dict.fromkeys(odd, "")).items():
+    def note(self, odd: Mapping[str, str], segment: str) -> None:
+        """Count what is odd about a segment: kind -> example."""
+        for kind, example in odd.items():
             self.odd[kind] = self.odd.get(kind, 0) + 1
             self.odd_examples.setdefault(kind, f"{segment}: {example}" if example else segment)
 
@@ -110,12 +108,12 @@ class Report:
     @property
     def reasons(self) -> dict[str, int]:
         """How often something was skipped for each reason, most frequent first."""
-        return _count(self.skipped)
+        return dict(Counter(skip.reason for skip in self.skipped).most_common())
 
     @property
     def problems(self) -> dict[str, int]:
-        """Likewise, without the paper's exclusions."""
-        return _count([skip for skip in self.skipped if not skip.exclusion])
+        """How often something was skipped for each reason but the paper's exclusions."""
+        return dict(Counter(skip.reason for skip in self.skipped if not skip.exclusion).most_common())
 
     @property
     def exclusions(self) -> dict[str, int]:
@@ -126,39 +124,31 @@ class Report:
     def to_json(self) -> dict[str, Any]:
         """As kept with the store."""
         skipped = [skip.to_json() for skip in self.skipped]
-        counts = {"exclusions": self.exclusions, "reasons": self.reasons}
-        return {**vars(self), "skipped": skipped, **counts}
+        return {**vars(self), "skipped": skipped, "exclusions": self.exclusions, "reasons": self.reasons}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Report:
-        """The reverse of :meth:`to_json`; an empty mapping gives an empty report."""
-        kinds = {
-            "converted": int,
-            "present": int,
-            "files": int,
-            "settings": dict,
-            "odd": dict,
-            "overlaps": int,
-            "joined_gaps": int,
-            "odd_examples": dict,
-        }
-        known = {key: value[key] for key in kinds if key in value}
+        """The reverse of :meth:`to_json`; an empty mapping gives an empty report.
+
+        Raises:
+            DataError: it is no such report.
+        """
+        known = {item.name: value[item.name] for item in fields(cls) if item.name in value}
         for key, found in known.items():
-            if not isinstance(found, kinds[key]):
+            if not isinstance(found, type(getattr(cls(), key))):
                 raise DataError(f"not a conversion report: {str(found)[:40]!r}", field=key)
         try:
-            skipped = [Skip(**{k: _text(v) for k, v in skip.items()}) for skip in value.get("skipped", ())]
+            skipped = [Skip(**{k: _text(v) for k, v in skip.items()}) for skip in known.pop("skipped", ())]
             return cls(**known, skipped=skipped)
         except (TypeError, AttributeError) as error:
             raise DataError(f"not a conversion report: {error}", field="skipped") from error
 
     def after(self, earlier: Report) -> Report:
         """This report joined to the one of an earlier conversion into the same store."""
-        skipped = list(dict.fromkeys([*earlier.skipped, *self.skipped]))
         return Report(
             converted=earlier.converted + self.converted,
             files=earlier.files + self.files,
-            skipped=skipped,
+            skipped=list(dict.fromkeys([*earlier.skipped, *self.skipped])),
             settings=self.settings,
             odd=dict(Counter(earlier.odd) + Counter(self.odd)),
             overlaps=earlier.overlaps + self.overlaps,
@@ -181,7 +171,3 @@ def _text(value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{str(value)[:40]!r} is no text")
     return value
-
-
-def _count(skipped: list[Skip]) -> dict[str, int]:
-    return dict(Counter(skip.reason for skip in skipped).most_common())

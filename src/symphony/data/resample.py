@@ -1,6 +1,6 @@
 """Changing a run segment's time step, smoothing noisy logs, and filling in lights.
 
-Both are choices of the one who prepares the data; readers keep to the log.
+These are choices of the one who prepares the data; readers keep to the log.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SLOW, FAST = 1.0, 2.0
 
 
 def resample(segment: RunSegment, dt: float) -> RunSegment:
-    """The same segment at another time step, beginning at the same moment.
+    """The same valid segment with steps of ``dt`` seconds, beginning at the same moment.
 
     Where ``dt`` is a whole multiple of the segment's own step (10 Hz to 5 Hz), steps are picked and nothing is
     computed; a light unknown at a picked step has the latest state known since the one before (some WOMD records
@@ -43,17 +43,10 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
     the shorter arc, between two neighbouring valid steps; an agent is valid where both are. A light keeps the state
     of the latest logged step, and ``current_step`` becomes the latest new step not after the old one.
 
-    Args:
-        segment: a valid segment.
-        dt: seconds between the new steps.
-
     Raises:
         ConfigError: ``dt`` is not positive, or absurd.
-        DataError: fewer than two steps would remain, or more than a segment may have, or the ego would be valid at
-            none.
+        DataError: too few or too many steps would remain, or the ego would be valid at none.
     """
-    if not dt > 0:
-        raise ConfigError(f"dt must be positive, is {dt}")
     if not MIN_DT <= dt <= MAX_DT:
         raise ConfigError(f"dt must be between {MIN_DT:g} and {MAX_DT:g} s, is {dt}")
     ratio = dt / segment.dt
@@ -64,25 +57,16 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
 
 
 def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
-    return segment.replace(
-        dt=dt,
-        position=segment.position[:, ::every].copy(),
-        heading=segment.heading[:, ::every].copy(),
-        velocity=segment.velocity[:, ::every].copy(),
-        valid=segment.valid[:, ::every].copy(),
-        signal_state=_picked_lights(segment.signal_state, every),
-        current_step=segment.current_step // every,
-    )
-
-
-def _picked_lights(state: NDArray[Any], every: int) -> NDArray[Any]:
-    found = state[:, ::every].copy()
+    state = segment.signal_state
+    lights = state[:, ::every].copy()
+    later = lights[:, 1:]  # the first picked step has none before it
     for back in range(1, every):
-        # The first picked step has none before it.
-        later = found[:, 1:]
         before = state[:, every - back :: every][:, : later.shape[1]]
         later[later == SignalState.UNKNOWN] = before[later == SignalState.UNKNOWN]
-    return found
+    states = ("position", "heading", "velocity", "valid")
+    picked = {name: getattr(segment, name)[:, ::every].copy() for name in states}
+    current = segment.current_step // every
+    return segment.replace(dt=dt, signal_state=lights, current_step=current, **picked)
 
 
 def hold_lights(segment: RunSegment) -> RunSegment:
@@ -119,9 +103,7 @@ def evened(segment: RunSegment, times: Doubles) -> RunSegment:
     :func:`resample`; inside a gap of more than :data:`MAX_GAP` seconds nobody is seen. Frames that do not come after
     those before them are left out. What was done is noted (see :mod:`symphony.data.odd`).
 
-    Args:
-        segment: not validated yet; its ``dt`` is the usual time between two frames.
-        times: [T] of its steps, in seconds.
+    Takes the times [T] of its steps in seconds; its ``dt`` is the usual time between two frames.
     """
     dt = segment.dt
     if (np.abs(np.diff(times) - dt) <= EVEN * dt).all():
@@ -138,21 +120,17 @@ def evened(segment: RunSegment, times: Doubles) -> RunSegment:
     share = np.where(near, 0.0, (where - logged[last]) / np.where(near, 1.0, gap))
     current = max(int(np.searchsorted(where, times[segment.current_step] + EVEN * dt, side="right")) - 1, 0)
     found = _between(segment.replace(current_step=current), frames[last], frames[following], share)
-    found.valid[:, gap > MAX_GAP] = False
-    found.signal_state[:, gap > MAX_GAP] = SignalState.UNKNOWN
+    open_ = gap > MAX_GAP + 1e-6
+    found.valid[:, open_] = False
+    found.signal_state[:, open_] = SignalState.UNKNOWN
     lost, uneven = gap > 1.5 * dt, (gap > 0) & (gap <= 1.5 * dt)
     kinds = (
         (LOST, int(lost.sum()), steps),
         (UNEVEN, int(uneven.sum()), steps),
         (REPEATED, len(times) - len(frames), len(times)),
     )
-    return noted(_cleared(found), {kind: f"{count} of {of}" for kind, count, of in kinds if count})
-
-
-def _cleared(segment: RunSegment) -> RunSegment:
-    """The same with 0 for all states that are not valid."""
-    masked = {n: _masked(getattr(segment, n), segment.valid) for n in ("position", "heading", "velocity")}
-    return segment.replace(**masked)
+    masked = {n: _masked(getattr(found, n), found.valid) for n in ("position", "heading", "velocity")}
+    return noted(found.replace(**masked), {kind: f"{count} of {of}" for kind, count, of in kinds if count})
 
 
 def _between(segment: RunSegment, before: Ints, after: Ints, share: Doubles) -> RunSegment:
@@ -179,23 +157,14 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     """Remove position noise with a Gaussian window (NGSIM: 0.3 to 0.5 s before actions are fitted).
 
     Each position becomes the value, and each velocity the slope, of a straight line fitted to the agent's valid
-    positions with Gaussian weights in time, out to 4 sigma. Inside a track that is a Gaussian filter; unlike one
-    it does not pull a moving agent inwards at the ends of its track or beside gaps. Above 2 m/s the heading
-    becomes the direction of motion (or its opposite, for an agent that reverses), below 1 m/s it is the logged
-    one, smoothed likewise, and in between it goes over from one to the other. A track of a single valid step,
-    and the validity of all, stay as they are.
-
-    Args:
-        segment: a valid segment.
-        sigma: standard deviation of the window in seconds; 0 changes nothing.
-
-    Raises:
-        ConfigError: ``sigma`` is negative, above :data:`MAX_SIGMA` or not finite.
+    positions with Gaussian weights in time (standard deviation ``sigma`` seconds), out to 4 sigma. Inside a track it
+    is a Gaussian filter; unlike one it does not pull a moving agent inwards at the ends of its track or beside gaps.
+    Above 2 m/s the heading becomes the direction of motion (or its opposite, for an agent that reverses), below 1 m/s
+    it is the logged one, smoothed, and in between it goes over from one to the other. A track of a single valid step
+    stays as it is.
     """
-    if not 0 <= sigma <= MAX_SIGMA:
-        raise ConfigError(f"sigma must not be negative or above {MAX_SIGMA:g} s, is {sigma}")
-    if sigma == 0:
-        return segment
+    if not 0 < sigma <= MAX_SIGMA:
+        raise ConfigError(f"sigma must be positive and at most {MAX_SIGMA:g} s, is {sigma}")
     valid = segment.valid
     position, slope, fitted = local_line(segment.position.astype(np.float64), valid, segment.dt, sigma)
     velocity = np.where(fitted[..., None], slope[..., :2], segment.velocity)
@@ -225,7 +194,10 @@ def local_line(
     total = np.maximum(there.sum(axis=1), 1)[:, None, None]
     mean = (values * there[..., None]).sum(axis=1, keepdims=True) / total
     masked = (values - mean) * there[..., None]
-    blocks = [_moments(there, masked, rows, dt, sigma) for rows in _blocks(valid.shape[1])]
+    steps = valid.shape[1]
+    rows = max(BLOCK // steps, 1)  # steps at a time: their lags to all others stay below BLOCK numbers
+    parts = (range(k, min(k + rows, steps)) for k in range(0, steps, rows))
+    blocks = [_moments(there, masked, part, dt, sigma) for part in parts]
     s0, s1, s2, y0, y1 = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
     spread = s0 * s2 - s1**2
     fitted = valid & (spread > 1e-9 * s0**2 * sigma**2)
@@ -233,12 +205,6 @@ def local_line(
     value = (s2[..., None] * y0 - s1[..., None] * y1) / safe + mean
     slope = (s0[..., None] * y1 - s1[..., None] * y0) / safe
     return np.where(fitted[..., None], value, values), np.where(fitted[..., None], slope, 0.0), fitted
-
-
-def _blocks(steps: int) -> list[range]:
-    """Steps that are smoothed at a time: their lags to all others [rows, T] stay below ``BLOCK`` numbers."""
-    rows = max(BLOCK // steps, 1)
-    return [range(k, min(k + rows, steps)) for k in range(0, steps, rows)]
 
 
 def _moments(there: Doubles, masked: Doubles, rows: range, dt: float, sigma: float) -> tuple[Doubles, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -17,12 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import MAX_COORDINATE, MAX_SIZE, size_checks, value_checks
+from symphony.data import bounds
 from symphony.errors import DataError
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
+Check = tuple[str, bool, str]
+"""Field, whether it holds, and what is wrong if it doesn't."""
 
 
 class AgentType(IntEnum):
@@ -109,7 +111,7 @@ class RoadMap:
     """Lane graph, road boundary and markings.
 
     Attributes:
-        lanes: centre lines in the direction of travel (a single point where the source has no more).
+        lanes: centre lines in the direction of travel (single points where the source has no more).
         lane_id: [L] int64, the source's own ids (unique).
         lane_type: [L] uint8, :class:`LaneType`.
         speed_limit: [L] float32 m/s, NaN where unknown.
@@ -117,7 +119,7 @@ class RoadMap:
         successors: [E, 2] int32 lane indices (from, to): traffic flows from the end of one into the other.
             Predecessors are the same pairs read backwards.
         left_neighbors: [E', 2] int32 (lane, the lane on its left that a lane change may reach, same direction).
-        right_neighbors: [E'', 2] int32, likewise on the right.
+        right_neighbors: [E'', 2] int32 (lane, the one on its right).
         boundary: edge of the drivable area, *oriented: the drivable side is on the left*. Closed rings repeat
             their first point.
         marks: other features (lines, crosswalks, stop signs; a sign is a line of one point).
@@ -166,8 +168,8 @@ class RunSegment:
             independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
         joined_gaps: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it
             as a tag. No part of the content hash.
-        odd: what is unusual, or was left out of the record (see :mod:`symphony.data.odd`): kind -> example. Kept and
-            hashed likewise.
+        odd: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a
+            tag. No part of the content hash.
     """
 
     segment_id: str
@@ -196,12 +198,12 @@ class RunSegment:
 
     @property
     def num_agents(self) -> int:
-        """A."""
+        """The number of agents, A."""
         return len(self.agent_id)
 
     @property
     def num_steps(self) -> int:
-        """T."""
+        """The number of steps, T."""
         return self.position.shape[1]
 
     def replace(self, **changes: Any) -> RunSegment:
@@ -232,7 +234,7 @@ def _feed(digest: Any, value: Any) -> None:
 
 
 def validate(segment: RunSegment) -> RunSegment:
-    """Check the whole schema: dtypes, shapes, ranges, indices, finite numbers.
+    """Check the whole schema: sizes, dtypes, shapes, ranges, indices, finite and plausible numbers.
 
     Returns:
         The segment itself.
@@ -246,10 +248,20 @@ def validate(segment: RunSegment) -> RunSegment:
     return segment
 
 
-def _checks(s: RunSegment) -> Any:
+def _checks(s: RunSegment) -> Iterator[Check]:
     agents, steps = s.num_agents, s.valid.shape[1] if s.valid.ndim == 2 else -1
     yield "segment_id", bool(s.segment_id) and "/" not in s.segment_id, "must be a non-empty name without '/'"
-    yield from size_checks(s)
+    # The counts come before anything that is slow on large arrays.
+    yield "valid", steps <= bounds.MAX_STEPS, f"{steps} steps, at most {bounds.MAX_STEPS}: cut the log"
+    yield "agent_id", agents <= bounds.MAX_AGENTS, f"{agents} agents, at most {bounds.MAX_AGENTS}"
+    states = agents * steps
+    yield "valid", states <= bounds.MAX_STATES, f"{states} states, at most {bounds.MAX_STATES}: cut the log"
+    for name in ("segment_id", "source", "file", "group"):
+        text = getattr(s, name)
+        yield name, len(text) <= bounds.MAX_NAME, f"{len(text)} characters, at most {bounds.MAX_NAME}"
+        yield name, not text or text.isprintable(), "holds characters that can't be printed"
+    points = sum(len(lines.points) for lines in (s.road.lanes, s.road.boundary, s.road.marks))
+    yield "road", points <= bounds.MAX_POINTS, f"{points} map points, at most {bounds.MAX_POINTS}"
     yield "dt", np.isfinite(s.dt) and s.dt > 0, f"must be positive, is {s.dt}"
     yield "valid", s.valid.dtype == np.bool_ and s.valid.shape == (agents, steps), "must be bool [A, T]"
     yield "valid", steps >= 2, f"needs at least 2 steps, has {steps}"
@@ -258,27 +270,28 @@ def _checks(s: RunSegment) -> Any:
     yield from _array("agent_type", s.agent_type, (agents,), np.uint8, len(AgentType))
     yield from _array("size", s.size, (agents, 3), np.float32)
     yield "size", bool((s.size[:, :2] > 0).all()), "length and width must be positive"
-    yield "size", bool((s.size < MAX_SIZE).all()), f"a side of {MAX_SIZE:g} m or more"
+    yield "size", bool((s.size < bounds.MAX_SIZE).all()), f"a side of {bounds.MAX_SIZE:g} m or more"
     yield from _array("position", s.position, (agents, steps, 3), np.float32)
     yield from _array("heading", s.heading, (agents, steps), np.float32)
     yield from _array("velocity", s.velocity, (agents, steps, 2), np.float32)
-    far = np.abs(s.position[..., :2]).max(initial=0)
-    yield "position", far < MAX_COORDINATE, f"{far:.0f} m from the origin: not re-centred"
+    far = largest(s.position[..., :2])
+    yield "position", far < bounds.MAX_COORDINATE, f"{far:.0f} m from the origin: not re-centred"
     yield "ego", 0 <= s.ego < agents, f"index {s.ego} outside the {agents} agents"
     yield "ego", bool(s.valid[s.ego].any()), "the ego is valid at no step"
-    yield from _checks_road(s.road)
+    yield from _road_checks(s.road)
     lights = len(s.signal_lane)
     yield from _array("signal_lane", s.signal_lane, (lights,), np.int32, len(s.road.lane_id))
     yield from _array("signal_point", s.signal_point, (lights, 3), np.float32)
     yield from _array("signal_state", s.signal_state, (lights, steps), np.uint8, len(SignalState))
     yield from _array("interest", s.interest, (len(s.interest),), np.int32, agents)
     yield from _array("predict", s.predict, (len(s.predict),), np.int32, agents)
-    yield "origin", s.origin.shape == (3,) and bool(np.isfinite(s.origin).all()), "must be 3 finite numbers"
+    finite = s.origin.dtype == np.float64 and s.origin.shape == (3,) and bool(np.isfinite(s.origin).all())
+    yield "origin", finite, "must be 3 finite numbers, float64"
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
-    yield from value_checks(s)
+    yield from _value_checks(s)
 
 
-def _checks_road(road: RoadMap) -> Any:
+def _road_checks(road: RoadMap) -> Iterator[Check]:
     lanes = len(road.lanes)
     yield "road.lanes", lanes >= 1, "has no lanes"
     for name in ("lanes", "boundary", "marks"):
@@ -286,17 +299,20 @@ def _checks_road(road: RoadMap) -> Any:
     yield "road.lane_id", road.lane_id.shape == (lanes,), "must be [L]"
     yield "road.lane_id", len(np.unique(road.lane_id)) == lanes, "ids are not unique"
     yield from _array("road.lane_type", road.lane_type, (lanes,), np.uint8, len(LaneType))
-    for name in ("speed_limit", "lane_width"):
+    for name, most in (("speed_limit", bounds.MAX_SPEED), ("lane_width", bounds.MAX_WIDTH)):
         array = getattr(road, name)
         yield f"road.{name}", array.shape == (lanes,) and array.dtype == np.float32, "must be float32 [L]"
         yield f"road.{name}", bool((np.isnan(array) | (array > 0)).all()), "must be positive or NaN"
+        yield f"road.{name}", not (array > most).any(), f"more than {most:g}"
     for name in ("successors", "left_neighbors", "right_neighbors"):
         array = getattr(road, name)
         yield from _array(f"road.{name}", array, (len(array), 2), np.int32, lanes)
     yield from _array("road.mark_type", road.mark_type, (len(road.marks),), np.uint8, len(MarkType))
+    length = sum(line_lengths(lines).sum() for lines in (road.lanes, road.boundary, road.marks))
+    yield "road", length <= bounds.MAX_LENGTH, f"{length:.4g} m of lines, at most {bounds.MAX_LENGTH:g}"
 
 
-def _polylines(name: str, lines: Polylines, least: int) -> Any:
+def _polylines(name: str, lines: Polylines, least: int) -> Iterator[Check]:
     ends = lines.offsets[0] == 0 and lines.offsets[-1] == len(lines.points)
     # Compared, not subtracted: differences of damaged offsets can overflow and look like counts.
     ordered = bool((lines.offsets[1:] >= lines.offsets[:-1]).all())
@@ -304,21 +320,59 @@ def _polylines(name: str, lines: Polylines, least: int) -> Any:
     short = np.flatnonzero(np.diff(lines.offsets) < least)
     yield name, len(short) == 0, f"line {short[:1]} has fewer than {least} points"
     yield from _array(name, lines.points, (len(lines.points), 3), np.float32)
+    far, height = largest(lines.points[:, :2]), largest(lines.points[:, 2])
+    message = f"{far:.4g} m from the origin, at most {bounds.MAX_COORDINATE:g}"
+    yield name, far <= bounds.MAX_COORDINATE, message
+    yield name, height <= bounds.MAX_HEIGHT, f"a height of {height:.4g} m, at most {bounds.MAX_HEIGHT:g}"
 
 
 def _array(
     name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: Any, below: int | None = None
-) -> Any:
+) -> Iterator[Check]:
     # Names of types are slow to form, and every array of every segment comes through here.
     if array.dtype != dtype:
         yield name, False, f"dtype {array.dtype}, expected {np.dtype(dtype)}"
     if array.shape != shape:
         yield name, False, f"shape {array.shape}, expected {shape}"
-    if below is None:
-        if not np.isfinite(array).all():
-            bad = np.argwhere(~np.isfinite(array))
-            message = f"{len(bad)} numbers that are not finite, first at index {bad[:1].tolist()}"
-            yield name, False, message
-    else:
-        inside = ((array >= 0) & (array < below)).all()
-        yield name, bool(inside), f"values outside 0 … {below - 1}"
+    if below is not None:
+        yield name, bool(((array >= 0) & (array < below)).all()), f"values outside 0 … {below - 1}"
+    elif not np.isfinite(array).all():
+        bad = np.argwhere(~np.isfinite(array))
+        yield name, False, f"{len(bad)} numbers that are not finite, first at index {bad[:1].tolist()}"
+
+
+def _value_checks(s: RunSegment) -> Iterator[Check]:
+    """What is plausible, once shapes and dtypes are right and numbers finite."""
+    least, most = bounds.MIN_DT, bounds.MAX_DT
+    yield "dt", least <= s.dt <= most, f"{s.dt:g} s, expected {least:g} to {most:g}"
+    small = bool((s.size[:, :2] < bounds.MIN_SIZE).any())
+    yield "size", not small, f"a side of less than {bounds.MIN_SIZE:g} m"
+    yield "size", bool((s.size[:, 2] >= 0).all()), "a height below 0"
+    for name, found, most, unit in (
+        ("velocity", largest(s.velocity), bounds.MAX_SPEED, "m/s"),
+        ("heading", largest(s.heading), bounds.MAX_HEADING, "rad"),
+        ("position", float(jumps(s).max(initial=0)), bounds.MAX_JUMP, "m in a step"),
+        ("position", largest(s.position[..., 2]), bounds.MAX_HEIGHT, "m of height"),
+        ("signal_point", largest(s.signal_point), bounds.MAX_COORDINATE, "m from the origin"),
+        ("origin", largest(s.origin), bounds.MAX_ORIGIN, "m"),
+    ):
+        yield name, found <= most, f"{found:.4g} {unit}, at most {most:g} is plausible"
+
+
+def jumps(s: RunSegment) -> NDArray[np.float64]:
+    """[A, T - 1] metres from each step to the next, 0 where an agent is not valid at both."""
+    way = np.hypot(*np.moveaxis(np.diff(s.position[..., :2].astype(np.float64), axis=1), -1, 0))
+    return np.where(s.valid[:, 1:] & s.valid[:, :-1], way, 0.0)
+
+
+def line_lengths(lines: Polylines) -> NDArray[np.float64]:
+    """[K] metres of each line."""
+    sides = np.hypot(*np.diff(lines.points[:, :2].astype(np.float64), axis=0).T)
+    owner = lines.line_index
+    within = owner[1:] == owner[:-1]
+    return np.asarray(np.bincount(owner[1:][within], sides[within], minlength=len(lines)), np.float64)
+
+
+def largest(array: NDArray[Any]) -> float:
+    """The largest magnitude; 0 of no numbers."""
+    return float(np.abs(array).max(initial=0))

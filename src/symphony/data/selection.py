@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.context import Context, relations
-from symphony.data.segment import AgentType, Polylines, RunSegment
+from symphony.data.segment import AgentType, RunSegment, line_lengths
 from symphony.errors import DataError
 
 MAX_PLAYBACK_AGENTS = 256
@@ -42,20 +42,13 @@ def travel(segment: RunSegment) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class InteractiveChoice:
-    """The agents that are simulated, and why.
-
-    Attributes:
-        agents: [count] agent indices: the ego, its partner, the rest.
-        context: what made the second the ego's partner; None if the ego is alone.
-    """
+    """The agents [count] that are simulated (the ego, its partner, the rest), and why the partner was chosen."""
 
     agents: NDArray[np.int64]
     context: Context | None
 
 
-def interactive_choice(
-    segment: RunSegment, count: int, *, moving: float = MOVING, fewer: bool = False
-) -> InteractiveChoice:
+def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) -> InteractiveChoice:
     """Pick the agents that are simulated.
 
     First the ego. Then one partner, chosen by context: the nearest of the agents the source marks as interacting,
@@ -65,21 +58,13 @@ def interactive_choice(
     step, and agents seen at every step (which can be compared with the log throughout) go before the others, whatever
     their context.
 
-    Args:
-        segment: the segment.
-        count: how many, N_I (2 or 8 in the paper).
-        moving: metres of :func:`travel` past which an agent moves.
-        fewer: take those that there are, if they are not as many.
-
-    Raises:
-        DataError: there are not as many, or no ego.
+    Raises a :class:`DataError` if there is no ego, or there are not as many (N_I, 2 or 8 in the paper); ``fewer``
+    takes those that there are.
     """
-    if count < 1:
-        raise ValueError(f"count must be positive, is {count}")
     seen = segment.valid[:, 0] & (segment.agent_type == AgentType.VEHICLE)
     others = seen & (np.arange(segment.num_agents) != segment.ego)
     order = _nearest_first(segment)
-    others, moves = order[others[order]], order[(others & (travel(segment) > moving))[order]]
+    others, moves = order[others[order]], order[(others & (travel(segment) > MOVING))[order]]
     has_ego = bool(segment.valid[segment.ego, 0])
     partner, context = None, None
     if has_ego and count > 1:
@@ -93,9 +78,9 @@ def interactive_choice(
     return InteractiveChoice(np.asarray(chosen[:count], np.int64), context)
 
 
-def interactive_agents(segment: RunSegment, count: int, *, moving: float = MOVING) -> NDArray[np.int64]:
+def interactive_agents(segment: RunSegment, count: int) -> NDArray[np.int64]:
     """[count] the agents of :func:`interactive_choice`, the ego first."""
-    return interactive_choice(segment, count, moving=moving).agents
+    return interactive_choice(segment, count).agents
 
 
 def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
@@ -110,11 +95,10 @@ def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
     for segment in segments:
         try:
             choice = interactive_choice(segment, count)
+            agents = segment.agent_id[choice.agents].tolist()
+            found[segment.segment_id] = {"context": choice.context, "agents": agents}
         except DataError:
             too_few += 1
-            continue
-        agents = segment.agent_id[choice.agents].tolist()
-        found[segment.segment_id] = {"context": choice.context, "agents": agents}
     counts = Counter(each["context"] for each in found.values())
     contexts = {str(context): counts[context] for context in Context if counts[context]}
     return {"count": count, "contexts": contexts, "too_few": too_few, "segments": found}
@@ -161,31 +145,15 @@ def road_points(segment: RunSegment) -> int:
 
     Raw logs differ in density (WOMD: 0.5 m), so the paper's limit is applied to this number.
     """
-    road = segment.road
-    return sum(_resampled_points(lines) for lines in (road.lanes, road.boundary, road.marks))
-
-
-def _resampled_points(lines: Polylines) -> int:
-    if len(lines.points) == 0:
-        return 0
-    sides = np.linalg.norm(np.diff(lines.points[:, :2].astype(np.float64), axis=0), axis=-1)
-    index = lines.line_index
-    within = index[1:] == index[:-1]
-    length = np.bincount(index[1:][within], sides[within], minlength=len(lines))
-    return int((np.ceil(length / POINT_SPACING) + 1).sum())
+    lines = (segment.road.lanes, segment.road.boundary, segment.road.marks)
+    return sum(int((np.ceil(line_lengths(each) / POINT_SPACING) + 1).sum()) for each in lines)
 
 
 def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
-    """Whether the paper leaves a segment out.
+    """The first of the paper's :data:`EXCLUSIONS` that applies to a segment and an error that says why; None if none.
 
-    Args:
-        segment: the segment.
-        count: interactive agents it must have at its first step.
-
-    Returns:
-        None, or the first of the paper's :data:`EXCLUSIONS` that applies and an error that says why: more than 256
-        playback agents (those seen at some step), more than 10 000 roadgraph points (see :func:`road_points`), or
-        too few interactive agents.
+    Playback agents are those seen at some step but for the ``count`` interactive ones that a segment must have at its
+    first step; for roadgraph points see :func:`road_points`.
     """
     where = {"file": segment.file or None, "segment": segment.segment_id}
     playback = int(segment.valid.any(1).sum()) - count
@@ -204,11 +172,7 @@ def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
 
 
 def usable(segment: RunSegment, count: int) -> None:
-    """Apply the paper's exclusions (see :func:`exclusion`).
-
-    Raises:
-        DataError: one of them applies.
-    """
+    """Raise the :class:`DataError` of :func:`exclusion`, if there is one."""
     found = exclusion(segment, count)
     if found is not None:
         raise found[1]

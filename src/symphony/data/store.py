@@ -7,7 +7,7 @@ import json
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, SupportsIndex, cast, overload
 
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from symphony.data import store_format as layout
 from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
-from symphony.data.store_format import MAPS, SEGMENTS
-from symphony.data.store_index import decoded, read_ids, read_indices, rows
+from symphony.data.store_format import MAPS, SEGMENTS, decoded, read_ids, read_indices, rows
 from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
@@ -32,30 +31,23 @@ class SegmentStore(Sequence[RunSegment]):
     time a process reads a segment, its content and its map's are compared with the hash that was written with it,
     and checked against the schema.
 
-    Args:
-        path: the store's directory.
-        check: whether to look at what is read for the first time.
-
     Raises:
         DataError: not a store, of another version, or a file is missing, truncated or damaged.
     """
 
-    def __init__(self, path: str | Path, *, check: bool = True) -> None:
+    def __init__(self, path: str | Path) -> None:
         self.path = Path(path).absolute()
         layout.check_header(self.path)
         self._segments, self._maps = read_indices(self.path)
-        longer = [
-            layout.check_columns(self.path, table, records)
-            for table, records in ((SEGMENTS, self._segments), (MAPS, self._maps))
-        ]
-        if any(longer):
+        more = layout.check_columns(self.path, SEGMENTS, self._segments)
+        if layout.check_columns(self.path, MAPS, self._maps) or more:
             layout.check_whole(self.path, len(self._segments))
-        self.check, self._unseen = check, np.full(len(self._segments), check)
+        self._unseen = np.ones(len(self._segments), np.bool_)
         self._columns = layout.map_columns(self.path, SEGMENTS, self._segments)
         self._road_columns = layout.map_columns(self.path, MAPS, self._maps)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return partial(SegmentStore, check=self.check), (str(self.path),)
+        return SegmentStore, (str(self.path),)
 
     def __len__(self) -> int:
         return len(self._segments)
@@ -102,10 +94,8 @@ class SegmentStore(Sequence[RunSegment]):
             raise DataError("content does not match its hash: the store was damaged", file=self.path)
         try:
             validate(segment)
-        except DataError as error:
-            raise DataError(
-                error.message, file=self.path, segment=error.segment, field=error.field
-            ) from error
+        except DataError as error:  # names the log it was read from
+            raise DataError(error.message, file=self.path, field=error.field) from error
 
     def _name(self, row: int) -> str:
         try:
@@ -165,11 +155,7 @@ class SegmentStore(Sequence[RunSegment]):
         return {name: i for i, name in enumerate(self.ids)}
 
     def index_of(self, segment_id: str | int) -> int:
-        """Index of a segment by its id, or by its number, which it is.
-
-        Raises:
-            DataError: there is none of that name or number.
-        """
+        """Index of a segment by its id, or by its number, which it is; a :class:`DataError` if there is none."""
         if isinstance(segment_id, int):
             if not 0 <= segment_id < len(self):
                 held = f"the store holds {len(self)} segments, the first is number 0"
@@ -188,13 +174,12 @@ class SegmentStore(Sequence[RunSegment]):
         try:
             found = json.loads(self._text("tags", row) or "{}")
         except (ValueError, RecursionError) as error:
-            raise self._damaged(row, "tags", f"not JSON: {error}") from error
+            raise DataError(
+                f"not JSON: {error}", file=self.path, segment=self._name(row), field="tags"
+            ) from error
         if not isinstance(found, dict):
-            raise self._damaged(row, "tags", "not a JSON object")
+            raise DataError("not a JSON object", file=self.path, segment=self._name(row), field="tags")
         return found
-
-    def _damaged(self, row: int, field: str, message: str) -> DataError:
-        return DataError(message, file=self.path, segment=self._name(row), field=field)
 
     @cached_property
     def groups(self) -> NDArray[np.str_]:
@@ -233,11 +218,7 @@ class SegmentStore(Sequence[RunSegment]):
         )
 
     def check_complete(self) -> None:
-        """Refuse a store that is still being generated, or whose generation was interrupted.
-
-        Raises:
-            DataError: says how many segments there are, of how many.
-        """
+        """Refuse a store that is still being generated, or whose generation was interrupted."""
         if self.unfinished is not None:
             raise DataError(self.unfinished, file=self.path)
 
@@ -256,17 +237,13 @@ class SegmentStore(Sequence[RunSegment]):
     def verify(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Read everything, read before or not, and compare it with the hashes and the schema; the tags must be JSON.
 
-        Args:
-            progress: told how many segments are done, of how many.
-
-        Raises:
-            DataError: naming the first segment that is not what was written, and its field where that is known.
+        A :class:`DataError` names the first segment that is not what was written. ``progress`` is told how many are
+        done, of how many.
         """
         for number, key in enumerate(self._maps["hash"]):
             if content_hash(cast(Any, self.road(number))) != key.tobytes().hex():
-                raise DataError(
-                    f"map {number} does not match its hash: the store was damaged", file=self.path
-                )
+                message = f"map {number} does not match its hash: the store was damaged"
+                raise DataError(message, file=self.path)
         seen: dict[str, int] = {}
         for row, name in enumerate(self.ids):
             if seen.setdefault(name, row) != row:
@@ -300,12 +277,9 @@ class SegmentStore(Sequence[RunSegment]):
         """Counts and ranges over the whole store, as JSON can hold them; reads no agent or map data."""
         segments, maps = self._segments, self._maps
         steps, dt = segments["steps"], segments["dt"]
-        used = segments["map"]
-
-        def per_map(*axes: str) -> NDArray[np.int64]:
-            return sum((maps["count"][:, MAPS.axes[axis]] for axis in axes), np.zeros(len(maps), np.int64))
-
-        points = per_map("lanes.points", "boundary.points", "marks.points")
+        lanes = maps["count"][:, MAPS.axes["lanes"]]
+        axes = [MAPS.axes[f"{name}.points"] for name in ("lanes", "boundary", "marks")]
+        points = maps["count"][:, axes].sum(axis=1)
         return {
             "segments": len(self),
             "agents": int(segments["count"][:, SEGMENTS.axes["agents"]].sum()),
@@ -315,8 +289,8 @@ class SegmentStore(Sequence[RunSegment]):
             "dt": _span(dt),
             "duration": _span((steps - 1) * dt),
             "maps": len(maps),
-            "lanes": _span(per_map("lanes")[used]),
-            "map_points": _span(points[used]),
+            "lanes": _span(lanes[segments["map"]]),
+            "map_points": _span(points[segments["map"]]),
             "bytes": sum(file.stat().st_size for file in self.path.rglob("*") if file.is_file()),
         }
 

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony import files
+from symphony.data.bounds import MAX_AGENTS, MAX_POINTS, MAX_STEPS
 from symphony.errors import DataError
 from symphony.files import locating
 
@@ -155,23 +156,15 @@ def header() -> dict[str, Any]:
 
 
 def check_header(folder: Path) -> None:
-    """Refuse anything but a store of this version.
-
-    Raises:
-        DataError: the folder is missing, not a store, or of another version.
-    """
+    """Refuse what is not a store of this version, with a :class:`DataError`."""
     path = folder / HEADER
     if not folder.name:
         raise DataError("not a segment store: it has no name of its own", file=folder)
     if not path.is_file():
-        if not folder.is_dir():
-            message = "no such directory" if not folder.exists() else "not a directory"
-        else:
-            message = f"not a segment store: it has no {HEADER}"
+        message = "no such directory" if not folder.exists() else "not a directory"
+        message = f"not a segment store: it has no {HEADER}" if folder.is_dir() else message
         if folder.with_name(folder.name + PARTIAL).is_dir():
-            message += (
-                "; there is an unfinished conversion to that name: the command that began it goes on with it"
-            )
+            message += "; there is an unfinished conversion to that name: its command goes on with it"
         raise DataError(message, file=folder)
     found = read_json(path)
     if found.get("format") != FORMAT:
@@ -184,11 +177,7 @@ def check_header(folder: Path) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Parse a JSON object.
-
-    Raises:
-        DataError: unreadable, not JSON, or not an object.
-    """
+    """Parse a JSON object; a :class:`DataError` if it can't be read, or is none."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -209,17 +198,40 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
         draft.replace(path)
 
 
-def read_index(folder: Path, table: Table, limit: int | None = None) -> NDArray[Any]:
-    """The complete records of an index, memory-mapped; a torn last record is not one.
-
-    Args:
-        folder: the store.
-        table: which index.
-        limit: read this many records; there must be as many.
+def read_indices(folder: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Records of the segments, and of the maps they lie on, memory-mapped.
 
     Raises:
-        DataError: the index is missing, too short, or its records do not follow one another.
+        DataError: an index is missing or cut short, or a record contradicts itself or its neighbours.
     """
+    segments = _read_index(folder, SEGMENTS, None)
+    count, axes = segments["count"], SEGMENTS.axes
+    agents, lights, steps = count[:, axes["agents"]], count[:, axes["signals"]], segments["steps"]
+    # Limits first: a product of numbers out of range may wrap around to a right one.
+    sound = (steps >= 2) & (steps <= MAX_STEPS) & (agents <= MAX_AGENTS) & (lights <= MAX_POINTS)
+    sound &= (count[:, axes["states"]] == agents * steps) & (
+        count[:, axes["signal_states"]] == lights * steps
+    )
+    sound &= (segments["ego"] >= 0) & (segments["ego"] < agents) & (segments["map"] >= 0)
+    _check_sound(sound, SEGMENTS, folder)
+    # Maps no segment points at belong to an append that never finished.
+    maps = _read_index(folder, MAPS, limit=int(segments["map"].max(initial=-1)) + 1)
+    lines = [maps["count"][:, MAPS.axes[f"{name}.offsets"]] for name in ("lanes", "boundary", "marks")]
+    sound = np.all([line >= 1 for line in lines], axis=0)
+    for name, line in (("lanes", lines[0]), ("marks", lines[2])):
+        sound &= maps["count"][:, MAPS.axes[name]] == line - 1
+    _check_sound(sound, MAPS, folder)
+    return segments, maps
+
+
+def _check_sound(sound: NDArray[np.bool_], table: Table, folder: Path) -> None:
+    if not sound.all():
+        message = f"record {int(np.argmin(sound))} contradicts itself: the file is damaged"
+        raise DataError(message, file=table.index_path(folder))
+
+
+def _read_index(folder: Path, table: Table, limit: int | None) -> NDArray[Any]:
+    """The complete records of an index; a torn last record is not one. With a limit there must be as many."""
     path = table.index_path(folder)
     if not path.is_file():
         raise DataError("index file is missing", file=path)
@@ -235,6 +247,39 @@ def read_index(folder: Path, table: Table, limit: int | None = None) -> NDArray[
     return records
 
 
+def read_ids(folder: Path, segments: NDArray[Any]) -> list[str]:
+    """Segment ids in the order of the records; a :class:`DataError` names the number of one that is no text."""
+    axis = SEGMENTS.axes["segment_id"]
+    data = (folder / COLUMNS / "segment_id.bin").read_bytes()
+    found = []
+    for begin, count in zip(
+        segments["begin"][:, axis].tolist(), segments["count"][:, axis].tolist(), strict=True
+    ):
+        try:
+            found.append(decoded(data[begin : begin + count], "segment_id"))
+        except DataError as error:
+            raise error.at(file=folder, segment=f"number {len(found)}") from error
+    return found
+
+
+def decoded(data: bytes, field: str) -> str:
+    """Text of a field; a :class:`DataError` if it is not UTF-8."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise DataError(f"damaged: not UTF-8 ({error.reason})", field=field) from error
+
+
+def rows(table: Table, columns: Mapping[str, NDArray[Any]], record: Any) -> dict[str, Any]:
+    """Views of one record's rows of every column."""
+    begin, count = record["begin"].tolist(), record["count"].tolist()
+    found = {}
+    for column in table.columns:
+        axis = table.axes[column.axis]
+        found[column.name] = columns[column.name][begin[axis] : begin[axis] + count[axis]]
+    return found
+
+
 def ends(records: NDArray[Any], table: Table) -> NDArray[np.int64]:
     """[axes] rows in use on each axis."""
     if len(records) == 0:
@@ -243,35 +288,25 @@ def ends(records: NDArray[Any], table: Table) -> NDArray[np.int64]:
 
 
 def check_columns(folder: Path, table: Table, records: NDArray[Any]) -> bool:
-    """See that every column holds what the index says.
+    """See that every column holds what the index says; a :class:`DataError` locates the first that does not.
 
     Returns:
         Whether one holds more: a writer is at work or has died, or the index was cut short.
-
-    Raises:
-        DataError: locating the first column that is missing or too short.
     """
-    rows, more = ends(records, table), False
+    used, more = ends(records, table), False
     for column in table.columns:
         path = table.column_path(folder, column)
-        try:
-            size = path.stat().st_size
-        except OSError as error:
-            raise DataError("column file is missing", file=path, field=column.name) from error
-        need = int(rows[table.axes[column.axis]]) * column.row_bytes
+        if not path.is_file():
+            raise DataError("column file is missing", file=path, field=column.name)
+        size, need = path.stat().st_size, int(used[table.axes[column.axis]]) * column.row_bytes
         if size < need:
-            message = f"column is truncated: {size} of {need} bytes"
-            raise DataError(message, file=path, field=column.name)
+            raise DataError(f"column is truncated: {size} of {need} bytes", file=path, field=column.name)
         more |= size > need
     return more
 
 
 def check_whole(folder: Path, segments: int) -> None:
-    """See that the index holds as many segments as the report has counted.
-
-    Raises:
-        DataError: it holds fewer.
-    """
+    """See that the index holds as many segments as the report has counted, else raise a :class:`DataError`."""
     path = folder / REPORT
     counted = read_json(path).get("converted") if path.exists() else None
     if isinstance(counted, int) and counted > segments:
@@ -286,17 +321,17 @@ def _map(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     if 0 in shape:
         return np.zeros(shape, dtype)
     # Not np.memmap, which asks the disk for every folder on the way to each file, and is slow to slice.
-    rows = np.dtype((dtype, shape[1:]))
+    row = np.dtype((dtype, shape[1:]))
     with path.open("rb") as file:
-        mapped = mmap.mmap(file.fileno(), shape[0] * rows.itemsize, access=mmap.ACCESS_READ)
-    return np.frombuffer(mapped, rows)
+        mapped = mmap.mmap(file.fileno(), shape[0] * row.itemsize, access=mmap.ACCESS_READ)
+    return np.frombuffer(mapped, row)
 
 
 def map_columns(folder: Path, table: Table, records: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Every column, [rows in use, *tail], memory-mapped."""
-    rows = ends(records, table)
+    used = ends(records, table)
     return {
-        c.name: _map(table.column_path(folder, c), c.dtype, (int(rows[table.axes[c.axis]]), *c.tail))
+        c.name: _map(table.column_path(folder, c), c.dtype, (int(used[table.axes[c.axis]]), *c.tail))
         for c in table.columns
     }
 
@@ -323,18 +358,12 @@ class TableWriter:
         self.trim()
 
     def append(self, values: Mapping[str, NDArray[Any]], digest: bytes, **scalars: Any) -> int:
-        """Write one record.
+        """Write one record and return its number.
 
         Args:
             values: rows of every column; leading dimensions are flattened.
             digest: SHA-256 of the content.
             scalars: the table's scalars.
-
-        Returns:
-            Its number.
-
-        Raises:
-            DataError: a dtype the column does not have.
         """
         record = np.zeros(1, self.table.record)
         counts = np.full(len(self.table.axes), -1)
@@ -343,10 +372,10 @@ class TableWriter:
             if array.dtype != np.dtype(column.dtype):
                 message = f"dtype {array.dtype}, expected {np.dtype(column.dtype)}"
                 raise DataError(message, field=column.name)
-            rows = array.size // int(np.prod(column.tail, dtype=int))
-            if counts[axis] not in {-1, rows}:
-                raise DataError(f"{rows} rows, expected {counts[axis]}", field=column.name)
-            counts[axis] = rows
+            size = array.size // int(np.prod(column.tail, dtype=int))
+            if counts[axis] not in {-1, size}:
+                raise DataError(f"{size} rows, expected {counts[axis]}", field=column.name)
+            counts[axis] = size
         number, end = self._state
         for column in self.table.columns:
             begin = int(end[self.table.axes[column.axis]])
@@ -370,8 +399,7 @@ class TableWriter:
         number, end = self._state
         self._index.truncate(number * self.table.record.itemsize)
         for column in self.table.columns:
-            rows = int(end[self.table.axes[column.axis]])
-            self._files[column.name].truncate(rows * column.row_bytes)
+            self._files[column.name].truncate(int(end[self.table.axes[column.axis]]) * column.row_bytes)
 
     def sync(self) -> None:
         """Bring everything to the disk, columns before the index."""
@@ -388,11 +416,7 @@ class TableWriter:
 
 
 def lock(folder: Path) -> files.Lock:
-    """Keep other writers out of a folder until what is returned is closed.
-
-    Raises:
-        DataError: another process is in there.
-    """
+    """Keep other writers out of a folder until this is closed; a :class:`DataError` if one is in there."""
     return files.Lock(folder / LOCK)
 
 

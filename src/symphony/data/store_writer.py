@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from symphony.data import store_format as layout
 from symphony.data.segment import RoadMap, RunSegment, content_hash, validate
 from symphony.data.store import GROUP, TWICE, SegmentStore
-from symphony.data.store_format import MAPS, SEGMENTS, TableWriter
-from symphony.data.store_index import decoded, read_ids, read_indices
+from symphony.data.store_format import MAPS, SEGMENTS, TableWriter, decoded, read_ids, read_indices
 from symphony.errors import DataError
 from symphony.files import Lock
 
@@ -29,14 +28,12 @@ class StoreWriter:
     Args:
         path: the store's directory; created, or must be empty unless ``append``.
         append: continue an existing store (or start one).
-        keep: take back all segments but the first so many.
 
     Raises:
-        DataError: the directory holds something else, is damaged, of another version, or being written; or it
-            holds fewer segments than are to be kept.
+        DataError: the directory holds something else, is damaged, of another version, or being written.
     """
 
-    def __init__(self, path: str | Path, *, append: bool = False, keep: int | None = None) -> None:
+    def __init__(self, path: str | Path, *, append: bool = False) -> None:
         self.path = Path(path).absolute()
         if self.path.exists() and not self.path.is_dir():
             raise DataError("not a directory", file=self.path)
@@ -50,15 +47,15 @@ class StoreWriter:
         self.path.mkdir(parents=True, exist_ok=True)
         self._lock: Lock | None = layout.lock(self.path)
         try:
-            self._open(fresh, keep)
+            self._open(fresh)
         except BaseException:
             self._lock.close()
             raise
 
-    def _open(self, fresh: bool, keep: int | None) -> None:
+    def _open(self, fresh: bool) -> None:
         if fresh:
             _create(self.path)
-        segments, maps = read_indices(self.path, keep)
+        segments, maps = read_indices(self.path)
         for table, records in ((SEGMENTS, segments), (MAPS, maps)):
             layout.check_columns(self.path, table, records)
         self._ids = {name: k for k, name in enumerate(read_ids(self.path, segments))}
@@ -101,8 +98,6 @@ class StoreWriter:
             raise error.at(file=segment.file or None, segment=segment.segment_id) from error
 
     def _append(self, segment: RunSegment, tags: str) -> int:
-        if segment.origin.dtype != np.float64:
-            raise DataError(f"dtype {segment.origin.dtype}, expected float64", field="origin")
         key = bytes.fromhex(content_hash(cast(Any, segment.road)))
         road = self._road(key, lambda: _road_values(segment.road))
         values = {c.name: getattr(segment, c.name) for c in SEGMENTS.columns if c.name != "tags"}
@@ -129,11 +124,7 @@ class StoreWriter:
     def copy(self, store: SegmentStore, index: int) -> int:
         """Add a segment of another store, tags included; many times faster than reading and appending it.
 
-        Returns:
-            Its index.
-
-        Raises:
-            DataError: one of that name is there already.
+        Returns its index, or raises a :class:`DataError` where one of that name is there already.
         """
         self._check_open()
         name, record, values, road = store.raw(index)
@@ -149,11 +140,6 @@ class StoreWriter:
     def _check_open(self) -> None:
         if self._lock is None:
             raise ValueError("the writer is closed")
-
-    def sync(self) -> None:
-        """Bring everything to the disk."""
-        self._maps.sync()
-        self._segments.sync()
 
     def write_report(self, report: Mapping[str, Any]) -> None:
         """Replace the conversion report kept with the store."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from symphony import keys
@@ -16,10 +17,15 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import Objects, everyone_at
-from symphony.envs.observation import Observation, ObservationConfig, observe_states
+from symphony.envs.observation import (
+    Observation,
+    ObservationConfig,
+    observation_spec,
+    observe_states,
+    rows_of,
+)
 from symphony.envs.routes import route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
-from symphony.envs.specs import make_specs
 from symphony.envs.tables import Tables
 from symphony.envs.traffic import entering
 from symphony.errors import ConfigError
@@ -148,7 +154,7 @@ class DrivingEnv(EnvBase):
 
     @property
     def scenes(self) -> SceneBatch:
-        """Those at hand.
+        """The scenes at hand.
 
         Raises:
             ConfigError: before the first reset of an environment that draws from a source.
@@ -166,20 +172,57 @@ class DrivingEnv(EnvBase):
         self.decisions = int(scenes.last_step.max())
         """Actions until the last logged step of the longest scene."""
         before, drawn_open = self.open_traffic, self.source is not None and self.source.open_traffic
-        self.open_traffic = drawn_open or scenes.exits.shape[1] + scenes.hull.shape[1] > 0
+        self.open_traffic = drawn_open or scenes.open_traffic
         """Whether agents enter and leave."""
         if self.open_traffic != before:
             self._make_specs()
 
     def _make_specs(self) -> None:
         self._tables: Tables | None = None
-        specs = make_specs(self.observation, self.dynamics, self.num_agents, self.open_traffic, self.device)
-        self.observation_spec, self.state_spec, self.action_spec = (
-            specs.observation,
-            specs.state,
-            specs.action,
+        agents, device = self.num_agents, self.device
+
+        def flags(*shape: int) -> Binary:
+            return Binary(shape=shape, dtype=torch.bool, device=device)
+
+        def floats(*shape: int) -> Unbounded:
+            return Unbounded(shape=shape, device=device)
+
+        def numbers(*shape: int) -> Unbounded:
+            return Unbounded(shape=shape, dtype=torch.int64, device=device)
+
+        def state() -> dict[str, Any]:
+            parts = {
+                "valid": flags(agents),
+                "state": floats(agents, 4),
+                "goal": numbers(agents),
+                "progress": floats(agents),
+            }
+            if self.open_traffic:
+                parts["waiting"] = flags(agents)
+            return parts | {"persona": floats(agents, 2)} if self.observation.persona else parts
+
+        def of_agents(entries: dict[str, Any]) -> Composite:
+            return Composite(entries, shape=(agents,))
+
+        seen = observation_spec(self.observation, agents, device)
+        observed = {} if seen.is_empty() else {"observation": seen}
+        outcome = {"collision": flags(agents, 1), "offroad": flags(agents, 1)}
+        self.state_spec = Composite(
+            scene=numbers(1), step=numbers(1), stream=numbers(1), agents=of_agents(state())
         )
-        self.reward_spec, self.done_spec = specs.reward, specs.done
+        self.observation_spec = Composite(
+            scene=numbers(1),
+            step=numbers(1),
+            stream=numbers(1),
+            segment=numbers(1),
+            agents=of_agents({**state(), **observed, **outcome}),
+        )
+        action: Categorical | Unbounded = floats(agents, 2)
+        if self.dynamics.discrete:
+            action = Categorical(self.dynamics.num_actions, shape=(agents,), dtype=torch.int64, device=device)
+        self.action_spec = Composite(agents=of_agents({"action": action}))
+        self.reward_spec = Composite(agents=of_agents({"reward": floats(agents, 1)}))
+        self.done_spec = Composite(done=flags(1), terminated=flags(1), truncated=flags(1))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
@@ -200,9 +243,7 @@ class DrivingEnv(EnvBase):
         For few agents a step is mostly calls of small operators, which is what this saves; of many it compares each
         with every point of the map, and loses. Copies of the environment are not compiled.
 
-        Args:
-            args: of :func:`torch.compile`, whose default backend needs a C++ compiler.
-            kwargs: likewise.
+        Arguments are those of :func:`torch.compile`, whose default backend needs a C++ compiler.
         """
         step = torch.compile(type(self)._step.__get__(self), *args, **kwargs)
         self._step = step  # type: ignore[method-assign]
@@ -232,7 +273,7 @@ class DrivingEnv(EnvBase):
         waiting = real & ~early if self.open_traffic else None
         first = self._logged_state(scene)
         if self.observation.persona and persona is None:
-            persona = _rows(self.scenes.persona, scene, self.scenes.interactive[scene])
+            persona = self.scenes.persona[scene[..., None], self.scenes.interactive[scene]]
         begin, progress = torch.zeros_like(scene), torch.zeros_like(first[..., 0])
         none = torch.full_like(real, -1, dtype=torch.int64)
         start = State(scene, begin, stream, first, real & early, none, progress, waiting, persona)
@@ -308,7 +349,7 @@ class DrivingEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         now = self._read(tensordict)
         index = _of(self.scenes.interactive, now.scene)
-        size = _rows(self.scenes.box_size, now.scene, index)
+        size = self.scenes.box_size[now.scene[..., None], index]
         after = self._moved(tensordict, now.state, size)
         after = torch.where(now.valid[..., None], after, now.state)
         valid, waiting = now.valid, now.waiting
@@ -364,15 +405,8 @@ class DrivingEnv(EnvBase):
         state: Float[Tensor, "M N 4"],
         valid: Bool[Tensor, "M N"],
     ) -> Objects:
-        """Everyone at a step: driven agents in their states, and all others as logged.
-
-        Args:
-            row: of the scene batch.
-            step: logged step.
-            state: x, y, heading, speed of the driven agents.
-            valid: which of them are there.
-        """
-        return everyone_at(self.scenes, row, step, state, valid, open_traffic=self.open_traffic)
+        """Everyone at logged steps of scenes ``row``: agents that are ``valid`` in their states, others as logged."""
+        return everyone_at(self.scenes, row, step, state, valid)
 
     def _read(self, tensordict: TensorDictBase) -> State:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
@@ -407,7 +441,6 @@ class DrivingEnv(EnvBase):
             goal=goal.reshape(real.shape) if follows else None,
             progress=progress.reshape(real.shape) if follows else None,
             tables=self._kept(),
-            open_traffic=self.open_traffic,
         )
         collision, offroad = self._flags(row, objects, index, real, seen)
         truncated = at >= self.scenes.last_step[row]
@@ -455,18 +488,13 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()
     def _flags(
-        self,
-        scene: Int[Tensor, " M"],
-        objects: Objects,
-        index: Int[Tensor, "M N"],
-        valid: Bool[Tensor, "M N"],
-        seen: Observation,
+        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor, seen: Observation
     ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
         collision = collision_flags(objects, index) & valid
         if seen.road is not None:
             return collision, (seen.road[..., 0] > 0) & valid
-        position = _rows_of(objects.state, index)[..., :2]
-        height = None if objects.height is None else _rows_of(objects.height, index)
+        position = rows_of(objects.state, index)[..., :2]
+        height = None if objects.height is None else rows_of(objects.height, index)
         return collision, offroad_flags(self.scenes, scene, position, self._kept(), height) & valid
 
     def _kept(self) -> Tables:
@@ -476,20 +504,9 @@ class DrivingEnv(EnvBase):
         return self._tables
 
 
-def _rows_of(values: Float[Tensor, "*b A F"], index: Int[Tensor, "*b N"]) -> Float[Tensor, "*b N F"]:
-    return values.gather(-2, index[..., None].expand(*index.shape, values.shape[-1]))
-
-
 def _of(table: Shaped[Tensor, "B ..."], scene: Int[Tensor, "*b"]) -> Shaped[Tensor, "*_"]:
     """table[scene], which does not compile where a single scene is a number, that is, without dimensions."""
     return table.index_select(0, scene.flatten()).reshape((*scene.shape, *table.shape[1:]))
-
-
-def _rows(
-    table: Float[Tensor, "B A F"], scene: Int[Tensor, "*b"], index: Int[Tensor, "*b N"]
-) -> Float[Tensor, "*b N F"]:
-    """table[scene, index] for scene [...] and index [..., N]."""
-    return table[scene[..., None], index]
 
 
 def _like(mask: Bool[Tensor, "*b 1"], value: Shaped[Tensor, "*_"]) -> Bool[Tensor, "*_"]:

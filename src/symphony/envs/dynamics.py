@@ -19,7 +19,6 @@ from torch import Tensor
 from symphony.errors import ConfigError
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate, wrap
-from symphony.geometry.nearest import first_smallest
 
 WHEELBASE = 0.6
 """Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""
@@ -148,7 +147,7 @@ class Bicycle:
         max_acceleration: m/s^2, the grid is symmetric.
         num_acceleration: size of the acceleration grid (odd, so that 0 is in it, and at least 3).
         max_steering: radians.
-        num_steering: size of the steering grid (likewise).
+        num_steering: size of the steering grid (odd and at least 3, too).
         heading_weight: metres that one radian of heading error counts for in the greedy fit.
         speed_weight: metres that one m/s of speed error counts for in the greedy fit.
         effort: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of
@@ -245,7 +244,7 @@ class Bicycle:
                 + (self.speed_weight * (after[..., 3] - target[..., None, 3])).square()
                 + effort
             )
-            action = first_smallest(error).masked_fill(~known, self.num_actions // 2)
+            action = error.argmin(-1).masked_fill(~known, self.num_actions // 2)
             index = action[..., None, None].expand(*action.shape, 1, 4)
             return action, after.gather(-2, index).squeeze(-2)
 

@@ -19,7 +19,7 @@ from symphony.geometry.boxes import gap_between
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import wrap
 from symphony.geometry.levels import levels_apart
-from symphony.geometry.nearest import nearest, on_host
+from symphony.geometry.nearest import nearest
 
 OBJECT_FEATURES = 8 + AGENT_FEATURES
 _PLACES = 1 << 22
@@ -62,20 +62,32 @@ def objects_at(
         index: their rows among the scene's agents.
         index_valid: which of them are real.
     """
-    steps = scenes.log_state.shape[1]
+    steps, agents = scenes.log_valid.shape[1:]
     row = scene * steps + step.clamp(max=steps - 1)
-    logged = scenes.log_state.flatten(0, 1).index_select(0, row)
-    valid = scenes.log_valid.flatten(0, 1).index_select(0, row)
+    logged, valid, size, kind = (
+        table.index_select(0, place)
+        for table, place in (
+            (scenes.log_state.flatten(0, 1), row),
+            (scenes.log_valid.flatten(0, 1), row),
+            (scenes.box_size, scene),
+            (scenes.agent_type, scene),
+        )
+    )
     valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
-    height = None
-    if scenes.agent_height.shape[1]:
-        height = scenes.agent_height.flatten(0, 1).index_select(0, row)
-        if state is not None and index is not None:
-            wide = index[..., None].expand(*index.shape, 2)
-            height = height.scatter(1, wide, _height(scenes, scene, state.detach()[..., :2], index))
-    if state is not None and index is not None and index_valid is not None:
-        logged, valid = _put(logged, valid, state, index, index_valid)
-    size, kind = (value.index_select(0, scene) for value in (scenes.box_size, scenes.agent_type))
+    has_height = scenes.agent_height.shape[1] > 0
+    height = scenes.agent_height.flatten(0, 1).index_select(0, row) if has_height else None
+    if state is None or index is None or index_valid is None:
+        return Objects(logged, valid, size, kind, height)
+    if height is not None:
+        wide = index[..., None].expand(*index.shape, 2)
+        height = height.scatter(1, wide, _height(scenes, scene, state.detach()[..., :2], index))
+    x, y, heading, speed = state.unbind(-1)
+    simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
+    # Those not there are written to a column past the last one, which is cut off again.
+    column = torch.where(index_valid, index, agents)
+    wide = column[..., None].expand(*index.shape, 5)
+    logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
+    valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
     return Objects(logged, valid, size, kind, height)
 
 
@@ -85,22 +97,13 @@ def everyone_at(
     step: Int[Tensor, " M"],
     state: Float[Tensor, "M N 4"],
     valid: Bool[Tensor, "M N"],
-    *,
-    open_traffic: bool = False,
 ) -> Objects:
-    """Everyone at a step: interactive agents in their states, and all others as logged.
-
-    Args:
-        scenes: the static part.
-        scene: rows of ``scenes``.
-        step: logged step.
-        state: x, y, heading, speed of the interactive agents.
-        valid: which of them are there.
-        open_traffic: whether agents enter and leave: one that has left, or not entered yet, is not played back.
+    """Everyone at a step: interactive agents in their states where they are ``valid``, all others as logged. In open
+    traffic one that has left, or not entered yet, is not played back.
     """
     index = scenes.interactive.index_select(0, scene)
     found = objects_at(scenes, scene, step, state, index, valid)
-    if not open_traffic:
+    if not scenes.open_traffic:
         return found
     agents = found.valid.shape[1]
     column = torch.where(scenes.interactive_valid[scene] & ~valid, index, agents)
@@ -143,47 +146,6 @@ def rollout_heights(
     return torch.cat(found).unflatten(0, state.shape[:3])
 
 
-def _put(
-    logged: Float[Tensor, "M A 5"],
-    valid: Bool[Tensor, "M A"],
-    state: Float[Tensor, "M N 4"],
-    index: Int[Tensor, "M N"],
-    real: Bool[Tensor, "M N"],
-) -> tuple[Float[Tensor, "M A 5"], Bool[Tensor, "M A"]]:
-    """Simulated agents among the logged ones."""
-    x, y, heading, speed = state.unbind(-1)
-    simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
-    wide = index[..., None].expand(*index.shape, 5)
-    if on_host(state) and bool(real.all()):
-        return logged.scatter(1, wide, simulated), valid.scatter(1, index, True)
-    # Those not there are written to a column past the last one, which is cut off again.
-    agents = logged.shape[1]
-    column = torch.where(real, index, agents)
-    wide = column[..., None].expand_as(wide)
-    return (
-        pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents],
-        pad(valid, (0, 1)).scatter(1, column, True)[:, :agents],
-    )
-
-
-class Seen(NamedTuple):
-    """What agents see of objects; what was not asked for is None.
-
-    Attributes:
-        features: [M, N, O, 15], zero where masked.
-        mask: [M, N, O].
-        gap: [M, N, O] metres between boxes.
-        gap_ahead: [M, N, O, H] likewise at H times ahead.
-        along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
-    """
-
-    features: Tensor | None = None
-    mask: Tensor | None = None
-    gap: Tensor | None = None
-    gap_ahead: Tensor | None = None
-    along: Tensor | None = None
-
-
 def observed_objects(
     tables: Tables,
     scene: Int[Tensor, " M"],
@@ -192,17 +154,10 @@ def observed_objects(
     own: Float[Tensor, "M N 5"],
     own_size: Float[Tensor, "M N 2"],
     routes: RouteWindow | None,
-) -> Seen:
-    """The nearest others, by the distance between centres.
+) -> dict[str, Tensor]:
+    """What agents ``index`` in states ``own`` see of the nearest others, by the distance between centres.
 
-    Args:
-        tables: of the scenes and of what is seen.
-        scene: rows of the scenes.
-        objects: all agents of each row.
-        index: those that observe.
-        own: their states.
-        own_size: length and width of their boxes.
-        routes: what they see of their routes; without, nothing is seen along routes.
+    The result holds the entries of :class:`symphony.envs.observation.Observation` that are asked for.
     """
     config, agents = tables.config, objects.valid.shape[1]
     chosen, mask = _nearest(objects, index, own, config.num_objects)
@@ -212,19 +167,17 @@ def observed_objects(
     # Whoever is not seen may hold anything, and neither its numbers nor their gradient may get through.
     state = objects.state.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
     state = torch.where(mask[..., None], state, 0.0)
-    features = _features(tables, state, row, mask, own)
-    follows, measures = config.along and routes is not None, config.clearance or config.gaps
-    if not follows and not measures:
-        return Seen(features, mask)
+    seen = {"objects": _features(tables, state, row, mask, own), "objects_mask": mask}
     size = objects.size.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
-    along = None
-    if follows and routes is not None:
-        along = along_route(own, own_size, state, size, routes) * mask[..., None]
-    if not measures:
-        return Seen(features, mask, along=along)
-    gap = _gaps(config.foresight, own, own_size, state, size)
-    gap = torch.where(mask[..., None], gap, 0.0)
-    return Seen(features, mask, gap[..., 0], gap[..., 1:] if config.foresight else None, along)
+    if config.along and routes is not None:
+        seen["along"] = along_route(own, own_size, state, size, routes) * mask[..., None]
+    if config.clearance or config.gaps:
+        gap = _gaps(config.foresight, own, own_size, state, size)
+        gap = torch.where(mask[..., None], gap, 0.0)
+        seen["gap"] = gap[..., 0]
+        if config.foresight:
+            seen["gap_ahead"] = gap[..., 1:]
+    return seen
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
-from symphony.envs.objects import OBJECT_FEATURES, Objects, Seen, everyone_at, observed_objects
+from symphony.envs.objects import OBJECT_FEATURES, Objects, everyone_at, observed_objects
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.road import road_distance
 from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, RouteWindow, route_ahead
@@ -21,16 +21,7 @@ from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import POINT_FEATURES, Tables
 from symphony.geometry.boxes import box_corners
 
-__all__ = [
-    "OBJECT_FEATURES",
-    "POINT_FEATURES",
-    "SELF_FEATURES",
-    "Observation",
-    "ObservationConfig",
-    "observe",
-    "observe_states",
-    "road_distance",
-]
+__all__ = ["OBJECT_FEATURES", "POINT_FEATURES"]
 
 SELF_FEATURES = 4
 
@@ -95,10 +86,10 @@ class Observation(NamedTuple):
         objects_mask: [M, N, O].
         points: [M, N, P, 23].
         points_mask: [M, N, P].
-        lights: [M, N, L, 23] likewise.
+        lights: [M, N, L, 23] the nearest lights, with the features of points.
         lights_mask: [M, N, L].
         gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked.
-        gap_ahead: [M, N, O, H] likewise at H times ahead.
+        gap_ahead: [M, N, O, H] the gaps at H times ahead.
         road: [M, N, 5] metres of centre and corners off the road, negative on it.
         route: [M, N, Fr], see :func:`symphony.envs.routes.route_ahead`.
         along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
@@ -120,29 +111,25 @@ class Observation(NamedTuple):
 
 def observation_spec(config: ObservationConfig, agents: int, device: torch.device | None = None) -> Composite:
     """Shapes of what each of N agents observes, under the names of :class:`Observation`."""
-    widths: dict[str, tuple[int, ...]] = {}
-    if config.own:
-        widths["own"] = (SELF_FEATURES,)
-    if config.num_objects:
-        widths["objects"] = (config.num_objects, OBJECT_FEATURES)
-    if config.num_points:
-        widths["points"] = (config.num_points, POINT_FEATURES)
-    if config.num_lights:
-        widths["lights"] = (config.num_lights, POINT_FEATURES)
-    masks = {f"{name}_mask": width[:1] for name, width in widths.items() if len(width) > 1}
-    if config.route:
-        widths["route"] = (ROUTE_FEATURES,)
-    if config.clearance:
-        widths["road"] = (5,)
-    if config.num_objects and (config.clearance or config.gaps):
-        widths["gap"] = (config.num_objects,)
-        if config.foresight:
-            widths["gap_ahead"] = (config.num_objects, len(config.foresight))
-    if config.num_objects and config.along:
-        widths["along"] = (config.num_objects, ALONG_FEATURES)
-    numbers = {name: Unbounded(shape=(agents, *width), device=device) for name, width in widths.items()}
+    others, ahead = config.num_objects, len(config.foresight)
+    measures = others and (config.clearance or config.gaps)
+    widths: dict[str, tuple[int, ...]] = {
+        "own": (SELF_FEATURES,) if config.own else (),
+        "objects": (others, OBJECT_FEATURES) if others else (),
+        "points": (config.num_points, POINT_FEATURES) if config.num_points else (),
+        "lights": (config.num_lights, POINT_FEATURES) if config.num_lights else (),
+        "route": (ROUTE_FEATURES,) if config.route else (),
+        "road": (5,) if config.clearance else (),
+        "gap": (others,) if measures else (),
+        "gap_ahead": (others, ahead) if measures and ahead else (),
+        "along": (others, ALONG_FEATURES) if others and config.along else (),
+    }
+    asked = {name: width for name, width in widths.items() if width}
+    numbers = {name: Unbounded(shape=(agents, *width), device=device) for name, width in asked.items()}
     flags = {
-        name: Binary(shape=(agents, *width), dtype=torch.bool, device=device) for name, width in masks.items()
+        f"{name}_mask": Binary(shape=(agents, asked[name][0]), dtype=torch.bool, device=device)
+        for name in ("objects", "points", "lights")
+        if name in asked
     }
     return Composite({**numbers, **flags}, shape=(agents,))
 
@@ -175,53 +162,33 @@ def observe(
     if config.blind and not config.route:
         return Observation()
     tables = Tables(scenes, config) if tables is None else tables
-    own = _take(objects.state, index)
-    own_size = _take(objects.size, index)
+    own, own_size = rows_of(objects.state, index), rows_of(objects.size, index)
+    height = None if objects.height is None else rows_of(objects.height, index)
     origin, heading = own[..., :2], own[..., 2]
     turn = -heading
     speed = turn.cos() * own[..., 3] - turn.sin() * own[..., 4]
-    height = None if objects.height is None else _take(objects.height, index)
-    features, points, points_mask, road, route = None, None, None, None, None
-    lights, lights_mask = None, None
+    seen: dict[str, Tensor] = {}
     if config.own:
-        ends = (step >= scenes.last_step[scene]).to(own.dtype)
-        features = torch.cat(
-            [
-                (speed / config.speed_scale)[..., None],
-                own_size / config.size_scale,
-                ends[:, None, None].expand(*index.shape, 1),
-            ],
-            -1,
+        ends = (step >= scenes.last_step[scene]).to(own.dtype)[:, None, None].expand(*index.shape, 1)
+        seen["own"] = torch.cat(
+            [(speed / config.speed_scale)[..., None], own_size / config.size_scale, ends], -1
         )
-    seen = Seen()
     if config.num_objects:
-        seen = observed_objects(tables, scene, objects, index, own, own_size, routes)
+        seen |= observed_objects(tables, scene, objects, index, own, own_size, routes)
+    pose = origin, heading, speed, height
     if config.num_points:
-        points, points_mask = observed_points(tables, scene, step, origin, heading, speed, height)
+        seen["points"], seen["points_mask"] = observed_points(tables, scene, step, *pose)
     if config.num_lights:
-        lights, lights_mask = observed_lights(tables, scene, step, origin, heading, speed, height)
+        seen["lights"], seen["lights_mask"] = observed_lights(tables, scene, step, *pose)
     if config.route and routes is not None:
-        pose = torch.cat([own[..., :3], speed[..., None]], -1)
-        route = route_ahead(pose, routes, config.distance_scale)
+        state = torch.cat([own[..., :3], speed[..., None]], -1)
+        seen["route"] = route_ahead(state, routes, config.distance_scale)
     if config.clearance:
         queried = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
         of_each = None if height is None else height.repeat_interleave(queried.shape[2], 1)
         road = road_distance(scenes, scene, queried.flatten(1, 2), tables, of_each)
-        road = road.unflatten(1, queried.shape[1:3])
-    return Observation(
-        own=features,
-        objects=seen.features,
-        objects_mask=seen.mask,
-        points=points,
-        points_mask=points_mask,
-        lights=lights,
-        lights_mask=lights_mask,
-        gap=seen.gap,
-        gap_ahead=seen.gap_ahead,
-        road=road,
-        route=route,
-        along=seen.along,
-    )
+        seen["road"] = road.unflatten(1, queried.shape[1:3])
+    return Observation(**seen)
 
 
 def observe_states(
@@ -235,7 +202,6 @@ def observe_states(
     goal: Int[Tensor, "M N"] | None = None,
     progress: Float[Tensor, "M N"] | None = None,
     tables: Tables | None = None,
-    open_traffic: bool = False,
 ) -> tuple[Observation, Objects]:
     """What interactive agents observe in given states, and everyone whom they could see. No environment is needed.
 
@@ -249,9 +215,8 @@ def observe_states(
         goal: routes that they follow, -1 for none; without them nothing of routes is observed.
         progress: metres that they have come along them.
         tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
-        open_traffic: whether agents enter and leave.
     """
-    objects = everyone_at(scenes, scene, step, state, valid, open_traffic=open_traffic)
+    objects = everyone_at(scenes, scene, step, state, valid)
     routes = None
     if goal is not None and progress is not None:
         routes = scenes.routes.of(scene, goal).window(progress)
@@ -259,6 +224,6 @@ def observe_states(
     return observe(scenes, scene, step, objects, index, config, tables, routes), objects
 
 
-def _take(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
+def rows_of(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
     """Each row's values at its own index."""
     return values.gather(1, index[..., None].expand(*index.shape, values.shape[-1]))

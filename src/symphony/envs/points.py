@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
-from symphony.geometry.cells import REPAID
 from symphony.geometry.levels import levels_apart
-from symphony.geometry.nearest import nearest, on_host, smallest
+from symphony.geometry.nearest import nearest, on_host
 
+REPAID = 2
+"""Positions in a cell that repay a list of its points."""
 _DISTANCES = 1 << 16
 """Distances held at a time."""
 
@@ -70,39 +71,32 @@ def nearest_points(
 
     With heights and levels, points on other levels do not (see :func:`symphony.geometry.levels_apart`).
     """
-    x, y = tables.position
-    count, total = tables.config.num_points, x.shape[1]
-    if height is not None and on_host(origin) and total > count:
-        # Cells do not know of levels: where one of the nearest is on another, all are looked at.
-        flat, mask = nearest_points(tables, scene, origin)
-        heights = tables.scenes.point_height.flatten(0, 1)[flat]
-        some = levels_apart(heights, height[:, :, None]).flatten(1).any(1).nonzero().squeeze(-1)
-        for rows in some.split(max(_DISTANCES // (total * origin.shape[1]), 1)):
-            flat[rows], mask[rows] = _of_all(tables, scene[rows], origin[rows], height[rows])
-        return flat, mask
+    count, total = tables.config.num_points, tables.position[0].shape[1]
     if not on_host(origin) or total <= count:
-        return _of_all(tables, scene, origin, height)
-    agents = origin.shape[1]
-    row = scene.repeat_interleave(agents).numpy()
-    here = origin.reshape(-1, 2).numpy()
-    here_x, here_y = np.ascontiguousarray(here[:, 0]), np.ascontiguousarray(here[:, 1])
-    flat = torch.empty(len(row), count, dtype=torch.int64)
-    cells = tables.point_cells
-    cell = cells.locate(row, here_x, here_y)
-    known = cell >= 0
-    known[known] = cells.listed(row[known], cell[known], REPAID)
-    at, rest = np.flatnonzero(known), np.flatnonzero(~known)
-    found = flat.numpy()
-    found[at] = cells.nearest_points(cell[at], here_x[at], here_y[at])
-    _among_all(found, rest, row, here_x, here_y, x.numpy(), y.numpy())
-    flat = flat.view(*origin.shape[:2], count)
-    return flat, _exist(tables, flat)
+        return _among_all(tables, scene, origin, height)
+    row, here = scene.repeat_interleave(origin.shape[1]), origin.reshape(-1, 2)
+    level = None if height is None else height.reshape(-1, 1, 2)
+    x, y = np.ascontiguousarray(here.numpy().T)
+    cell = tables.point_cells.at(row.numpy(), x, y, REPAID)
+    known = np.flatnonzero(cell >= 0)
+    flat = torch.zeros(len(row), count, dtype=torch.int64)
+    flat.numpy()[known] = tables.point_cells.nearest_points(cell[known], x[known], y[known])
+    mask = tables.scenes.point_valid.flatten()[flat]
+    rest = torch.from_numpy(cell < 0)
+    if level is not None:
+        # Cells do not know of levels: where one of the nearest is on another, all are looked at.
+        rest |= levels_apart(tables.scenes.point_height.flatten(0, 1)[flat], level).any(1)
+    for some in rest.nonzero().squeeze(-1).split(max(_DISTANCES // total, 1)):
+        own = None if level is None else level[some]
+        found = _among_all(tables, row[some], here[some, None], own)
+        flat[some], mask[some] = (value.squeeze(1) for value in found)
+    return flat.view(*origin.shape[:2], count), mask.view(*origin.shape[:2], count)
 
 
-def _of_all(
+def _among_all(
     tables: Tables, scene: Int[Tensor, " M"], origin: Float[Tensor, "M N 2"], height: Tensor | None
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
-    """The same, from the distances to all points of a scene."""
+    """What :func:`nearest_points` gives, from the distances to all points of a scene."""
     x, y = tables.position
     squared = (x[scene][:, None] - origin[..., :1]).square() + (y[scene][:, None] - origin[..., 1:]).square()
     if height is not None:
@@ -110,42 +104,6 @@ def _of_all(
         squared = squared.masked_fill(away, torch.inf)
     index, mask = nearest(squared, tables.config.num_points)
     return index + (scene * x.shape[1])[:, None, None], mask
-
-
-def _among_all(
-    flat: np.ndarray,
-    rest: np.ndarray,
-    scene: np.ndarray,
-    here_x: np.ndarray,
-    here_y: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-) -> None:
-    """Write the nearest points of the positions ``rest``, of all points of their scenes."""
-    total, count = x.shape[1], flat.shape[1]
-    block = max(1, min(_DISTANCES // total, len(rest)))
-    everywhere = len(rest) == len(flat)
-    buffers = np.empty((2, block, total), x.dtype)
-    for a in range(0, len(rest), block):
-        rows = rest[a : a + block]
-        squared, across = buffers[:, : len(rows)]
-        np.take(x, scene[rows], axis=0, out=squared, mode="clip")
-        np.take(y, scene[rows], axis=0, out=across, mode="clip")
-        squared -= here_x[rows, None]
-        across -= here_y[rows, None]
-        np.square(squared, out=squared)
-        squared += np.square(across, out=across)
-        # From places in the block to numbers among all points; a remainder would take five times as long.
-        shift = (scene[rows] - np.arange(len(rows))) * total
-        found = smallest(squared, count).reshape(-1, count)
-        found += shift[:, None]
-        flat[slice(a, a + block) if everywhere else rows] = found
-
-
-def _exist(tables: Tables, flat: Int[Tensor, "M N K"]) -> Bool[Tensor, "M N K"]:
-    if tables.enough_points:
-        return torch.ones(flat.shape, dtype=torch.bool)
-    return tables.scenes.point_valid.flatten()[flat]
 
 
 def _features(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import Tables
 from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import on_host
-from symphony.geometry.polylines import NO_BOUNDARY, distance_to, signed_distance
+from symphony.geometry.polylines import distance_to, signed_distance
 
 _PAIRS = 1 << 20
 """Positions times edges that are measured at a time where the nearest is on another level."""
@@ -35,52 +34,35 @@ def road_distance(
     levels do not count (see :func:`symphony.geometry.levels_apart`).
     """
     if height is not None:
-        flat = road_distance(scenes, scene, position, tables)
-        return on_levels(scenes, scene, position, height, flat, tables)
+        return _on_levels(scenes, scene, position, height, tables)
     if tables is not None and on_host(position) and position.numel() and scenes.edge_start.shape[1]:
         return _by_cells(scenes, scene, position, tables)
+    return _among_all(scenes, scene, position, scenes.edge_valid[scene])
+
+
+def _among_all(scenes: SceneBatch, scene: Tensor, position: Tensor, valid: Tensor) -> Float[Tensor, "M K"]:
     return signed_distance(
         position,
         scenes.edge_start[scene],
         scenes.edge_end[scene],
-        scenes.edge_valid[scene],
+        valid,
         scenes.edge_previous[scene],
         scenes.edge_following[scene],
     )
 
 
-def on_levels(
-    scenes: SceneBatch,
-    scene: Int[Tensor, " M"],
-    position: Float[Tensor, "M K 2"],
-    height: Float[Tensor, "M K 2"],
-    flat: Shaped[Tensor, "M K"],
-    tables: Tables | None = None,
-    of: Callable[[Tensor], Tensor] = lambda away: away,
-) -> Shaped[Tensor, "M K"]:
-    """What was made of the distance to the nearest edge, put right where that edge is on another level.
-
-    Args:
-        scenes: the static part.
-        scene: rows of ``scenes``.
-        position: as in :func:`road_distance`.
-        height: of the positions.
-        flat: what was made of the distance.
-        tables: as in :func:`road_distance`.
-        of: what is made of the distance.
-    """
-    row, where, level = (
-        scene.repeat_interleave(position.shape[1]),
-        position.flatten(0, 1),
-        height.flatten(0, 1),
-    )
+def _on_levels(
+    scenes: SceneBatch, scene: Tensor, position: Tensor, height: Tensor, tables: Tables | None
+) -> Float[Tensor, "M K"]:
+    """The distance to the nearest edge, put right where that edge is on another level."""
+    flat = road_distance(scenes, scene, position, tables)
+    row = scene.repeat_interleave(position.shape[1])
+    where, level = position.flatten(0, 1), height.flatten(0, 1)
     wrong = torch.arange(len(row), device=row.device)
-    if on_host(position):
-        wrong = (scenes.edge_height[..., 1] > 0).any(1)[row].nonzero().squeeze(-1)
-        if tables is not None and len(wrong):
-            nearest, inside = _nearest(tables, row[wrong].numpy(), where[wrong].detach().numpy())
-            nearest_height = scenes.edge_height.flatten(0, 1)[torch.from_numpy(nearest)]
-            wrong = wrong[levels_apart(nearest_height, level[wrong]) | ~torch.from_numpy(inside)]
+    if on_host(position) and tables is not None:
+        nearest, inside = _nearest(tables, row.numpy(), where.detach().numpy())
+        apart = levels_apart(scenes.edge_height.flatten(0, 1)[torch.from_numpy(nearest)], level)
+        wrong = wrong[apart | ~torch.from_numpy(inside)]
     if not len(wrong):
         return flat
     parts = []
@@ -88,15 +70,8 @@ def on_levels(
     for some in wrong.split(max(_PAIRS // max(scenes.edge_start.shape[1], 1), 1)):
         line = row[some]
         there = scenes.edge_valid[line] & ~levels_apart(scenes.edge_height[line], level[some, None])
-        ends, links = (
-            (one[line], two[line])
-            for one, two in (
-                (scenes.edge_start, scenes.edge_end),
-                (scenes.edge_previous, scenes.edge_following),
-            )
-        )
-        parts.append(signed_distance(where[some, None], *ends, there, *links).squeeze(1))
-    return flat.flatten().index_copy(0, wrong, of(torch.cat(parts))).view(flat.shape)
+        parts.append(_among_all(scenes, line, where[some, None], there).squeeze(1))
+    return flat.flatten().index_copy(0, wrong, torch.cat(parts)).view(flat.shape)
 
 
 def _nearest(
@@ -104,27 +79,22 @@ def _nearest(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """[R] the edge nearest to each position [R, 2] among those of all scenes, and whether its cell tells."""
     x, y = np.ascontiguousarray(where.T)
-    cells = tables.edge_cells
-    cell = cells.locate(row, x, y)
-    inside = cell >= 0
-    known = slice(None) if inside.all() else inside
-    cells.listed(row[known], cell[known])
-    nearest = np.zeros(len(row), np.int64)
-    if inside.any():
-        nearest[known] = cells.nearest_edge(cell[known], x[known], y[known])
+    cell = tables.edge_cells.at(row, x, y)
+    inside, nearest = cell >= 0, np.zeros(len(row), np.int64)
+    known = np.flatnonzero(inside)
+    if len(known):
+        nearest[known] = tables.edge_cells.nearest_edge(cell[known], x[known], y[known])
     return nearest, inside
 
 
 def _by_cells(scenes: SceneBatch, scene: Tensor, position: Tensor, tables: Tables) -> Float[Tensor, "M K"]:
     flat = position.detach().reshape(-1, 2).numpy()
     nearest, inside = _nearest(tables, np.repeat(scene.numpy(), position.shape[1]), flat)
-    everywhere = bool(inside.all())
     distance = distance_to(
         position.reshape(1, -1, 2), **tables.edges, nearest=torch.from_numpy(nearest)[None]
     ).view(position.shape[:2])
-    if everywhere:
-        return distance  # a map with cells has a boundary
-    distance = torch.where(tables.bounded[scene][:, None], distance, NO_BOUNDARY)
+    if inside.all():
+        return distance
     # Outside of the cells, or of a map that has none: rows that hold such a position, among all edges.
     listed = torch.from_numpy(inside).view(position.shape[:2])
     some = (~listed).any(1).nonzero().squeeze(-1)

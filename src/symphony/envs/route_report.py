@@ -59,7 +59,8 @@ def route_counts(
             found["routes"] += len(lines)
             found["kinked"] += sum(kinked(graph, *pair) for pair in zip(kept, lines, strict=True))
             found["ends_inside"] += sum(
-                _ends(graph, route, line) for route, line in zip(kept, lines, strict=True)
+                not graph.successors[route.lanes[-1]] and ends_inside(graph, line)
+                for route, line in zip(kept, lines, strict=True)
             )
             away = _away(segment, graph, agent, first, lines)
             if len(away):
@@ -82,11 +83,6 @@ def kinked(graph: LaneGraph, route: Route, line: NDArray[np.float64]) -> bool:
         return False
     parts = [part for part in (route.lanes[: route.change], route.lanes[route.change :]) if part]
     return bool(turn > KINK + max(own_sharpest(graph, part) for part in parts))
-
-
-def _ends(graph: LaneGraph, route: Route, line: NDArray[np.float64]) -> bool:
-    """Whether a route stops where the map goes on, for want of a lane that its last one leads to."""
-    return not graph.successors[route.lanes[-1]] and ends_inside(graph, line)
 
 
 def _away(

@@ -22,7 +22,7 @@ from symphony.errors import DataError, DataWarning
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import rotate
 from symphony.geometry.levels import LEVEL
-from symphony.geometry.nearest import first_smallest, on_host
+from symphony.geometry.nearest import on_host
 from symphony.geometry.stations import stations_along
 from symphony.roadgraph import LaneGraph, Route, ground_truth_routes, route_lines, routes, starting_lanes
 from symphony.roadgraph.routes import HORIZON
@@ -264,7 +264,7 @@ class FollowedRoutes(NamedTuple):
             arc = SPACING * place[..., :-1].to(about.dtype)
             near = (arc <= about[..., None] + reach) & (arc + SPACING >= about[..., None] - reach)
             near &= place[..., 1:] < self.length[..., None]
-            which = first_smallest(squared.masked_fill(~near, torch.inf))[..., None]
+            which = squared.masked_fill(~near, torch.inf).argmin(-1, keepdim=True)
             found = (arc + along).gather(-1, which)[..., 0]
             return torch.where(near.any(-1), found, about)
 
@@ -374,7 +374,7 @@ def along_route(
         line = torch.stack([points_x - x[..., :1], points_y - y[..., :1]], -2)
         own_part = line.square().sum(-2).masked_fill(~routes.exists, torch.inf)
         # The agent's own place is where it has come to, which on a route that passes itself is not the nearest one.
-        nearest = first_smallest(own_part[..., None, :] - 2.0 * here[..., 1:, :] @ line)
+        nearest = (own_part[..., None, :] - 2.0 * here[..., 1:, :] @ line).argmin(-1)
         nearest = torch.cat([routes.own[..., None], nearest], -1)
         start = nearest.minimum((count[..., None] - 2).clamp_min(0))
         following = (start + 1).clamp_max(last)

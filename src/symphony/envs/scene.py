@@ -59,14 +59,13 @@ class SceneSource(Protocol):
 
     Attributes:
         interactive: N, interactive agents per scene.
-        open_traffic: whether its scenes say where their maps end.
     """
 
     interactive: int
 
     @property
     def open_traffic(self) -> bool:
-        """As above."""
+        """Whether its scenes say where their maps end."""
         ...
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
@@ -93,7 +92,7 @@ class SceneBatch(TensorClass):
         background: [B, N] agents that a rule drives, which nobody evaluates.
         exits: [B, X, 4] where agents leave the map, see :class:`symphony.envs.edge.MapEdge`; zeros for padding.
             None, nor any hull, where the same agents are driven from the first step to the last.
-        hull: [B, H, 3] outline of the map, likewise.
+        hull: [B, H, 3] outline of the map, see :class:`symphony.envs.edge.MapEdge`.
         last_step: [B] int64, the segment's last logged step.
         point: [B, P, 2].
         point_direction: [B, P, 2] unit vector along the line; for lights from the stop point to where their lane
@@ -156,6 +155,11 @@ class SceneBatch(TensorClass):
     route_first: Tensor
     route_count: Tensor
     route_logged: Tensor
+
+    @property
+    def open_traffic(self) -> bool:
+        """Whether agents enter and leave: where the scenes say where their maps end."""
+        return self.exits.shape[1] + self.hull.shape[1] > 0
 
     @property
     def routes(self) -> Routes:

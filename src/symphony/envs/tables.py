@@ -9,13 +9,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from symphony.data.segment import AgentType, SignalState
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.cells import EdgeCells, PointCells
-from symphony.geometry.edges import Edges
 from symphony.geometry.polylines import has_length
 
 if TYPE_CHECKING:
@@ -84,11 +83,6 @@ class Tables:
         return x.contiguous(), y.contiguous()
 
     @cached_property
-    def enough_points(self) -> bool:
-        """Whether every scene has as many points as are seen (CPU)."""
-        return bool((self.scenes.point_valid.sum(1) >= self.config.num_points).all())
-
-    @cached_property
     def agents(self) -> Float[Tensor, "BA 7"]:
         """[B * A, 7] size and kind of agents as they are seen."""
         scenes = self.scenes
@@ -117,17 +111,6 @@ class Tables:
         }
 
     @cached_property
-    def bounded(self) -> Bool[Tensor, " B"]:
-        """[B] whether a scene has a boundary at all."""
-        return self.edges["valid"].view(self.scenes.edge_valid.shape).any(1)
-
-    @cached_property
-    def segments(self) -> Edges:
-        """The boundary component by component (CPU)."""
-        names = ("start", "end", "valid", "previous", "following")
-        return Edges.of(*(self.edges[name][0].numpy() for name in names))
-
-    @cached_property
     def point_cells(self) -> PointCells:
         """Cells for the nearest points (CPU)."""
         x, y = self.position
@@ -136,5 +119,5 @@ class Tables:
     @cached_property
     def edge_cells(self) -> EdgeCells:
         """Cells for the nearest edge of the road (CPU)."""
-        exists = self.edges["valid"].view(self.scenes.edge_valid.shape).numpy()
-        return EdgeCells(self.segments, exists)
+        start, end, valid, previous, following = (value[0].numpy() for value in self.edges.values())
+        return EdgeCells(start, end, valid.reshape(self.scenes.edge_valid.shape), previous, following)

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
-from symphony.evaluation.evaluator import EvaluatedBatch, Evaluation, evaluate
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.evaluation.evaluator import EvaluatedBatch, Evaluation, evaluate
 
 __all__ = ["EvaluatedBatch", "Evaluation", "evaluate"]
+
+__getattr__, __dir__ = lazily(__name__)

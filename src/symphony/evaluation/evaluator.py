@@ -39,7 +39,7 @@ from symphony.metrics import (
 )
 from symphony.roadgraph import LaneGraph, visited_curvatures
 from symphony.rollouts.crowd import crowd_dataset
-from symphony.rollouts.driving import Simulation, driven_by, search_kind
+from symphony.rollouts.driving import Simulation, simulate_batch
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.unroll import Rollouts, existing
 from symphony.rollouts.workers import batches, naming, segments_together, shared
@@ -186,7 +186,7 @@ def evaluate_dataset(
     hows = [config] + [once] * (len(everyone) - 1)
     horizon = dataset.decisions * dataset.dt
     found = [
-        Evaluation(one.name, RolloutMetrics(), how, acting, search_kind(one, how), horizon=horizon)
+        Evaluation(one.name, RolloutMetrics(), how, acting, one.plan(how).kind, horizon=horizon)
         for one, how in zip(everyone, hows, strict=True)
     ]
     for path in config.metric:
@@ -248,7 +248,7 @@ class _BatchEvaluator:
             for agent, blank in zip(self.agents, self.blank, strict=True):
                 began = time.process_time()
                 try:
-                    found = driven_by(agent, scenes, blank.config)
+                    found = simulate_batch(agent, scenes, blank.config)
                 except NotFiniteError as error:
                     raise error.named(self.dataset.segment(items[error.row]).segment_id) from error
                 seconds = time.process_time() - began

@@ -3,7 +3,7 @@
 The rules follow the sense of nuPlan's at-fault collisions (https://github.com/motional/nuplan-devkit): an agent
 answers for what it drives into, not for being driven into. To these come red lights, lanes that an agent leaves, and
 lane changes in front of others that are too close by RSS (Shalev-Shwartz et al., "On a formal model of safe and
-scalable self-driving cars", 2017, definition 1). ``docs/rollouts.md`` has them in a table.
+scalable self-driving cars", 2017, definition 1). ``docs/metrics.md`` has them in a table.
 
 Metres, radians, seconds. Legend: A agents, U states of a rollout, E contacts, W states of a window.
 """

@@ -114,7 +114,7 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
-    config, used = result.config, result.config.pruning(agent.search)
+    config, used = result.config, agent.plan(result.config).search
     filled = dataclasses.asdict(config) | {
         "search": result.search,
         "score": "discriminator",
@@ -129,7 +129,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "threshold": None,
     }
     if result.search not in ("none", "log"):
-        filled["score"] = config.score
+        filled["score"] = used.score
     if result.search in ("tree", "best"):
         filled["branches"] = used.test_branches
     if result.search == "backtrack":

@@ -1,6 +1,6 @@
 """What happened in saved rollouts: a row for each run, totals with errors over groups of segments.
 
-A run is one rollout of one segment. Percent, metres, seconds; what each number means: ``docs/rollouts.md``.
+A run is one rollout of one segment. Percent, metres, seconds; what each number means: ``docs/metrics.md``.
 """
 
 from __future__ import annotations

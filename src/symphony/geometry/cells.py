@@ -11,22 +11,24 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from threading import Lock
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.geometry.edges import Bools, Edges, Indices, Reals, squared_to
-from symphony.geometry.nearest import kth_smallest, smallest
+from symphony.geometry.nearest import smallest
 from symphony.geometry.spans import spans
+
+Reals = NDArray[np.floating[Any]]
+Indices = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 POINT_CELL = 8.0
 """Metres of a cell's side, for points."""
 EDGE_CELL = 4.0
 """Metres of a cell's side, for the edges of the road."""
-REPAID = 2
-"""Positions in a cell that repay a list of its points."""
 ROWS = 64
 """Positions whose candidates are looked at together, so that they stay in the cache."""
 
@@ -43,20 +45,6 @@ _MANY = 256
 _WORTH = 3
 """Elements of a map for each that is looked for, below which a list saves nothing."""
 _FILLING = Lock()
-
-
-class Lists(NamedTuple):
-    """What can be nearest to a position in each of C cells.
-
-    Attributes:
-        length: [C] elements of each list.
-        items: all lists, one after the other, ascending within each.
-        sign: [C] 1 or -1 where every position of the cell is off or on the road, 0 where it depends on the position.
-    """
-
-    length: Indices
-    items: Indices
-    sign: NDArray[np.int8]
 
 
 class Cells(ABC):
@@ -96,42 +84,40 @@ class Cells(ABC):
         self.first, cells = np.concatenate([[0], ends[:-1]]), int(ends[-1]) if len(ends) else 0
         # Where a cell's list begins; -1 while it has none.
         self.begin, self.count = np.full(cells, -1), np.zeros(cells, np.int64)
-        self.sign, self._asked = np.zeros(cells, np.int8), np.zeros(cells, np.int64)
+        # One more, that is always 0, for positions in no cell, which is number -1.
+        self.sign, self._asked = np.zeros(cells + 1, np.int8), np.zeros(cells, np.int64)
         self.items, self._used = np.zeros(1 << 12, np.int32), 0
 
     @abstractmethod
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
         """Squared metres [C, elements of a map] from centres x and y [C, 1]; infinity where there is no element."""
 
-    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
-        """Lists of cells with the centres x and y [C], as long as ``side`` [C]."""
-        counts, items, step = [], [], max(1, _BLOCK // self.total)
-        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
-        for a in range(0, len(scene), step):
-            rows = slice(a, a + step)
-            squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
-            last = kth_smallest(squared, self.wanted)
-            near = squared <= np.square(np.sqrt(last) + reach[rows])
-            counts.append(np.count_nonzero(near, axis=1))
-            # From places in the block to numbers among all elements.
-            shift = (scene[rows] - np.arange(len(near))) * self.total
-            items.append(np.flatnonzero(near) + np.repeat(shift, counts[-1]))
-        count = np.concatenate(counts)
-        return Lists(count, np.concatenate(items), np.zeros(len(count), np.int8))
+    def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
+        """1 or -1 for cells [C] of which every position is off or on the road, 0 where it depends on the position."""
+        return np.zeros(len(x), np.int8)
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
         """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells.
 
         Args:
             scene: any shape that broadcasts against the positions.
-            x: of the positions.
-            y: likewise.
+            x: metres of the positions.
+            y: metres of the positions.
         """
         per_metre, columns = self.per_metre.take(scene), self.columns.take(scene)
         column = np.floor((x - self.x.take(scene)) * per_metre)
         row = np.floor((y - self.y.take(scene)) * per_metre)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < self.rows.take(scene))
         return np.where(inside, row * columns + column + self.first.take(scene), -1.0).astype(np.int64)
+
+    def at(self, scene: Indices, x: Reals, y: Reals, repaid: int = 1) -> Indices:
+        """What :meth:`locate` gives, and -1 for cells that have no list: those have one that so many positions [R]
+        have been in by now.
+        """
+        cell = self.locate(scene, x, y)
+        inside = np.flatnonzero(cell >= 0)
+        cell[inside[~self.listed(scene[inside], cell[inside], repaid)]] = -1
+        return cell
 
     def listed(self, scene: Indices, cell: Indices, repaid: int = 1) -> Bools:
         """Whether the cells [R] of maps [R] have lists: those do that so many positions have been in by now."""
@@ -143,24 +129,32 @@ class Cells(ABC):
             self._asked[number] += times
             due = (self.begin[number] < 0) & (self._asked[number] >= repaid)
             if due.any():
-                self._write(number[due], self._made(scene[new[place[due]]], number[due]))
+                self._fill(scene[new[place[due]]], number[due])
         return self.begin.take(cell) >= 0
 
-    def _made(self, scene: Indices, number: Indices) -> Lists:
-        column, row = (f(number - self.first[scene], self.columns[scene]) for f in (np.mod, np.floor_divide))
-        side = self.side[scene]
+    def _fill(self, scene: Indices, number: Indices) -> None:
+        """Make the lists of cells [C] of maps [C]."""
+        side, (row, column) = self.side[scene], np.divmod(number - self.first[scene], self.columns[scene])
         x, y = self.x[scene] + (column + 0.5) * side, self.y[scene] + (row + 0.5) * side
-        return self._lists(scene, x, y, side)
-
-    def _write(self, number: Indices, lists: Lists) -> None:
-        end = self._used + len(lists.items)
+        counts, parts, step = [], [], max(1, _BLOCK // self.total)
+        reach = (math.sqrt(2.0) * side + _SLACK).astype(np.float32)[:, None]
+        for a in range(0, len(scene), step):
+            rows = slice(a, a + step)
+            squared = self._squared(scene[rows], *(v[rows, None].astype(np.float32) for v in (x, y)))
+            last = np.partition(squared, self.wanted - 1, axis=1)[:, self.wanted - 1, None]
+            near = squared <= np.square(np.sqrt(last) + reach[rows])
+            counts.append(np.count_nonzero(near, axis=1))
+            # From places in the block to numbers among all elements.
+            shift = (scene[rows] - np.arange(len(near))) * self.total
+            parts.append(np.flatnonzero(near) + np.repeat(shift, counts[-1]))
+        count, items = np.concatenate(counts), np.concatenate(parts)
+        end = self._used + len(items)
         if end > len(self.items):
             # Never shorter than what somebody may be reading.
-            more = np.zeros(2 * end - len(self.items), np.int32)
-            self.items = np.concatenate([self.items, more])
-        self.items[self._used : end] = lists.items
-        self.count[number], self.sign[number] = lists.length, lists.sign
-        self.begin[number] = self._used + lists.length.cumsum() - lists.length
+            self.items = np.concatenate([self.items, np.zeros(2 * end - len(self.items), np.int32)])
+        self.items[self._used : end] = items
+        self.count[number], self.sign[number] = count, self._signs(x, y, count, items, 0.5 * side)
+        self.begin[number] = self._used + count.cumsum() - count
         self._used = end
 
 
@@ -212,50 +206,47 @@ class PointCells(Cells):
 
 
 class EdgeCells(Cells):
-    """Cells for the nearest edge of the road.
+    """Cells for the nearest edge of the road, and the side of it on which whole cells lie.
 
     Args:
-        edges: of all maps.
-        exists: [B, E] which of them there are.
+        start: [B * E, 2] of the directed edges of all maps.
+        end: [B * E, 2].
+        exists: [B, E] which of them there are and have a length.
+        previous: [B * E] number of the edge that ends where this one starts, -1 if none.
+        following: [B * E] number of the edge that starts where this one ends, -1 if none.
     """
 
-    def __init__(self, edges: Edges, exists: Bools) -> None:
-        shape = exists.shape
-        ends = [
-            (v, v + 2 * edges.half * unit) for v, unit in ((edges.x, edges.unit_x), (edges.y, edges.unit_y))
-        ]
+    def __init__(
+        self, start: Reals, end: Reals, exists: Bools, previous: Indices, following: Indices
+    ) -> None:
+        along = end - start
+        length = np.hypot(along[:, 0], along[:, 1])
+        unit = along / np.where(length > 0, length, 1)[:, None]
+        # x and y of the start, those of the direction, and half the length: for one edge side by side, and of all.
+        parts = (start[:, 0], start[:, 1], unit[:, 0], unit[:, 1], 0.5 * length)
+        self.edges = np.stack(parts, dtype=start.dtype, casting="same_kind")
+        self.of_edge = np.ascontiguousarray(self.edges.T)
+        self.exists, there = exists, exists.ravel()
+        self.links = [np.where((link >= 0) & there[link], link, -1) for link in (previous, following)]
         low, high = (
-            np.stack(
-                [bound(of_two(*two).reshape(shape), 1, where=exists, initial=start) for two in ends],
-                -1,
-            )
-            for bound, of_two, start in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
+            bound(of_two(start, end).reshape(*exists.shape, 2), 1, where=exists[..., None], initial=begin)
+            for bound, of_two, begin in ((np.min, np.minimum, np.inf), (np.max, np.maximum, -np.inf))
         )
-        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=shape[1])
-        self.edges, self.exists = edges, exists
+        super().__init__(low, high, np.asarray(exists.any(1)), EDGE_CELL, total=exists.shape[1])
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
-        edges = self.edges
         # Column by column, so that each lies in one piece.
-        columns = [
-            column.reshape(-1, self.total).take(scene, 0)
-            for column in (edges.x, edges.y, edges.unit_x, edges.unit_y, edges.half)
-        ]
-        squared = squared_to(columns, x, y)
+        squared = _squared_to([part.reshape(-1, self.total).take(scene, 0) for part in self.edges], x, y)
         squared[~self.exists[scene]] = np.inf
         return squared
 
-    def _lists(self, scene: Indices, x: Reals, y: Reals, side: Reals) -> Lists:
-        lists = super()._lists(scene, x, y, side)
-        return lists._replace(sign=self._signs(x, y, lists.length, lists.items, 0.5 * side))
-
     def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
-        """1 or -1 for cells [C] on one side of every edge listed and of each neighbour that decides at a corner."""
+        # On one side of every edge listed, and of each neighbour that decides at a corner.
         cell = np.repeat(np.arange(len(x)), count)
         side, before, past = self._sides(x[cell], y[cell], item, half[cell])
         lowest, highest = side.copy(), side.copy()
-        for neighbor, decides in ((self.edges.previous, before), (self.edges.following, past)):
-            other = neighbor[item]
+        for link, decides in zip(self.links, (before, past), strict=True):
+            other = link[item]
             pair = np.flatnonzero(decides & (other >= 0))
             at = cell[pair]
             beside, _, _ = self._sides(x[at], y[at], other[pair], half[at])
@@ -267,14 +258,13 @@ class EdgeCells(Cells):
 
     def _sides(self, x: Reals, y: Reals, edge: Indices, half: Reals) -> tuple[NDArray[np.int8], Bools, Bools]:
         """Side of an edge on which a whole cell lies (0: on both), and whether any of it lies before or past it."""
-        edges = self.edges
-        away_x, away_y = x - edges.x[edge], y - edges.y[edge]
-        unit_x, unit_y = edges.unit_x[edge], edges.unit_y[edge]
+        start_x, start_y, unit_x, unit_y, half_length = self.edges[:, edge]
+        away_x, away_y = x - start_x, y - start_y
         along, across = away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x
         # The normal has the same components as the direction, so the cell spreads as far across as along.
         spread = half * (np.abs(unit_x) + np.abs(unit_y)) + _SLACK
         side = (across > spread).astype(np.int8) - (across < -spread)
-        return side, along < spread, along > 2 * edges.half[edge] - spread
+        return side, along < spread, along > 2 * half_length - spread
 
     def nearest_edge(self, cell: Indices, x: Reals, y: Reals) -> Indices:
         """Number [R] of the edge nearest to each position [R] in a cell that has a list."""
@@ -282,10 +272,27 @@ class EdgeCells(Cells):
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
         candidate = self.items.take(spans(self.begin.take(cell), held))
-        rows = self.edges.rows.take(candidate, axis=0)
-        squared = squared_to(np.moveaxis(rows, -1, 0), np.repeat(x, held), np.repeat(y, held))
+        squared = _squared_to(
+            np.moveaxis(self.of_edge.take(candidate, axis=0), -1, 0), np.repeat(x, held), np.repeat(y, held)
+        )
         hit = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), held))[::-1]
         nearest = candidate[first]
         # Written from the last to the first, so the first of equally near ones stays.
         nearest[np.repeat(np.arange(len(cell)), held)[hit]] = candidate[hit]
         return nearest.astype(np.int64)
+
+
+def _squared_to(edges: Sequence[Reals] | Reals, x: Reals, y: Reals) -> Reals:
+    """Squared metres from positions to edges [5, ...] as :class:`EdgeCells` keeps them."""
+    start_x, start_y, unit_x, unit_y, half = edges
+    away_x, away_y = x - start_x, y - start_y
+    beyond = away_x * unit_x
+    beyond += away_y * unit_y
+    beyond -= half
+    np.abs(beyond, out=beyond)
+    beyond -= half
+    np.maximum(beyond, 0, out=beyond)
+    away_x *= unit_y
+    away_y *= unit_x
+    away_x -= away_y
+    return np.square(beyond, out=beyond) + np.square(away_x, out=away_x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.geometry.nearest import first_smallest, on_host
+from symphony.geometry.nearest import on_host
 
 NO_BOUNDARY = -1e6
 """Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
@@ -157,36 +158,22 @@ def _nearest_segment(
 ) -> Int[Tensor, "B M"]:
     """Index [B, M] of the nearest valid segment."""
     batch, count, _ = points.shape
-    edges = start.shape[1]
-    if batch == 0 or count == 0:
-        return torch.zeros(batch, count, dtype=torch.long, device=points.device)
     # Coordinates relative to a point of the map keep float32 rounding well below a millimetre.
     center = _middle(start, valid)
     x, y = (points - center)[..., None].unbind(2)
-    axes = _segment_axes(start, end, valid, center)
-    width, group = edges, batch
+    axes = _segment_axes(start, end, valid, center)[:, :, None]
+    group, most = batch, count
     if points.device.type == "cpu":
-        width = min(edges, max(1, _BLOCK // count))
-        group = min(batch, max(1, _BLOCK // (count * width)))
-    # Each block of distances is written into the same two buffers: fresh ones would cost page faults.
-    buffers = points.new_empty(2, group * count * width)
+        most = max(1, min(count, _BLOCK // start.shape[1]))
+        group = max(1, _BLOCK // max(most * start.shape[1], 1))
     result = torch.empty(batch, count, dtype=torch.long, device=points.device)
-    for b in range(0, batch, group):
-        rows = slice(b, b + group)
-        best = points.new_full((min(group, batch - b), count), torch.inf)
-        for e in range(0, edges, width):
-            unit_x, unit_y, along, across, half = axes[:, rows, None, e : e + width]
-            shape = len(best), count, unit_x.shape[-1]
-            beyond, side = (buffer[: shape[0] * count * shape[2]].view(shape) for buffer in buffers)
-            torch.addcmul(along, x[rows], unit_x, out=beyond).addcmul_(y[rows], unit_y)
-            beyond.abs_().sub_(half).clamp_(min=0).square_()
-            torch.addcmul(across, x[rows], unit_y, out=side).addcmul_(y[rows], unit_x, value=-1)
-            distance = beyond.addcmul_(side, side)
-            index = first_smallest(distance)
-            smallest = distance.gather(-1, index[..., None])[..., 0]
-            better = smallest < best
-            result[rows] = torch.where(better, index + e, result[rows] if e else index)
-            best = torch.where(better, smallest, best)
+    for b, m in product(range(0, batch, max(group, 1)), range(0, count, max(most, 1))):
+        part = slice(b, b + group), slice(m, m + most)
+        unit_x, unit_y, along, across, half = axes[:, part[0]]
+        beyond = torch.addcmul(along, x[part], unit_x).addcmul_(y[part], unit_y)
+        beyond.abs_().sub_(half).clamp_(min=0).square_()
+        side = torch.addcmul(across, x[part], unit_y).addcmul_(y[part], unit_x, value=-1)
+        result[part] = beyond.addcmul_(side, side).argmin(-1)
     return result
 
 
@@ -209,25 +196,17 @@ def _segment_axes(
     Component by component: operations on a last dimension of 2 are ten times slower.
     """
     # Padding may hold anything, NaN included.
-    zero = start.new_zeros(())
-    x0, y0 = (
-        torch.where(valid, v - c, zero) for v, c in zip(start.unbind(-1), center.unbind(-1), strict=True)
+    (x0, y0), (x1, y1) = (
+        torch.where(valid[..., None], end_point - center, 0.0).unbind(-1) for end_point in (start, end)
     )
-    x1, y1 = (torch.where(valid, v - c, zero) for v, c in zip(end.unbind(-1), center.unbind(-1), strict=True))
-    out = start.new_empty(5, *valid.shape)
-    unit_x, unit_y, along, across, half = out.unbind()
-    torch.sub(x1, x0, out=unit_x)
-    torch.sub(y1, y0, out=unit_y)
-    torch.hypot(unit_x, unit_y, out=half)
-    inverse = torch.where(valid, half, 1.0).reciprocal_()
-    unit_x.mul_(inverse)
-    unit_y.mul_(inverse)
-    half.mul_(0.5)
-    x, y = x0.add_(x1).mul_(-0.5), y0.add_(y1).mul_(-0.5)
-    torch.mul(x, unit_x, out=along).addcmul_(y, unit_y)
-    torch.mul(x, unit_y, out=across).addcmul_(y, unit_x, value=-1)
-    across.masked_fill_(~valid, _FAR)
-    return out
+    unit_x, unit_y = x1 - x0, y1 - y0
+    length = torch.hypot(unit_x, unit_y)
+    inverse = torch.where(valid, length, 1.0).reciprocal()
+    unit_x, unit_y = unit_x * inverse, unit_y * inverse
+    x, y = -0.5 * (x0 + x1), -0.5 * (y0 + y1)
+    along = torch.addcmul(x * unit_x, y, unit_y)
+    across = torch.addcmul(x * unit_y, y, unit_x, value=-1).masked_fill(~valid, _FAR)
+    return torch.stack([unit_x, unit_y, along, across, 0.5 * length])
 
 
 def segments_of(

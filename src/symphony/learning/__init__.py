@@ -1,4 +1,4 @@
-"""What is learned from: demonstrations prepared from logs, and the rollouts of a search."""
+"""Data to learn from: demonstrations prepared from logs, and the rollouts of a search."""
 
 from __future__ import annotations
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -22,17 +25,19 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.routes import RouteWindow, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
-from symphony.errors import DataError
+from symphony.errors import DataError, DataWarning
 from symphony.geometry.frames import with_speed
-from symphony.learning.experts import Experts, fit_experts
-from symphony.learning.kept import KeptExperts
+from symphony.learning.experts import Experts, KeptExperts, fit_experts
 from symphony.learning.logged import expert_batch, logged, logged_routes
-from symphony.learning.memory import ItemCache
 from symphony.roadgraph import LaneGraph
 
 if TYPE_CHECKING:
     from symphony.learning.personas import PersonaScale
 
+T = TypeVar("T")
+
+SHARE = 0.125
+"""Part of the machine's memory that one cache may take; a data set has two."""
 GRAPHS = 64
 """Lane graphs held in memory."""
 DISPLACED = 2.0
@@ -43,6 +48,70 @@ def evenly_spaced(total: int, count: int) -> list[int]:
     """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
     count = min(count, total)
     return [k * total // count for k in range(count)]
+
+
+def room() -> int:
+    """Bytes a cache may hold; processes of one training share the machine."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return int(SHARE * total) // max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+class ItemCache(Generic[T]):
+    """A cache of values made from items when first asked for, several at a time; those used longest ago go first.
+
+    Warns once when items asked for have to go although fewer than ``keep`` are held.
+
+    Args:
+        make: gives the values of some items, in their order.
+        size: gives the bytes of a value.
+        keep: items held at most; None for no bound.
+        limit: bytes held at most, beyond what was asked for last; :func:`room` by default.
+        name: of what is held, for the warning.
+
+    Attributes:
+        kept: what is held, with its bytes, by item.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[Sequence[int]], list[T]],
+        size: Callable[[T], int],
+        *,
+        keep: int | None = None,
+        limit: int | None = None,
+        name: str = "items",
+    ) -> None:
+        self.make, self.size, self.keep, self.name = make, size, keep, name
+        self.limit = room() if limit is None else limit
+        self.kept: OrderedDict[int, tuple[T, int]] = OrderedDict()
+        self._held, self._warned = 0, False
+
+    def __call__(self, item: int) -> T:
+        """The value of one item."""
+        return self.many([item])[0]
+
+    def many(self, items: Sequence[int]) -> list[T]:
+        """The values of several items, in their order."""
+        missing = [item for item in dict.fromkeys(items) if item not in self.kept]
+        for item, value in zip(missing, self.make(missing) if missing else [], strict=True):
+            self.kept[item] = value, self.size(value)
+            self._held += self.kept[item][1]
+        found = [self.kept[item][0] for item in items]
+        for item in items:
+            self.kept.move_to_end(item)
+        while self.keep is not None and len(self.kept) > self.keep:
+            self._held -= self.kept.popitem(last=False)[1][1]
+        while self._held > self.limit and len(self.kept) > 1:
+            if not self._warned:
+                self._warned = True
+                warnings.warn(
+                    f"{self.name} take more than {self.limit / 2**30:.2g} GiB of memory: {len(self.kept)} are kept, "
+                    "others are prepared anew each time they are drawn",
+                    DataWarning,
+                    stacklevel=2,
+                )
+            self._held -= self.kept.popitem(last=False)[1][1]
+        return found
 
 
 class SceneDataset:
@@ -311,7 +380,7 @@ class SceneDataset:
         return batch
 
     def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """What the interactive agents of some segments did, as the fit to the action space has it.
+        """The motion of the interactive agents of some segments, as the fit to the action space has it.
 
         Args:
             items: the segments.
@@ -339,7 +408,7 @@ def _seen_routes(
     progress: Float[Tensor, " M"],
     state: Float[Tensor, "M 4"],
 ) -> RouteWindow:
-    """What experts see of the routes they took from states that may lie beside where they were."""
+    """The part that experts see of the routes they took, from states that may lie beside where they were."""
     taken = logged_routes([table for expert in experts for table in expert.routes], row)
     # Whoever is displaced along the route by up to some metres has come as far as where it is now.
     near = torch.full_like(progress, DISPLACED)[:, None]

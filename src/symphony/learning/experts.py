@@ -1,24 +1,40 @@
-"""Logged vehicles as demonstrations: the actions that lead through what they did, fitted many segments at a time."""
+"""Logged vehicles as demonstrations: the actions that lead through what they did, fitted many segments at a time and
+kept with their store.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import os
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import symphony
+from symphony.data.npz import read_npz
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.routes import RouteTable, drivable, logged_progress, route_table
+from symphony.errors import DataError
+from symphony.files import replacing
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, lane_of
 
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
+
+VERSION = 3
+"""Version of the fit: raised when it gives other numbers or routes for the same segment (a test says when)."""
+PACKAGE = Path(symphony.__file__).parent
+_TENSORS = ("agent", "states", "actions", "valid", "error", "progress")
 
 TOGETHER = 256
 """Vehicles fitted at a time: more save no more calls worth saving, and their temporaries leave the cache."""
@@ -52,17 +68,6 @@ class Experts:
         tensors = (self.agent, self.states, self.actions, self.valid, self.error, self.progress)
         tables = (part for table in self.routes for part in (table.points, table.count, table.right))
         return sum(part.nbytes for part in (*tensors, *tables))
-
-
-def experts(
-    segment: RunSegment,
-    dynamics: Bicycle | Displacement,
-    graph: LaneGraph | None = None,
-    *,
-    routes: bool = False,
-) -> Experts:
-    """The demonstrations of one segment; see :func:`fit_experts`."""
-    return fit_experts([segment], dynamics, None if graph is None else [graph], routes=routes)[0]
 
 
 def fit_experts(
@@ -143,7 +148,7 @@ def _fit_together(
     group: Sequence[int],
     dynamics: Bicycle | Displacement,
 ) -> dict[int, tuple[Tensor, Tensor]]:
-    """The same by segment for a group of one time step."""
+    """Actions and states by segment, for a group of segments with one time step."""
     steps = max(segments[k].num_steps for k in group)
 
     def joined(name: str) -> Tensor:
@@ -172,3 +177,73 @@ def _fit_together(
         # Copies, so that a segment kept in memory doesn't keep the whole group.
         found[k] = action[:, : length - 1].clone(), state[:, :length].clone()
     return found
+
+
+class KeptExperts:
+    """Demonstrations kept in a folder of their store, so that a segment is fitted once and not once a run.
+
+    Files of arrays, nothing pickled, are named after all that they depend on. They are a cache: one that is missing
+    or damaged is made anew, and where the folder can't be written or belongs to the package, nothing is kept.
+
+    Args:
+        store: the store's folder.
+        settings: what the fit depends on beside the segment's content.
+    """
+
+    def __init__(self, store: Path, settings: str) -> None:
+        self.settings = settings
+        self.folder: Path | None = None if PACKAGE in store.resolve().parents else store / "experts"
+        try:
+            if self.folder is not None:
+                self.folder.mkdir(exist_ok=True)
+        except OSError:
+            self.folder = None
+
+    def _path(self, content: str) -> Path | None:
+        key = hashlib.sha256(f"{VERSION} {content} {self.settings}".encode()).hexdigest()
+        return None if self.folder is None else self.folder / f"{key[:32]}.npz"
+
+    def load(self, content: str) -> Experts | None:
+        """The demonstrations of the segment with this hash; None where there are none that can be read."""
+        path = self._path(content)
+        if path is None or not path.is_file():
+            return None
+        try:
+            arrays = read_npz(path)
+            ends = arrays["route_number"].cumsum()
+            # Points of the routes of each agent end where those of its last route do.
+            point_ends = np.append(0, arrays["route_count"].cumsum())[np.append(0, ends)]
+            tables = tuple(
+                RouteTable(
+                    arrays["route_points"][point_ends[k] : point_ends[k + 1]],
+                    arrays["route_count"][end - count : end],
+                    arrays["route_right"][end - count : end],
+                    int(arrays["route_logged"][k]),
+                )
+                for k, (end, count) in enumerate(zip(ends, arrays["route_number"], strict=True))
+            )
+            return Experts(**{name: torch.from_numpy(arrays[name]) for name in _TENSORS}, routes=tables)
+        except (DataError, OSError, ValueError, KeyError, IndexError):
+            return None
+
+    def save(self, content: str, experts: Experts) -> None:
+        """Keep the demonstrations of a segment, if the folder can be written and the disk has room."""
+        path, routes = self._path(content), experts.routes
+        if path is None or not os.access(path.parent, os.W_OK):
+            return
+        arrays = {name: getattr(experts, name).numpy() for name in _TENSORS} | {
+            "route_number": np.array([len(table.count) for table in routes], np.int64),
+            "route_points": np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in routes)]),
+            "route_count": np.concatenate([np.zeros(0, np.int64), *(t.count for t in routes)]),
+            "route_right": np.concatenate([np.zeros(0, np.bool_), *(t.right for t in routes)]),
+            "route_logged": np.array([table.logged for table in routes], np.int64),
+        }
+        try:
+            with replacing(path) as draft, zipfile.ZipFile(draft, "w") as file:
+                for name, array in arrays.items():
+                    part = io.BytesIO()
+                    np.save(part, array)
+                    # Of no date, so that equal arrays are equal files.
+                    file.writestr(zipfile.ZipInfo(f"{name}.npy"), part.getvalue())
+        except OSError:
+            self.folder = None

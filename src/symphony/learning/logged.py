@@ -1,4 +1,4 @@
-"""What a log says of agents: their states, the routes they took, and what an agent would observe among them."""
+"""Agents in their log: their states, the routes they took, and what an agent would observe among them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def logged_routes(tables: Sequence[RouteTable], row: Int[Tensor, " M"]) -> Follo
 
 
 def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
-    """What the interactive agents did in the log: states and validity."""
+    """The states of the interactive agents in the log, and where they are valid."""
     steps = scenes.log_valid.shape[1]
     index = scenes.interactive[:, None].expand(-1, steps, -1)
     log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))

@@ -104,7 +104,7 @@ def _change(speed: Floats, valid: NDArray[np.bool_], dt: float) -> Floats:
 
 @dataclass(frozen=True)
 class PersonaScale:
-    """What styles are usual: a persona is where a vehicle's own stands among all.
+    """The usual styles of driving: a persona is where a vehicle's own style stands among all.
 
     Attributes:
         headway: of all vehicles that tell, ascending, seconds.
@@ -118,7 +118,7 @@ class PersonaScale:
 
     @classmethod
     def of(cls, found: Iterable[Floats]) -> PersonaScale:
-        """From the :func:`styles` of segments."""
+        """The scale made from the :func:`styles` of segments."""
         known = np.concatenate([np.zeros((0, 2)), *found])
         known = known[~np.isnan(known).all(1)]
         headway, speed = (np.sort(column[~np.isnan(column)]) for column in known.T)

@@ -1,4 +1,4 @@
-"""What the losses learn from after a search: its survivors, simulated and logged states, rollouts to repeat.
+"""Batches that losses learn from after a search: its survivors, simulated and logged states, rollouts to repeat.
 
 Legend: B scenes, S branches, T steps, N agents, K states drawn.
 """
@@ -151,8 +151,8 @@ def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
 
 
 def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:
-    """What matters to a search: whether scores rank colliding and off-road states last (AUC; NaN without any), and
-    the share of agent-steps that collide or are off the road before and after pruning.
+    """Numbers that matter to a search: whether scores rank colliding and off-road states last (AUC; NaN without any),
+    and the share of agent-steps that collide or are off the road before and after pruning.
     """
     tree, record = leaves.get("tree"), {}
     going = leaves.get(keys.STEP) < env.scenes.last_step[leaves.get(keys.SCENE)]

@@ -10,13 +10,17 @@ from symphony.modules.discriminator import Discriminator, discriminator
 if TYPE_CHECKING:
     from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram
     from symphony.modules.displacement import displacement_policy
-    from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder, SceneNetwork, scene_module
+    from symphony.modules.encoder import (
+        FORESIGHT,
+        ElementGroup,
+        SceneEncoder,
+        SceneNetwork,
+        mlp,
+        scene_module,
+    )
     from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
-    from symphony.modules.noise import SeededNoise
-    from symphony.modules.policy import NoiseSampler, discrete_policy
+    from symphony.modules.policy import NoiseSampler, SeededNoise, discrete_policy, inverse_cdf
     from symphony.modules.pooling import pool_elements
-    from symphony.modules.rows import in_blocks, mlp
-    from symphony.modules.sampling import inverse_cdf
 
 __all__ = [
     "FORESIGHT",
@@ -34,7 +38,6 @@ __all__ = [
     "displacement_policy",
     "drawn_goals",
     "goal_policy",
-    "in_blocks",
     "inverse_cdf",
     "mlp",
     "pool_elements",

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Normal, constraints
 
 from symphony.geometry.constants import constant
-from symphony.modules.sampling import inverse_cdf
+from symphony.modules.policy import inverse_cdf
 
 SMOOTH = 0.02
 """Metres within which a displacement bends smoothly towards zero instead of turning negative."""
@@ -24,10 +24,8 @@ EDGE = 1e-6
 
 
 def squash(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """`x / sqrt(1 + x^2)`, in (-1, 1). Made of exactly rounded operations, unlike tanh, whose last bit on the CPU
-    depends on an element's place in the batch.
-    """
-    return x * (1.0 + x.square()).rsqrt() if x.device.type != "cpu" else x / (1.0 + x.square()).sqrt()
+    """`x / sqrt(1 + x^2)`, in (-1, 1)."""
+    return x / (1.0 + x.square()).sqrt()
 
 
 def unsquash(y: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:

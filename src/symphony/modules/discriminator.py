@@ -21,7 +21,6 @@ from symphony.modules.encoder import (
     road_features,
     scene_module,
 )
-from symphony.modules.pooling import PoolMode
 
 Features = Literal["paper", "clearance", "foresight"]
 _GAP, _ROAD = 3, 2 * 5
@@ -35,7 +34,7 @@ class Discriminator(nn.Module):
     Args:
         own_features: of the agent itself, its route included where it is given one.
         object_features: of one object; the first two are its position in the agent's frame.
-        point_features: of one map or light point; likewise.
+        point_features: of one map or light point; the first two are its position in the agent's frame.
         radius: how far it observes, in the units of those positions.
         hidden: width of the encoders.
         head: widths of the head's hidden layers.
@@ -54,7 +53,6 @@ class Discriminator(nn.Module):
         hidden: int = 32,
         head: Sequence[int] = (64,),
         features: Features = "clearance",
-        pool: PoolMode = "auto",
     ) -> None:
         super().__init__()
         self.radius, self.clearance = radius, features != "paper"
@@ -62,9 +60,7 @@ class Discriminator(nn.Module):
         if self.clearance:
             gaps = 1 + len(FORESIGHT) if features == "foresight" else 1
             widths = (own_features + _ROAD, object_features + _GAP * gaps, point_features)
-        self.network = SceneNetwork(
-            SceneEncoder(widths[0], widths[1:], hidden=hidden, pool=pool), 1, head=head
-        )
+        self.network = SceneNetwork(SceneEncoder(widths[0], widths[1:], hidden=hidden), 1, head=head)
 
     def forward(
         self,
@@ -107,7 +103,6 @@ def discriminator(
     hidden: int = 32,
     head: Sequence[int] = (64,),
     features: Features = "clearance",
-    pool: PoolMode = "auto",
 ) -> TensorDictModule:
     """A :class:`Discriminator` that reads an observation and writes its logits `[..., N]`."""
     network = Discriminator(
@@ -118,7 +113,6 @@ def discriminator(
         hidden=hidden,
         head=head,
         features=features,
-        pool=pool,
     )
     groups = (
         ElementGroup(OBJECTS, OBJECTS_MASK, object_features),

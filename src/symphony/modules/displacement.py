@@ -8,15 +8,13 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from tensordict import NestedKey
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
 from symphony.keys import ACTION, NOISE, OWN, STATE, VALID
 from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram, positive
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.policy import NoiseSampler
-from symphony.modules.pooling import PoolMode
-from symphony.modules.tensors import TensorModule
 
 
 class _Parameters(nn.Module):
@@ -78,7 +76,6 @@ def displacement_policy(
     state_key: NestedKey = STATE,
     action_key: NestedKey = ACTION,
     noise_key: NestedKey = NOISE,
-    pool: PoolMode = "auto",
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section V-A), or a
@@ -106,7 +103,6 @@ def displacement_policy(
         state_key: `[..., N, 4]`, of which the speed is read.
         action_key: written.
         noise_key: `[..., N, 2]`, optional in the TensorDict.
-        pool: see :func:`symphony.modules.pool_elements`.
         encoder: a class with the arguments of :class:`SceneEncoder`.
     """
     if cells and (cells < 3 or cells % 2 == 0):
@@ -120,14 +116,14 @@ def displacement_policy(
     ):
         if not value > 0.0:
             raise ValueError(f"{name} must be positive, is {value}")
-    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)
     network = SceneNetwork(encoding, cells**2 or 4, head=head)
     names = ("logits", "pace", "slope") if cells else ("loc", "scale", "pace", "slope")
     parameters: list[NestedKey] = [("agents", name) for name in names]
     kind: dict[str, Any] = {"forward": cells} if cells else {}
     return ProbabilisticTensorDictSequential(
         scene_module(network, groups, ("agents", "head"), own_keys=own_keys, valid_key=valid_key),
-        TensorModule(
+        TensorDictModule(
             _Parameters(cells, dt, size_scale, min_scale, max_slope, max_lateral, axle),
             in_keys=[("agents", "head"), state_key, own_keys[0], valid_key],
             out_keys=parameters,

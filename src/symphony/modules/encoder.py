@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from symphony.geometry.nearest import on_host
 from symphony.keys import OWN, VALID
-from symphony.modules.pooling import PoolMode, pool_elements
-from symphony.modules.rows import in_blocks, mlp
-from symphony.modules.tensors import TensorModule
+from symphony.modules.pooling import pool_elements
 
 FORESIGHT = (0.5, 1.0, 2.0)
 """Seconds ahead at which gaps and distances to the edge of the road are observed, too."""
@@ -39,6 +39,17 @@ class ElementGroup:
     features: int
     more_keys: tuple[NestedKey, ...] = ()
     gap_keys: tuple[NestedKey, ...] = ()
+
+
+def mlp(sizes: Sequence[int]) -> nn.Sequential:
+    """Linear layers of the given widths (input first) with ReLU between them and none after the last."""
+    if len(sizes) < 2:
+        raise ValueError(f"a network needs an input and an output width, got {tuple(sizes)}")
+    layers: list[nn.Module] = []
+    for width_in, width_out in pairwise(sizes):
+        # In place: nothing reads what comes out of a linear layer, and fresh memory costs more than the maximum.
+        layers += [nn.Linear(width_in, width_out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers[:-1])
 
 
 def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
@@ -65,19 +76,15 @@ class SceneEncoder(nn.Module):
         own_features: features of the agent itself.
         group_features: features of one element, per group.
         hidden: width of every encoder.
-        pool: how to pool, see :func:`symphony.modules.pool_elements`.
 
     Attributes:
         width: size D of the vector, `hidden * (1 + number of groups)`.
     """
 
-    def __init__(
-        self, own_features: int, group_features: Sequence[int], *, hidden: int = 64, pool: PoolMode = "auto"
-    ) -> None:
+    def __init__(self, own_features: int, group_features: Sequence[int], *, hidden: int = 64) -> None:
         super().__init__()
         self.own = mlp((own_features, hidden, hidden))
         self.groups = nn.ModuleList(mlp((features, hidden, hidden)) for features in group_features)
-        self.pool: PoolMode = pool
         self.width = hidden * (1 + len(self.groups))
 
     def forward(
@@ -89,11 +96,11 @@ class SceneEncoder(nn.Module):
                 f"expected elements and mask of {len(self.groups)} groups, got {len(elements_and_masks)} tensors"
             )
         everyone = on_host(valid) and bool(valid.all())
-        parts = [in_blocks(self.own, own if everyone else torch.where(valid[..., None], own, 0.0))]
+        parts = [self.own(own if everyone else torch.where(valid[..., None], own, 0.0))]
         pairs = zip(elements_and_masks[::2], elements_and_masks[1::2], strict=True)
         for encoder, (elements, mask) in zip(self.groups, pairs, strict=True):
             seen = mask if everyone else mask & valid[..., None]
-            parts.append(pool_elements(encoder, elements, seen, mode=self.pool))
+            parts.append(pool_elements(encoder, elements, seen))
         # ReLU is monotone: after the maximum it is the same as before it, and far cheaper.
         return torch.relu(torch.cat(parts, -1))
 
@@ -116,7 +123,7 @@ class SceneNetwork(nn.Module):
         self, own: Float[Tensor, "*b n own"], valid: Bool[Tensor, "*b n"], *elements_and_masks: Tensor
     ) -> Float[Tensor, "*b n outputs"]:
         """Inputs as for :class:`SceneEncoder`."""
-        return in_blocks(self.head, self.encoder(own, valid, *elements_and_masks))
+        return self.head(self.encoder(own, valid, *elements_and_masks))
 
 
 class _Join(nn.Module):
@@ -149,7 +156,7 @@ def scene_module(
     own_keys: Sequence[NestedKey] = (OWN,),
     valid_key: NestedKey = VALID,
     more_keys: Sequence[NestedKey] = (),
-) -> TensorModule:
+) -> TensorDictModule:
     """Wrap a network over scenes so that it reads its inputs, in order, from a TensorDict.
 
     Args:
@@ -163,4 +170,4 @@ def scene_module(
     read = [key for group in groups for key in (group.key, group.mask_key, *group.more_keys, *group.gap_keys)]
     apart = len(own_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)
     joined = _Join(network, len(own_keys), groups) if apart else network
-    return TensorModule(joined, in_keys=[*own_keys, valid_key, *read, *more_keys], out_keys=[out_key])
+    return TensorDictModule(joined, in_keys=[*own_keys, valid_key, *read, *more_keys], out_keys=[out_key])

@@ -12,10 +12,8 @@ from torch import Tensor, nn
 
 from symphony.geometry.nearest import on_host
 from symphony.keys import GOAL, GOAL_LOGITS, GOAL_NOISE, OWN, ROUTES, ROUTES_MASK, VALID
-from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, scene_module
+from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, mlp, scene_module
 from symphony.modules.policy import NoiseSampler
-from symphony.modules.pooling import PoolMode
-from symphony.modules.rows import in_blocks, mlp
 
 NO_ROUTE = -1e4
 """Logit of a route that does not exist; finite, so that an agent without any still has a distribution."""
@@ -44,7 +42,7 @@ class RouteScores(nn.Module):
     ) -> Float[Tensor, "*b N G"]:
         """Inputs as for :class:`SceneEncoder`, then routes `[..., N, G, F]` and their mask `[..., N, G]`."""
         *elements, routes, mask = inputs
-        around = in_blocks(self.scene, self.encoder(own, valid, *elements))
+        around = self.scene(self.encoder(own, valid, *elements))
         if not on_host(mask):
             # Nothing of a route that is padding gets through, whatever its features hold.
             routes = torch.where(mask[..., None], routes, 0.0)
@@ -56,8 +54,8 @@ class RouteScores(nn.Module):
         return found.new_full((mask.numel(),), NO_ROUTE).index_copy(0, place, found).view(mask.shape)
 
     def _scores(self, routes: Float[Tensor, "*b F"], around: Float[Tensor, "*#b H"]) -> Float[Tensor, "*b"]:
-        met = torch.relu(in_blocks(self.route, routes) + around)
-        return in_blocks(self.head, met).squeeze(-1)
+        met = torch.relu(self.route(routes) + around)
+        return self.head(met).squeeze(-1)
 
 
 def goal_policy(
@@ -68,7 +66,6 @@ def goal_policy(
     hidden: int = 64,
     own_keys: Sequence[NestedKey] = (OWN,),
     valid_key: NestedKey = VALID,
-    pool: PoolMode = "auto",
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """A categorical over each agent's feasible routes, given the first state: h(g | s_1).
@@ -77,7 +74,7 @@ def goal_policy(
     :func:`drawn_goals`). A uniform number under `GOAL_NOISE`, if there is one, decides the draw. Another `encoder`
     takes the arguments of :class:`SceneEncoder`.
     """
-    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)
     network = RouteScores(encoding, route_features, hidden=hidden)
     return ProbabilisticTensorDictSequential(
         scene_module(

@@ -1,23 +1,72 @@
-"""Policies over discrete actions, and draws decided by given numbers."""
+"""Policies over discrete actions, random numbers as a function of what they are for, and draws decided by them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+from jaxtyping import Float, Int
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
 )
 from tensordict.nn.probabilistic import interaction_type
+from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
-from symphony.keys import ACTION, LOG_PROB, LOGITS, NOISE, OWN, VALID
+from symphony.keys import ACTION, LOG_PROB, LOGITS, NOISE, OWN, STEP, STREAM, VALID
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
-from symphony.modules.pooling import PoolMode
-from symphony.modules.sampling import inverse_cdf
+from symphony.streams import fold_in, uniform
+
+
+def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
+    """Draw categories `[...]` int64 from logits `[..., C]` by uniform numbers `[...]` in [0, 1].
+
+    The category is the one whose interval of the cumulative distribution holds the number; a category of
+    probability zero is never drawn. Where there is no category at all it is 0.
+    """
+    if logits.shape[-1] == 0:
+        return torch.zeros_like(noise, dtype=torch.int64)
+    cumulative = torch.softmax(logits.detach(), -1).cumsum(-1)
+    total = cumulative[..., -1:].contiguous()
+    # It never falls, so a place in it is the number of elements at most, or less than, a value.
+    drawn = torch.searchsorted(cumulative, noise[..., None] * total, right=True)
+    # Rounding may carry the product up to the total, past the last category that is possible at all. Where logits are
+    # not numbers no place is right, but one must be named.
+    last = torch.searchsorted(cumulative, total).clamp_max(logits.shape[-1] - 1)
+    return torch.minimum(drawn, last).squeeze(-1)
+
+
+class SeededNoise(TensorDictModuleBase):
+    """Gives every agent the random number its next action is decided by.
+
+    It depends on the seed, the rollout's identity, the step and the agent's place alone (never on the batch).
+
+    Args:
+        seed: of all rollouts.
+        numbers: per agent; 0 for a single one without a dimension of its own.
+    """
+
+    in_keys = [STREAM, STEP, VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
+    out_keys = [NOISE]  # noqa: RUF012
+
+    def __init__(self, seed: int, numbers: int = 0) -> None:
+        super().__init__()
+        self.seed, self.numbers = seed, numbers
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write numbers [..., N] or [..., N, numbers] in (0, 1)."""
+        agents = tensordict.get(VALID).shape[-1]
+        place = torch.arange(agents, device=tensordict.device)
+        stream, step = fold_in(tensordict.get(STREAM), place), tensordict.get(STEP)
+        if self.numbers:
+            stream = fold_in(stream[..., None], torch.arange(self.numbers, device=stream.device))
+            step = step[..., None]
+        return tensordict.set(NOISE, uniform(self.seed, stream, step))
 
 
 class NoiseSampler(ProbabilisticTensorDictModule):
@@ -95,7 +144,6 @@ def discrete_policy(
     noise_key: NestedKey = NOISE,
     return_log_prob: bool = False,
     log_prob_key: NestedKey = LOG_PROB,
-    pool: PoolMode = "auto",
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).
@@ -105,7 +153,7 @@ def discrete_policy(
     int64, sampled according to TorchRL's exploration type (RANDOM unless set; see :class:`NoiseSampler`). It does not
     depend on the number of agents or elements. Another `encoder` takes the arguments of :class:`SceneEncoder`.
     """
-    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden, pool=pool)
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)
     network = SceneNetwork(encoding, actions, head=head)
     return ProbabilisticTensorDictSequential(
         scene_module(network, groups, logits_key, own_keys=own_keys, valid_key=valid_key),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -14,7 +13,7 @@ from typing import Any
 from symphony.planners.interface import Planner, Traffic
 
 SECONDS = 60.0
-"""Of the clock that a planner has for one answer, unless it is told otherwise."""
+"""Seconds of the clock that a planner has for one answer, unless more or less are given."""
 
 
 class _Overdue(BaseException):
@@ -22,7 +21,7 @@ class _Overdue(BaseException):
 
 
 def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: float = SECONDS) -> list[Any]:
-    """What planners give back for what each of them sees, in their order: a plan, or the exception it ended with.
+    """Ask planners, each for what it sees; gives plans in their order, or the exceptions that the calls ended with.
 
     Those of one class that has ``plan_batch`` are asked together, and fail together.
 
@@ -64,7 +63,7 @@ def _as_many(given: Any, count: int) -> Any:
 
 
 def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
-    """What a call gives back, or the exception it ended with: a TimeoutError if it took too long."""
+    """Call a planner; gives what it returns, or the exception it ended with: a TimeoutError if it took too long."""
     try:
         with _at_most(seconds):
             return call(*args)
@@ -87,13 +86,10 @@ def _at_most(seconds: float) -> Iterator[None]:
         place = f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})" if frame is not None else ""
         raise _Overdue(place)
 
-    before, began = signal.signal(signal.SIGALRM, ring), time.monotonic()
-    left, again = signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-        if left > 0:  # somebody else's alarm goes on
-            spent = time.monotonic() - began
-            signal.setitimer(signal.ITIMER_REAL, max(left - spent, 1e-3), again)

@@ -53,50 +53,20 @@ class Failure(NamedTuple):
     reason: str
 
 
-class EgoPlanners:
+class EgoPlanners(NamedTuple):
     """How the egos of a batch are planned.
 
-    Args:
+    Attributes:
         name: of the planner.
         make: makes one.
         segments: behind the scenes, in their order; the first interactive agent of each is its ego.
         seconds: that a planner has for one answer.
     """
 
-    def __init__(
-        self,
-        name: str,
-        make: Callable[[], Planner],
-        segments: Sequence[RunSegment],
-        seconds: float = SECONDS,
-    ) -> None:
-        self.name, self.make, self.segments, self.seconds = name, make, segments, seconds
-
-    def begin(
-        self,
-        env: DrivingEnv,
-        start: TensorDictBase,
-        *,
-        seed: int,
-        forked: bool = False,
-    ) -> EgoPolicy:
-        """A planner for every start state, which gets its number, and what asks them.
-
-        Args:
-            env: the environment.
-            start: [...] of it, the egos on the routes of the log.
-            seed: of all rollouts.
-            forked: a search will copy planners with its branches.
-
-        Raises:
-            ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
-        """
-        number = torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
-        start.set(keys.PLANNER, number)
-        policy = EgoPolicy(env, self, start, seed)
-        if forked:
-            policy.check_copies()
-        return policy
+    name: str
+    make: Callable[[], Planner]
+    segments: Sequence[RunSegment]
+    seconds: float = SECONDS
 
 
 class EgoPolicy(TensorDictModuleBase):
@@ -108,16 +78,24 @@ class EgoPolicy(TensorDictModuleBase):
     Args:
         env: the environment.
         egos: how egos are planned.
-        start: [...] states at which planners begin, each with its number.
+        start: [...] states at which planners begin, the egos on the routes of the log; each gets its number.
         seed: of all rollouts.
+        forked: a search will copy planners with its branches.
+
+    Raises:
+        ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
     """
 
     in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012 - the type declared
     out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
 
-    def __init__(self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int) -> None:
+    def __init__(
+        self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int, *, forked: bool = False
+    ) -> None:
         super().__init__()
         self.env, self.egos = env, egos
+        numbers = torch.arange(start.numel(), device=start.device)
+        start.set(keys.PLANNER, numbers.reshape(*start.shape, 1))
         self._last = env.scenes.last_step.cpu().numpy()
         self._held: dict[int, Planner | Failure] = {}
         scene = start.get(keys.SCENE).flatten().tolist()
@@ -132,6 +110,9 @@ class EgoPolicy(TensorDictModuleBase):
             failed = isinstance(error, Exception)
             self._held[number] = Failure(0, f"reset: {_words(error)}") if failed else planner
         self._next = len(scene)
+        first = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
+        if forked and first is not None:
+            self._copy(first)
 
     def _route(self, row: int) -> NDArray[np.float32]:
         """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
@@ -184,7 +165,7 @@ class EgoPolicy(TensorDictModuleBase):
         return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
 
     def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
-        """Of the planners with these numbers, flattened."""
+        """The failures of the planners with these numbers, flattened; None for those that drive on."""
         found = (self._held[n] for n in number.flatten().tolist())
         return [planner if isinstance(planner, Failure) else None for planner in found]
 
@@ -202,12 +183,6 @@ class EgoPolicy(TensorDictModuleBase):
                 taken.add(chosen)
             out.append(chosen)
         return out
-
-    def check_copies(self) -> None:
-        """ConfigError if the first planner that came up can't be copied."""
-        first = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
-        if first is not None:
-            self._copy(first)
 
     def _copy(self, planner: Planner) -> Planner:
         try:

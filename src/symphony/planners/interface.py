@@ -46,7 +46,7 @@ class Pose(NamedTuple):
 
 
 class Control(NamedTuple):
-    """What moves the ego to the next step, as :func:`symphony.envs.dynamics.bicycle_step` says.
+    """The controls that move the ego to the next step, as :func:`symphony.envs.dynamics.bicycle_step` says.
 
     A vehicle does what it can: the acceleration ends at :data:`MAX_ACCELERATION` and -:data:`MAX_BRAKING`, the
     steering at :data:`MAX_STEERING` either way, the speed at 0.
@@ -92,7 +92,7 @@ class Traffic:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What a planner is told at the start. There is no history before it: simulations begin with the log.
+    """The scene that a planner is told at the start. There is no history before it: simulations begin with the log.
 
     A copy is the scenario itself, so that planners that keep it are cheap to fork.
 
@@ -153,7 +153,7 @@ class Planner(Protocol):
         ...
 
     def plan(self, traffic: Traffic) -> Pose | Control | Sequence[float] | Sequence[Pose] | NDArray[Any]:
-        """What the ego does until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
+        """The plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
 
         Of several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
         """
@@ -167,7 +167,7 @@ PIPE = "pipe:"
 
 
 def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
-    """What makes planners, one for each rollout.
+    """A function that makes planners, one for each rollout.
 
     Args:
         planner: a class with ``reset`` and ``plan``, a function that makes such objects, or a function from an
@@ -204,7 +204,7 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
 
 
 def planner_name(planner: str | Callable[..., Any]) -> str:
-    """What a planner is called in records."""
+    """The name of a planner in records."""
     if isinstance(planner, str):
         return planner
     if isinstance(planner, partial):
@@ -235,7 +235,7 @@ def _needed(function: Callable[..., Any]) -> list[str]:
 
 
 def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
-    """What planners of a run segment are told.
+    """The scenario that planners of a run segment are told.
 
     Args:
         segment: the segment.
@@ -286,7 +286,7 @@ def _fixed_road(road: RoadMap) -> RoadMap:
 
 
 def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
-    """What a planner gave back as 2 or 4 finite numbers: of a trajectory, its first state.
+    """The plan that a planner gave back as 2 or 4 finite numbers: of a trajectory, its first state.
 
     Args:
         plan: as it came.

@@ -95,7 +95,7 @@ class ProcessPlanner:
             raise ValueError(f"answered reset with {str(given)[:80]}, not with {{}}")
 
     def plan(self, traffic: Traffic) -> Any:
-        """What it answers."""
+        """The plan that the process answers."""
         seen = observation_of(self.scenario, traffic, ())
         now = {
             "time": seen.time,
@@ -157,7 +157,7 @@ class ProcessPlanner:
 
 
 def environment() -> dict[str, str]:
-    """What a planner's process gets of ours: secrets in it are none of its business."""
+    """The part of our environment that a planner's process gets: secrets in it are none of its business."""
     named = {"PATH", "HOME", "LANG", *os.environ.get(NAMES, "").replace(" ", "").split(",")}
     return {name: value for name, value in os.environ.items() if name in named or name.startswith("PYTHON")}
 

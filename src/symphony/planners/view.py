@@ -69,7 +69,7 @@ class Lights(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a planner sees at one step.
+    """The record that a planner sees at one step.
 
     Attributes:
         time: seconds since the start.
@@ -163,7 +163,7 @@ class FunctionPlanner:
         self.scenario, self.lanes = scenario, lanes_of(scenario)
 
     def plan(self, traffic: Traffic) -> Any:
-        """What the function says."""
+        """The plan that the function gives."""
         return self.function(observation_of(self.scenario, traffic, self.lanes))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FunctionPlanner:

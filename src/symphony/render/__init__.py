@@ -1,24 +1,27 @@
-"""Pictures of run segments, rollouts, searches and training."""
+"""Pictures of run segments, rollouts and training."""
 
-from symphony.render.curves import plot_curves
-from symphony.render.genealogy import plot_genealogy, plot_search
-from symphony.render.histograms import plot_curvature
-from symphony.render.plots import plot_grid, plot_rollout, plot_segment
-from symphony.render.routes import plot_routes
-from symphony.render.tree import SearchTree, plot_tree
-from symphony.render.video import Clip, animate_rollouts
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from symphony.imports import lazily
+
+if TYPE_CHECKING:
+    from symphony.render.curves import plot_curvature, plot_curves
+    from symphony.render.plots import Clip, plot_grid, plot_rollout, plot_routes, plot_segment, saved_clip
+    from symphony.render.video import animate_rollouts, draw_clips
 
 __all__ = [
     "Clip",
-    "SearchTree",
     "animate_rollouts",
+    "draw_clips",
     "plot_curvature",
     "plot_curves",
-    "plot_genealogy",
     "plot_grid",
     "plot_rollout",
     "plot_routes",
-    "plot_search",
     "plot_segment",
-    "plot_tree",
+    "saved_clip",
 ]
+
+__getattr__, __dir__ = lazily(__name__)

@@ -1,10 +1,12 @@
-"""Training curves of one or several runs, a panel for each metric."""
+"""Figures of numbers: the curves of trainings, and how often regions of each curvature are visited."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -13,84 +15,41 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from symphony.errors import ConfigError, DataError
 from symphony.render.style import AGENT_COLORS, INK, LANE, new_figure, picture_path, save
 
 Records = Sequence[Mapping[str, Any]]
-"""Of a run, each with its ``step``; other entries are metrics, and any may be absent or NaN."""
+"""Records of a run, each with its ``step``; other entries are metrics, and any may be absent or NaN."""
 
-Panel = tuple[str, Mapping[str, str]]
-"""Title, and the metrics with what each is called where there are several."""
-
-
-def _quantiles(title: str, name: str) -> Panel:
-    labels = {"p90": "90 %", "p50": "median", "p10": "10 %"}
-    return f"preview: {title}", {f"preview_{name}_{level}": label for level, label in labels.items()}
-
-
-PANELS: tuple[Panel, ...] = (
-    ("policy loss", {"loss_policy": "whole", "loss_mgail": "MGAIL", "loss_regression": "regression"}),
-    ("negative log-likelihood", {"policy_nll_expert": "expert", "policy_nll_rollout": "rollout"}),
-    ("accuracy", {"policy_accuracy": ""}),
-    ("entropy", {"policy_entropy": ""}),
-    ("MGAIL: discriminator logit", {"policy_mgail_score": ""}),
-    ("goal loss", {"loss_goals": ""}),
-    ("goal accuracy", {"goals_accuracy": "most likely", "goals_accuracy_top3": "among the best 3"}),
-    ("goal entropy", {"goals_entropy": ""}),
-    ("discriminator loss", {"loss_discriminator": ""}),
-    (
-        "discriminator accuracy",
-        {"discriminator_accuracy_simulated": "simulated", "discriminator_accuracy_data": "data"},
+PANELS: dict[str, tuple[str, ...]] = {
+    "policy loss": ("loss_policy", "loss_mgail", "loss_regression"),
+    "negative log-likelihood": ("policy_nll_expert", "policy_nll_rollout"),
+    "goal accuracy": ("goals_accuracy", "goals_accuracy_top3"),
+    "discriminator accuracy": ("discriminator_accuracy_simulated", "discriminator_accuracy_data"),
+    "discriminator logit": ("discriminator_score_simulated", "discriminator_score_data"),
+    "search: share in collision": ("search_collision_all", "search_collision_kept"),
+    "search: share off the road": ("search_offroad_all", "search_offroad_kept"),
+    "validation: infractions, %": (
+        "validation_collision_rate",
+        "validation_offroad_time",
+        "validation_infractions",
     ),
-    (
-        "discriminator logit",
-        {"discriminator_score_simulated": "simulated", "discriminator_score_data": "data"},
-    ),
-    ("discriminator AUC", {"discriminator_auc": ""}),
-    ("discriminator gradient penalty", {"discriminator_gradient_penalty": ""}),
-    ("search: AUC of collisions", {"search_auc_collision": ""}),
-    ("search: AUC of off-road states", {"search_auc_offroad": ""}),
-    ("search: share in collision", {"search_collision_all": "all", "search_collision_kept": "kept"}),
-    ("search: share off the road", {"search_offroad_all": "all", "search_offroad_kept": "kept"}),
-    (
-        "validation: infractions, %",
-        {
-            "validation_collision_rate": "collision rate",
-            "validation_offroad_time": "off-road time",
-            "validation_infractions": "sum",
-        },
-    ),
-    ("validation: displacement, m", {"validation_ade": "ADE", "validation_min_sade": "minSADE"}),
-    ("validation: curvature JSD", {"validation_curvature_jsd": ""}),
-    _quantiles("ADE, m", "ade"),
-    _quantiles("speed, m/s", "speed"),
-    _quantiles("logged speed, m/s", "speed_log"),
-    _quantiles("acceleration, m/s²", "acceleration"),
-    _quantiles("logged acceleration, m/s²", "acceleration_log"),
-    _quantiles("turn, rad/s", "turn"),
-    _quantiles("logged turn, rad/s", "turn_log"),
-    _quantiles("logit, simulated", "score_simulated"),
-    _quantiles("logit, data", "score_data"),
-    (
-        "gradient norm",
-        {
-            "gradient_norm_policy": "policy",
-            "gradient_norm_discriminator": "discriminator",
-            "gradient_norm_goals": "goals",
-        },
-    ),
-)
-"""In this order; whatever else there is follows in panels of its own, and then what is in :data:`LAST`."""
-LAST: tuple[Panel, ...] = (
-    ("updates per second", {"updates_per_second": ""}),
-    ("learning rate", {"learning_rate": ""}),
-    ("skipped updates", {"skipped_updates": ""}),
-)
+    "validation: displacement, m": ("validation_ade", "validation_min_sade"),
+    "gradient norm": ("gradient_norm_policy", "gradient_norm_discriminator", "gradient_norm_goals"),
+}
+"""Metrics that share a panel, by its title; quantiles share one, too, and all others have panels of their own."""
+LAST = ("updates_per_second", "learning_rate", "skipped_updates")
+"""Metrics that say how the training ran; their panels come last."""
 DASHES: tuple[Any, ...] = ("-", (0, (3, 1.5)), (0, (1, 1)))
-WINDOW = 0.1
-"""Share of a run's records that a point of the smoothed line is averaged over."""
+LOG_COLOR, POLICY_COLOR = "#0072B2", "#E69F00"
+TITLE = 40
+"""Characters of a line above a panel of curvature."""
+LEAST_REACH = 0.1
+"""Curvature in 1/m that is shown to either side, at least."""
 
 
 def plot_curves(
@@ -98,7 +57,7 @@ def plot_curves(
     path: str | Path,
     *,
     metrics: Sequence[str] = (),
-    window: float = WINDOW,
+    window: float = 0.1,
     columns: int = 4,
 ) -> Figure:
     """Draw the metrics of runs over their updates: pale as recorded, strong smoothed, one colour per run.
@@ -111,27 +70,37 @@ def plot_curves(
         columns: panels per row, at most.
 
     Raises:
-        ValueError: nothing to draw, or a metric that no run has.
-        ConfigError: a file of another kind.
+        ConfigError: nothing to draw, a metric that no run has, or a file of another kind.
     """
     file = picture_path(path)
     curves = {name: read_curves(records) for name, records in runs.items()}
     present = list(dict.fromkeys(metric for found in curves.values() for metric in found))
     if missing := [metric for metric in metrics if metric not in present]:
-        raise ValueError(f"no run has {', '.join(missing)}; there are {', '.join(present)}")
-    panels = [_own_panel(metric) for metric in metrics] or panels_of(present)
+        raise ConfigError(f"no run has {', '.join(missing)}; there are {', '.join(present)}")
+    panels = {metric: [metric] for metric in metrics} or panels_of(present)
     if not panels:
-        raise ValueError("no metrics to draw")
-    columns = min(columns, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(3.3 * columns, 2.3 * rows + 0.5)
-    grid = figure.add_gridspec(rows, columns)
+        raise ConfigError("no metrics to draw")
+    figure, slots = _grid(len(panels), min(columns, len(panels)), 3.3, 2.3)
     colors = dict(zip(runs, run_colors(len(runs)), strict=True))
-    for k, (title, names) in enumerate(panels):
-        axes = figure.add_subplot(grid[k // columns, k % columns])
-        _draw_panel(axes, title, names, curves, colors, window)
-        if k + columns >= len(panels):
-            axes.set_xlabel("update", fontsize=8, color=INK)
+    for axes, (title, names) in zip(slots, panels.items(), strict=True):
+        _style(axes, title)
+        for run, found in curves.items():
+            for name, dashes in zip(names, DASHES, strict=False):
+                if name in found:
+                    _draw_curve(
+                        axes, *found[name], window, f"{name}-{run}", color=colors[run], linestyle=dashes
+                    )
+        axes.grid(color=LANE, linewidth=0.4, alpha=0.6)
+        axes.set_axisbelow(True)
+        axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        if len(names) > 1:
+            styles = [
+                Line2D([], [], color=INK, linewidth=1.2, linestyle=dashes, label=name)
+                for name, dashes in zip(names, DASHES, strict=False)
+            ]
+            axes.legend(handles=styles, fontsize=6.5, framealpha=0.8, edgecolor="none", handlelength=2.2)
+    for axes in slots[-columns:]:
+        axes.set_xlabel("update", fontsize=8, color=INK)
     handles = [Line2D([], [], color=color, linewidth=2.5, label=name) for name, color in colors.items()]
     figure.legend(
         handles=handles, loc="outside upper left", ncols=min(len(handles), columns), frameon=False, fontsize=9
@@ -144,26 +113,23 @@ def read_curves(records: Records) -> dict[str, tuple[NDArray[np.float64], NDArra
     """Updates [K] and values [K] of each metric; what is no number is left out, NaN is kept."""
     found: dict[str, tuple[list[float], list[float]]] = {}
     for record in records:
-        step = record.get("step", "")
-        if not _is_number(step):
-            continue
         for name, value in record.items():
-            if name != "step" and (value is None or _is_number(value)):
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if name != "step" and (value is None or number):
                 steps, values = found.setdefault(name, ([], []))
-                steps.append(float(step))
+                steps.append(float(record["step"]))
                 values.append(math.nan if value is None else float(value))
     return {name: (np.asarray(steps), np.asarray(values)) for name, (steps, values) in found.items()}
 
 
-def panels_of(present: Sequence[str]) -> list[Panel]:
-    """The panels for the metrics there are."""
-    known = {name for _, names in (*PANELS, *LAST) for name in names}
-    others = [_own_panel(name) for name in present if name not in known]
-    panels = [
-        (title, {name: label for name, label in names.items() if name in present})
-        for title, names in (*PANELS, *others, *LAST)
-    ]
-    return [panel for panel in panels if panel[1]]
+def panels_of(present: Sequence[str]) -> dict[str, list[str]]:
+    """The metrics of each panel by its title, for the metrics there are: in their order, but for the last."""
+    titles = {name: title for title, names in PANELS.items() for name in names}
+    panels: dict[str, list[str]] = {}
+    for name in sorted(present, key=lambda name: LAST.index(name) if name in LAST else -1):
+        title = titles.get(name) or re.sub(r"_p\d+$", "", name).replace("_", " ")
+        panels.setdefault(title, []).append(name)
+    return panels
 
 
 def smoothed(values: NDArray[np.float64], window: float) -> NDArray[np.float64]:
@@ -184,45 +150,74 @@ def run_colors(count: int) -> list[str]:
     return [to_hex(color) for color in colormaps["turbo"](np.linspace(0.05, 0.95, count))]
 
 
-def _draw_panel(
-    axes: Axes,
-    title: str,
-    names: Mapping[str, str],
-    curves: Mapping[str, Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]],
-    colors: Mapping[str, str],
-    window: float,
-) -> None:
-    for run, found in curves.items():
-        for name, dashes in zip(names, DASHES, strict=False):
-            if name not in found:
-                continue
-            steps, values = found[name]
-            raw: dict[str, Any] = {"color": colors[run], "linewidth": 0.7, "alpha": 0.3, "linestyle": dashes}
-            axes.plot(steps, values, **raw, gid=f"raw-{name}-{run}")
-            strong: dict[str, Any] = {"color": colors[run], "linewidth": 1.6, "linestyle": dashes}
-            # A lone record has no line.
-            marker = "o" if np.isfinite(values).sum() == 1 else ""
-            axes.plot(
-                steps, smoothed(values, window), **strong, marker=marker, markersize=4, gid=f"{name}-{run}"
-            )
+def plot_curvature(
+    panels: Mapping[str, tuple[NDArray[Any], NDArray[Any]]], path: str | Path, *, columns: int = 3
+) -> Figure:
+    """Draw how often branching regions of each average curvature are visited, a panel for each agent.
+
+    Bars are shares of all visits, on a root scale: most regions are straight, and the turns are what is to be seen.
+
+    Args:
+        panels: by title, counts [K] of rollouts and of the log in K bins centred at equal steps from -1 to 1 (1/m).
+        path: file to write (png, pdf or svg).
+        columns: panels per row, at most.
+
+    Raises:
+        DataError: no region was visited, or counts differ in their number of bins.
+        ConfigError: a file of another kind.
+    """
+    file = picture_path(path)
+    for title, pair in panels.items():
+        if min(counts.sum() for counts in pair) == 0:
+            raise DataError(f"{title}: no branching region was visited")
+    every = [counts / counts.sum() for pair in panels.values() for counts in pair]
+    if len({len(shares) for shares in every}) > 1:
+        raise DataError("counts differ in their number of bins")
+    centres, width = np.linspace(-1, 1, len(every[0])), 2 / (len(every[0]) - 1)
+    reach = max(LEAST_REACH, *(np.abs(centres[shares > 0]).max() for shares in every)) + 2 * width
+    columns = min(columns, len(panels))
+    figure, slots = _grid(len(panels), columns, 4.2, 2.9)
+    for axes, title, policy, log in zip(slots, panels, every[::2], every[1::2], strict=True):
+        _style(axes, fill(title, TITLE))
+        edges = np.append(centres - width / 2, centres[-1] + width / 2)
+        axes.stairs(log, edges, fill=True, color=LOG_COLOR, alpha=0.6, gid="log")
+        axes.stairs(policy, edges, color=POLICY_COLOR, linewidth=1.5, gid="policy")
+        axes.set_yscale("function", functions=(lambda y: np.sqrt(np.maximum(y, 0)), np.square))
+        axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:g} %")
+        axes.set_yticks([0.001, 0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8])
+        axes.set_xlim(-reach, reach)
+        axes.set_ylim(0, 1.05 * max(shares.max() for shares in every))
+    for axes in slots[-columns:]:
+        axes.set_xlabel("average curvature, 1/m (left turns are positive)", fontsize=8, color=INK)
+    for axes in slots[::columns]:
+        axes.set_ylabel("share of visits", fontsize=8, color=INK)
+    handles = [Patch(color=LOG_COLOR, alpha=0.6, label="log"), Patch(color=POLICY_COLOR, label="policy")]
+    figure.legend(handles=handles, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
+    save(figure, file)
+    return figure
+
+
+def _grid(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of panels, each so many inches wide and high."""
+    rows = -(-count // columns)
+    figure = new_figure(width * columns, height * rows + 0.5)
+    grid = figure.add_gridspec(rows, columns)
+    return figure, [figure.add_subplot(grid[k // columns, k % columns]) for k in range(count)]
+
+
+def _style(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left", fontsize=9, fontweight="bold", color=INK, parse_math=False)
     axes.tick_params(labelsize=7.5, color=LANE, labelcolor=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(LANE)
-    axes.grid(color=LANE, linewidth=0.4, alpha=0.6)
-    axes.set_axisbelow(True)
-    axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    if len(names) > 1:
-        styles = [
-            Line2D([], [], color=INK, linewidth=1.2, linestyle=dashes, label=label)
-            for label, dashes in zip(names.values(), DASHES, strict=False)
-        ]
-        axes.legend(handles=styles, fontsize=6.5, framealpha=0.8, edgecolor="none", handlelength=2.2)
 
 
-def _own_panel(metric: str) -> Panel:
-    return metric, {metric: metric}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _draw_curve(
+    axes: Axes, steps: NDArray[Any], values: NDArray[Any], window: float, gid: str, **style: Any
+) -> None:
+    """A metric of a run, pale as recorded and strong smoothed."""
+    axes.plot(steps, values, linewidth=0.7, alpha=0.3, gid=f"raw-{gid}", **style)
+    # A lone record has no line.
+    marker = "o" if np.isfinite(values).sum() == 1 else ""
+    smooth = smoothed(values, window)
+    axes.plot(steps, smooth, linewidth=1.6, marker=marker, markersize=4, gid=gid, **style)

@@ -1,11 +1,11 @@
-"""Whole pictures: a run segment, rollouts over it, several side by side."""
+"""Whole pictures: a run segment, rollouts over it, the routes of an agent, several side by side."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -36,7 +36,12 @@ from symphony.render.style import (
     with_aspect,
 )
 
+if TYPE_CHECKING:
+    from symphony.saved.rollouts import SavedRollouts
+
 LOG_DASHES = (0, (4, 2))
+ROUTE = "#C2410C"
+"""Colour of the route that the log took."""
 ENTRIES = 8
 """Agents that a legend names; a crowd's would hide the picture."""
 EVENTS = (("collision", "collision", "X"), ("offroad", "off road", "^"))
@@ -50,7 +55,6 @@ def plot_segment(
     interactive: Sequence[int] | None = None,
     view: View | None = None,
     title: str | None = None,
-    legend: bool = True,
 ) -> Axes:
     """Draw a run segment: map, lights and boxes at one step, trails over the whole window.
 
@@ -61,16 +65,13 @@ def plot_segment(
         interactive: agents in colour, along with the ego; by default the segment's ``interest``.
         view: limits in metres; by default around the trails of the agents in colour, on given axes a square.
         title: by default the segment's id.
-        legend: whether to explain the colours.
 
     Raises:
-        ValueError: a step or an agent outside the segment.
         ConfigError: a file of another kind.
     """
     step = segment.current_step if step is None else step
-    if not 0 <= step < segment.num_steps:
-        raise ValueError(f"step {step} outside the {segment.num_steps} steps")
-    chosen = _highlighted(segment, segment.interest.tolist() if interactive is None else interactive)
+    named = segment.interest.tolist() if interactive is None else interactive
+    chosen = list(dict.fromkeys([segment.ego, *(int(agent) for agent in named)]))
     position, valid = segment.position[..., :2], segment.valid
     trails = position[chosen][valid[chosen]]
     view = view or _own_view(trails, target)
@@ -96,78 +97,188 @@ def plot_segment(
             )
     seconds = step * segment.dt
     frame(axes, view, title or segment.segment_id, f"{describe(segment)}   ·   shown at {seconds:.1f} s")
-    if legend:
-        add_legend(axes, [*agent_entries(segment, chosen), playback_entry(), *entries], trails)
+    add_legend(axes, [*agent_entries(segment, chosen), playback_entry(), *entries], trails)
     if path is not None:
         save(axes.figure, path)
     return axes
 
 
-def plot_rollout(
-    segment: RunSegment,
-    position: Any,
-    heading: Any,
-    agent_index: Any,
-    target: Target,
-    *,
-    start: int = 0,
-    valid: Any = None,
-    collision: Any = None,
-    offroad: Any = None,
-    view: View | None = None,
-    title: str | None = None,
-    legend: bool = True,
-) -> Axes:
-    """Draw K rollouts of the interactive agents over the log, with boxes where they end.
+@dataclass
+class Clip:
+    """K rollouts of N agents of a run segment, to be drawn or animated; padding among the agents is left out.
+
+    Attributes:
+        segment: the log.
+        position: [K, N, T, 2] simulated box centres, metres.
+        heading: [K, N, T] radians.
+        agents: [N] which agents of the segment these are; negative for padding.
+        start: step of the log at which the rollouts begin.
+        valid: [K, N, T] bool, or [N, T], all by default; steps that are not, or not finite, are left out.
+        collision: [K, N, T] bool, marked where each collision begins; by default none is known.
+        offroad: [K, N, T] bool, marked where each departure from the road begins.
+        view: limits in metres; by default around rollouts and log of those agents.
+        title: by default the segment's id.
+    """
+
+    segment: RunSegment
+    position: NDArray[Any]
+    heading: NDArray[Any]
+    agents: Any
+    start: int = 0
+    valid: Any = True
+    collision: Any = False
+    offroad: Any = False
+    view: View | None = None
+    title: str | None = None
+
+    def __post_init__(self) -> None:
+        agents = np.asarray(self.agents, np.int64)
+        kept, shape = agents >= 0, self.heading.shape
+        self.agents = agents[kept]
+        self.position, self.heading = (
+            np.asarray(part, np.float64)[:, kept] for part in (self.position, self.heading)
+        )
+        self.valid, self.collision, self.offroad = (
+            np.broadcast_to(flags, shape)[:, kept] for flags in (self.valid, self.collision, self.offroad)
+        )
+        self.valid = self.valid & np.isfinite(self.position).all(-1) & np.isfinite(self.heading)
+
+    @property
+    def steps(self) -> slice:
+        """Steps of the log that the rollouts last."""
+        return slice(self.start, self.start + self.heading.shape[2])
+
+    @property
+    def log(self) -> NDArray[Any]:
+        """[N, T, 2] where the agents were in the log, NaN where they were not."""
+        position = self.segment.position[self.agents, self.steps, :2]
+        return np.where(self.segment.valid[self.agents, self.steps, None], position, np.nan)
+
+    @property
+    def points(self) -> NDArray[Any]:
+        """[P, 2] where the agents are in the rollouts and in the log."""
+        return np.concatenate([self.position[self.valid], self.log.reshape(-1, 2)])
+
+    @property
+    def others(self) -> NDArray[np.int64]:
+        """The agents that play back the log."""
+        return np.setdiff1d(np.arange(self.segment.num_agents), self.agents)
+
+    @property
+    def alpha(self) -> float:
+        """How opaque one of the rollouts is drawn."""
+        return float(np.clip(2.5 / len(self.position), 0.3, 0.9))
+
+    def words(self) -> str:
+        """Such as `16 rollouts, 3 distinct`: leaves of a search may share all of their history."""
+        known = self.valid[..., None]
+        state = np.concatenate([self.position, self.heading[..., None]], -1)
+        rows = np.concatenate([np.where(known, state, 0.0), known], -1).reshape(len(state), -1)
+        count, distinct = len(state), len(np.unique(rows, axis=0))
+        return f"{count} rollout{'s' * (count > 1)}" + (f", {distinct} distinct" if distinct < count else "")
+
+    def beginnings(self, name: str, until: int | None = None) -> NDArray[np.bool_]:
+        """[K, N, T] where each run of true steps of an event begins, up to a step."""
+        happening = getattr(self, name) & self.valid
+        begins = happening & ~np.pad(happening[..., :-1], ((0, 0), (0, 0), (1, 0)))
+        return begins if until is None else begins & (np.arange(begins.shape[-1]) <= until)
+
+
+def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None = None) -> Clip:
+    """The first so many of the saved rollouts of a run segment, all by default, to be drawn or animated."""
+    # The first state is the log's.
+    state = saved.state[:count, 1:].swapaxes(1, 2)
+    valid, collision, offroad = (
+        part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad)
+    )
+    place = state[..., :2], state[..., 2], saved.agents, saved.start + 1
+    return Clip(saved.segment, *place, valid, collision, offroad, title=title)
+
+
+def plot_rollout(clip: Clip, target: Target) -> Axes:
+    """Draw rollouts of the interactive agents over the log, with boxes where they end.
 
     Playback agents, and the lights, are shown as logged at the last step; those that were hit also where that was.
 
     Args:
-        segment: the log.
-        position: [K, N, T, 2] simulated box centres, metres.
-        heading: [K, N, T] radians.
-        agent_index: [N] which agents of the segment these are; negative for padding.
+        clip: the rollouts.
         target: file to write (png, pdf or svg) or axes to draw on.
-        start: step of the log at which the rollouts begin.
-        valid: [N, T] or [K, N, T] bool, all by default; steps that are not are left out.
-        collision: [K, N, T] bool, crossed out where each collision begins.
-        offroad: [K, N, T] bool, marked by a triangle where each departure begins.
-        view: limits in metres; by default around rollouts and log of those agents, on given axes a square.
-        title: by default the segment's id.
-        legend: whether to explain the colours.
 
     Raises:
-        ValueError: shapes that don't fit together, or steps outside the log.
         ConfigError: a file of another kind.
     """
-    runs = Rollouts.of(segment, position, heading, agent_index, start, valid, collision, offroad)
-    steps = runs.position.shape[2]
-    last = start + steps - 1
-    log = segment.position[runs.agents, start : last + 1, :2]
-    logged = segment.valid[runs.agents, start : last + 1]
-    trails = np.concatenate([runs.position[runs.valid], log[logged]])
-    view = view or _own_view(trails, target)
+    segment, last, trails = clip.segment, clip.steps.stop - 1, clip.points
+    view = clip.view or _own_view(trails, target)
     axes, path = open_target(target, view)
-
     entries = draw_roads(axes, segment.road, view) + draw_signals(axes, segment, last, view)
-    others = np.setdiff1d(np.arange(segment.num_agents), runs.agents)
-    draw_playback(axes, segment, last, others)
-    hit = draw_hit(axes, segment, runs, others, start)
-    for rank, (agent, color) in enumerate(zip(runs.agents, colors_of(segment, runs.agents), strict=True)):
-        shown = np.where(logged[rank, :, None], log[rank], np.nan)
-        axes.plot(*shown.T, color=INK, linestyle=LOG_DASHES, linewidth=1.4, zorder=9, gid=f"log-{agent}")
-        _draw_agent(axes, runs, rank, segment.size[agent], color)
-    marks = [draw_events(axes, runs, *event) for event in EVENTS]
-    subtitle = f"{describe(segment)}   ·   {runs.words()} of {(steps - 1) * segment.dt:.1f} s"
-    frame(axes, view, title or segment.segment_id, subtitle)
-    if legend:
-        logline = Line2D([], [], color=INK, linestyle=LOG_DASHES, linewidth=1.4, label="log")
-        playback = playback_entry("playback, at the end")
-        found = filter(None, [hit, *marks])
-        explained = [*agent_entries(segment, runs.agents), logline, playback, *found, *entries]
-        add_legend(axes, explained, trails)
+    draw_playback(axes, segment, last, clip.others)
+    hit = draw_hit(axes, clip)
+    style: dict[str, Any] = {"color": INK, "linestyle": LOG_DASHES, "linewidth": 1.4}
+    for rank, (agent, color) in enumerate(zip(clip.agents, colors_of(segment, clip.agents), strict=True)):
+        axes.plot(*clip.log[rank].T, zorder=9, gid=f"log-{agent}", **style)
+        draw_ways(axes, clip, rank, color, width=1.6, gid=f"rollouts-{agent}")
+        seen = clip.valid[:, rank]
+        k = np.flatnonzero(seen.any(1))
+        if len(k):
+            t = seen.shape[1] - 1 - seen[k, ::-1].argmax(1)
+            size = np.broadcast_to(segment.size[agent], (len(k), 3))
+            at = clip.position[k, rank, t], clip.heading[k, rank, t], size
+            draw_boxes(axes, *at, color, alpha=max(clip.alpha, 0.45), gid=f"ends-{agent}")
+    marks = [draw_events(axes, clip, *event) for event in EVENTS]
+    duration = (clip.heading.shape[2] - 1) * segment.dt
+    subtitle = f"{describe(segment)}   ·   {clip.words()} of {duration:.1f} s"
+    frame(axes, view, clip.title or segment.segment_id, subtitle)
+    explained = [*agent_entries(segment, clip.agents), Line2D([], [], label="log", **style)]
+    found = filter(None, [hit, *marks])
+    add_legend(axes, [*explained, playback_entry("playback, at the end"), *found, *entries], trails)
     if path is not None:
         save(axes.figure, path)
+    return axes
+
+
+def plot_routes(
+    segment: RunSegment,
+    agent: int,
+    lines: Sequence[NDArray[Any]],
+    logged: int,
+    target: Target,
+    *,
+    step: int = 0,
+) -> Axes:
+    """Draw the routes of an agent, a dot for each of their points, the one that it took on top, and its log.
+
+    Args:
+        segment: the run segment.
+        agent: row of it.
+        lines: points [P, 2] of the routes.
+        logged: which of them it took, -1 for none.
+        target: file to write (png, pdf or svg) or axes to draw on.
+        step: at which boxes are shown.
+    """
+    path = segment.position[agent, :, :2][segment.valid[agent]]
+    places = np.concatenate([path, *lines])
+    view = _own_view(places, target)
+    axes, file = open_target(target, view)
+    entries = draw_roads(axes, segment.road, view)
+    draw_playback(axes, segment, step, np.setdiff1d(np.arange(segment.num_agents), [agent]))
+    style: dict[str, Any] = {"marker": ".", "markersize": 2.2, "solid_capstyle": "butt"}
+    own = colors_of(segment, np.array([segment.ego]))[0]
+    for number, line in enumerate(lines):
+        if number != logged:
+            axes.plot(*line.T, color=own, linewidth=0.7, alpha=0.75, zorder=8, **style)
+    shown = [Line2D([], [], color=own, linewidth=1.0, marker=".", label=f"feasible route ({len(lines)})")]
+    if logged >= 0:
+        axes.plot(*lines[logged].T, color=ROUTE, linewidth=1.6, zorder=9, **style)
+        shown.append(Line2D([], [], color=ROUTE, linewidth=1.6, marker=".", label="the one that was taken"))
+    axes.plot(*path.T, color=INK, linestyle=LOG_DASHES, linewidth=1.1, zorder=9.5)
+    shown.append(Line2D([], [], color=INK, linestyle=LOG_DASHES, linewidth=1.1, label="log"))
+    if segment.valid[agent, step]:
+        box = segment.position[[agent], step, :2], segment.heading[[agent], step], segment.size[[agent]]
+        draw_boxes(axes, *box, own, gid=f"box-{agent}")
+    frame(axes, view, f"{segment.segment_id}, agent {segment.agent_id[agent]}", describe(segment))
+    add_legend(axes, [*shown, *entries], places)
+    if file is not None:
+        save(axes.figure, file)
     return axes
 
 
@@ -184,11 +295,8 @@ def plot_grid(
         size: inches a picture is wide and high.
 
     Raises:
-        ValueError: no panels.
         ConfigError: a file of another kind.
     """
-    if not panels:
-        raise ValueError("no panels to draw")
     file = picture_path(path)
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
@@ -206,115 +314,30 @@ def _own_view(trails: NDArray[Any], target: Target) -> View:
     return with_aspect(view) if isinstance(target, Axes) else view
 
 
-@dataclass(frozen=True)
-class Rollouts:
-    """K rollouts of the N agents that are not padding; see :func:`plot_rollout` for the arrays."""
-
-    position: NDArray[np.float64]
-    heading: NDArray[np.float64]
-    valid: NDArray[np.bool_]
-    agents: NDArray[np.int64]
-    collision: NDArray[np.bool_] | None
-    offroad: NDArray[np.bool_] | None
-
-    @classmethod
-    def of(
-        cls,
-        segment: RunSegment,
-        position: Any,
-        heading: Any,
-        agents: Any,
-        start: int,
-        valid: Any,
-        collision: Any,
-        offroad: Any,
-    ) -> Rollouts:
-        """Check what was given against the segment and leave the padding out."""
-        position, heading = np.asarray(position, np.float64), np.asarray(heading, np.float64)
-        agents = np.asarray(agents, np.int64)
-        shape = heading.shape
-        if len(shape) != 3 or position.shape != (*shape, 2):
-            raise ValueError(f"position {position.shape}, heading {shape}: must be [K, N, T, 2], [K, N, T]")
-        if agents.shape != shape[1:2] or (agents >= segment.num_agents).any():
-            raise ValueError(f"agent_index {agents.tolist()}: must name {shape[1]} agents of the segment")
-        if start < 0 or start + shape[2] > segment.num_steps:
-            end = start + shape[2] - 1
-            raise ValueError(f"steps {start} to {end} are outside the {segment.num_steps} of the log")
-        seen = np.broadcast_to(np.ones((), bool) if valid is None else np.asarray(valid, bool), shape)
-        seen = seen & np.isfinite(position).all(-1) & np.isfinite(heading)
-        events = []
-        for name, event in (("collision", collision), ("offroad", offroad)):
-            array = None if event is None else np.asarray(event, bool)
-            if array is not None and array.shape != shape:
-                raise ValueError(f"{name} {array.shape}: must be [K, N, T] = {list(shape)}")
-            events.append(array)
-        kept = agents >= 0
-        cut = [None if array is None else array[:, kept] for array in events]
-        return cls(position[:, kept], heading[:, kept], seen[:, kept], agents[kept], cut[0], cut[1])
-
-    @property
-    def distinct(self) -> int:
-        """How many of the rollouts differ: leaves of a search may share all of their history."""
-        known = self.valid[..., None]
-        state = np.concatenate([self.position, self.heading[..., None]], -1)
-        rows = np.concatenate([np.where(known, state, 0.0), known], -1).reshape(len(state), -1)
-        return len(np.unique(rows, axis=0))
-
-    def words(self) -> str:
-        """Such as `16 rollouts, 3 distinct`."""
-        count = len(self.position)
-        same = f", {self.distinct} distinct" if self.distinct < count else ""
-        return f"{count} rollout{'s' if count > 1 else ''}{same}"
-
-    def until(self, step: int) -> Rollouts:
-        """As if they ended after a step."""
-        past = slice(0, step + 1)
-        return Rollouts(
-            self.position[:, :, past],
-            self.heading[:, :, past],
-            self.valid[:, :, past],
-            self.agents,
-            None if self.collision is None else self.collision[:, :, past],
-            None if self.offroad is None else self.offroad[:, :, past],
-        )
+def draw_ways(
+    axes: Axes,
+    clip: Clip,
+    rank: int,
+    color: str,
+    *,
+    width: float,
+    until: int | None = None,
+    gid: str | None = None,
+) -> None:
+    """Draw the way of one of the agents in every rollout, up to a step."""
+    past = slice(None if until is None else until + 1)
+    ways = zip(clip.position[:, rank, past], clip.valid[:, rank, past], strict=True)
+    lines = [step for way, valid in ways for step in pieces(way, valid)[0]]
+    colors = [to_rgba(color, clip.alpha)]
+    drawn = LineCollection(lines, colors=colors, linewidths=width, zorder=8, gid=gid)
+    axes.add_collection(drawn, autolim=False)
 
 
-def _draw_agent(axes: Axes, runs: Rollouts, rank: int, size: NDArray[Any], color: str) -> None:
-    """One agent's path in every rollout, and its box at the last valid step of each."""
-    agent, count = runs.agents[rank], len(runs.position)
-    lines: list[NDArray[Any]] = []
-    ends: list[tuple[int, int]] = []
-    for k in range(count):
-        valid = runs.valid[k, rank]
-        lines.extend(pieces(runs.position[k, rank], valid)[0])
-        if valid.any():
-            ends.append((k, int(np.flatnonzero(valid)[-1])))
-    alpha = float(np.clip(2.5 / count, 0.3, 0.9))
-    axes.add_collection(
-        LineCollection(
-            lines, colors=[to_rgba(color, alpha)], linewidths=1.6, zorder=8, gid=f"rollouts-{agent}"
-        ),
-        autolim=False,
-    )
-    if ends:
-        k, t = np.asarray(ends).T
-        sizes = np.broadcast_to(size, (len(k), len(size)))
-        at = runs.position[k, rank, t], runs.heading[k, rank, t], sizes
-        draw_boxes(axes, *at, color, alpha=max(alpha, 0.45), gid=f"ends-{agent}")
-
-
-def beginnings(runs: Rollouts, name: str) -> NDArray[np.bool_]:
-    """[K, N, T] where each run of true steps of an event begins; nowhere if it is not known."""
-    event = getattr(runs, name)
-    if event is None:
-        return np.zeros_like(runs.valid)
-    happening = event & runs.valid
-    return happening & ~np.pad(happening[..., :-1], ((0, 0), (0, 0), (1, 0)))
-
-
-def draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str) -> Line2D | None:
-    """Mark where each run of true steps of an event begins; None where there is none."""
-    points = runs.position[beginnings(runs, name)]
+def draw_events(
+    axes: Axes, clip: Clip, name: str, label: str, marker: str, until: int | None = None
+) -> Line2D | None:
+    """Mark where each run of true steps of an event begins, up to a step; None where there is none."""
+    points = clip.position[clip.beginnings(name, until)]
     if len(points) == 0:
         return None
     style: dict[str, Any] = {"marker": marker, "linewidths": 0.9, "edgecolors": "white"}
@@ -322,23 +345,25 @@ def draw_events(axes: Axes, runs: Rollouts, name: str, label: str, marker: str) 
     return Line2D([], [], linestyle="none", marker=marker, color=INK, markersize=6.5, label=label)
 
 
-def draw_hit(
-    axes: Axes, segment: RunSegment, runs: Rollouts, others: NDArray[Any], start: int
-) -> Patch | None:
-    """Outline the playback agents among ``others`` [K] that were hit, where they were when it began.
+def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
+    """Outline the playback agents that were hit, where they were when it began.
 
     Returns:
         Legend entry, None where nobody was hit.
     """
+    segment = clip.segment
     found: set[tuple[int, int]] = set()
-    for rollout, rank, at in np.argwhere(beginnings(runs, "collision")).tolist():
-        step = start + at
-        near = others[segment.valid[others, step]]
-        boxes = [_box(segment.position[a, step], segment.heading[a, step], segment.size[a]) for a in near]
-        own = _box(
-            runs.position[rollout, rank, at], runs.heading[rollout, rank, at], segment.size[runs.agents[rank]]
+    for rollout, rank, at in np.argwhere(clip.beginnings("collision")).tolist():
+        step = clip.start + at
+        near = clip.others[segment.valid[clip.others, step]]
+        size = segment.size[clip.agents[[rank]]]
+        own = shapely.Polygon(
+            place(CORNERS, clip.position[[rollout], rank, at], clip.heading[[rollout], rank, at], size)[0]
         )
-        found |= {(int(agent), step) for agent, box in zip(near, boxes, strict=True) if own.intersects(box)}
+        boxes = shapely.polygons(
+            place(CORNERS, segment.position[near, step], segment.heading[near, step], segment.size[near])
+        )
+        found |= {(int(agent), step) for agent in near[shapely.intersects(own, boxes)]}
     if not found:
         return None
     agent, step = np.array(sorted(found)).T
@@ -346,10 +371,6 @@ def draw_hit(
     style: dict[str, Any] = {"facecolors": [to_rgba(PLAYBACK, 0.55)], "edgecolors": INK, "linewidths": 0.8}
     axes.add_collection(PolyCollection(list(corners), zorder=7.8, gid="hit", **style), autolim=False)
     return Patch(facecolor=to_rgba(PLAYBACK, 0.55), edgecolor=INK, label="playback, when it was hit")
-
-
-def _box(position: NDArray[Any], heading: float, size: NDArray[Any]) -> shapely.Polygon:
-    return shapely.Polygon(place(CORNERS, position[None], np.array([heading]), size[None])[0])
 
 
 def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[Any]) -> None:
@@ -360,16 +381,8 @@ def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[An
         draw_boxes(axes, *at, PLAYBACK, zorder=7.5, gid="playback")
 
 
-def _highlighted(segment: RunSegment, interactive: Sequence[int]) -> list[int]:
-    """The ego, then the interactive agents, each once."""
-    chosen = list(dict.fromkeys([segment.ego, *(int(agent) for agent in interactive)]))
-    if min(chosen) < 0 or max(chosen) >= segment.num_agents:
-        raise ValueError(f"interactive {chosen[1:]}: the segment has {segment.num_agents} agents")
-    return chosen
-
-
 def colors_of(segment: RunSegment, agents: Any) -> list[str]:
-    """One for each agent: the ego's is the same in every picture."""
+    """A colour for each agent: the ego's is the same in every picture."""
     others = [int(agent) for agent in agents if agent != segment.ego]
     return [agent_color(0 if agent == segment.ego else 1 + others.index(int(agent))) for agent in agents]
 

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
 from symphony.render.style import BOUNDARY, CAUTION, GO, INK, LANE, MARK, ROAD, STOP, View
+from symphony.render.viewer.pack import BIKE_WIDTH, DEFAULT_WIDTH
 
-DEFAULT_WIDTH = 3.6
-"""Metres, for lanes whose width the source does not give."""
-BIKE_WIDTH = 1.6
 SLIT = 0.4
 ARROW_SPACING = 14.0
 ARROW = np.array([(-0.7, 0.7), (0.0, 0.0), (-0.7, -0.7)])

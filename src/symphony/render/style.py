@@ -45,6 +45,7 @@ GO = "#009E73"
 
 FORMATS = ("png", "pdf", "svg")
 ANIMATIONS = ("gif",)
+FILMS = ("mp4",)
 
 Corner = Literal["upper right", "upper left", "lower right"]
 Target = str | Path | Axes

@@ -1,9 +1,9 @@
-"""Rollouts as they unfold, in an animated picture."""
+"""Rollouts as they unfold, in an animated picture or a film."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_rgba
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
@@ -20,25 +19,29 @@ from matplotlib.offsetbox import AnchoredOffsetbox
 from numpy.typing import NDArray
 from PIL import Image
 
-from symphony.data.segment import RunSegment
+from symphony.errors import ConfigError
 from symphony.files import replacing
-from symphony.render.agents import CORNERS, draw_boxes, pieces, place
+from symphony.render.agents import CORNERS, draw_boxes, place
 from symphony.render.plots import (
     EVENTS,
     LOG_DASHES,
-    Rollouts,
+    Clip,
     agent_entries,
     colors_of,
     describe,
     draw_events,
     draw_playback,
+    draw_ways,
     playback_entry,
+    plot_grid,
+    plot_rollout,
 )
 from symphony.render.roads import draw_roads, draw_signals
 from symphony.render.style import (
     ANIMATIONS,
+    FILMS,
+    FORMATS,
     INK,
-    View,
     add_caption,
     add_legend,
     frame,
@@ -48,28 +51,59 @@ from symphony.render.style import (
     with_aspect,
 )
 
+SMOOTH = 25
+"""Frames a second of a film that a player is sure to keep up with; slower clips repeat frames."""
 FRAMES = 51
-"""In an animation, at most; steps are left out evenly where there are more."""
+"""Frames of an animation, at most; steps are left out evenly where there are more."""
 HEAD = 0.45
 """Inches for the title of a panel."""
 COLORS = 255
-"""Of an animation: one less than the format has, which then marks what stays as it was."""
+"""Colours of an animation: one less than the format has, which then marks what stays as it was."""
 
 
-@dataclass(frozen=True)
-class Clip:
-    """K rollouts to be animated; the fields are the arguments of :func:`symphony.render.plot_rollout`."""
+def draw_clips(clips: Sequence[Clip], path: Path, columns: int = 3) -> None:
+    """Draw, animate or film rollouts beside the log.
 
-    segment: RunSegment
-    position: Any
-    heading: Any
-    agent_index: Any
-    start: int = 0
-    valid: Any = None
-    collision: Any = None
-    offroad: Any = None
-    view: View | None = None
-    title: str | None = None
+    Args:
+        clips: rollouts of one run segment each.
+        path: file to write: an animation if it ends in .gif, a film if it ends in .mp4, else a picture.
+        columns: panels per row, at most.
+
+    Raises:
+        ConfigError: a file of another kind, or the encoder of films is not installed.
+    """
+    kind = picture_path(path, (*FORMATS, *ANIMATIONS, *FILMS)).suffix[1:].lower()
+    if kind in FILMS:
+        write_film(clips, path, columns=columns)
+    elif kind in ANIMATIONS:
+        animate_rollouts(clips, path, columns=columns)
+    else:
+        plot_grid([partial(plot_rollout, clip) for clip in clips], path, columns=columns)
+
+
+def write_film(clips: Sequence[Clip], path: Path, *, columns: int = 3, size: float = 5.0) -> None:
+    """What :func:`animate_rollouts` draws, as a film (H.264).
+
+    Raises:
+        ConfigError: the encoder is not installed.
+    """
+    try:
+        import imageio_ffmpeg  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise ConfigError("a film needs an encoder: pip install 'symphony-traffic[video]'") from error
+    frames, interval = frames_of(clips, columns=columns, size=size)
+    # The format wants even sides.
+    height, width = (side - side % 2 for side in frames[0].shape[:2])
+    repeat = max(1, round(SMOOTH * interval))
+    with replacing(path) as draft:
+        writer = imageio_ffmpeg.write_frames(
+            str(draft), (width, height), fps=repeat / interval, macro_block_size=2
+        )
+        writer.send(None)
+        for frame in frames:
+            for _ in range(repeat):
+                writer.send(np.ascontiguousarray(frame[:height, :width]))
+        writer.close()
 
 
 def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 3, size: float = 3.6) -> None:
@@ -86,7 +120,6 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
         size: inches a panel is wide, and high at most.
 
     Raises:
-        ValueError: no clips, shapes that don't fit together, or steps outside the log.
         ConfigError: a file of another kind.
     """
     file = picture_path(path, ANIMATIONS)
@@ -98,8 +131,6 @@ def frames_of(
     clips: Sequence[Clip], *, columns: int = 3, size: float = 3.6
 ) -> tuple[list[NDArray[np.uint8]], float]:
     """The frames [H, W, 3] of :func:`animate_rollouts`, and the seconds between two of them."""
-    if not clips:
-        raise ValueError("no rollouts to animate")
     panels = [_Panel(clip) for clip in clips]
     figure = _lay_out(panels, min(columns, len(clips)), size)
     canvas = FigureCanvasAgg(figure)
@@ -128,27 +159,8 @@ class _Panel:
     """Rollouts of one segment on axes of their own, which hold only what never moves."""
 
     def __init__(self, clip: Clip) -> None:
-        segment = clip.segment
-        runs = Rollouts.of(
-            segment,
-            clip.position,
-            clip.heading,
-            clip.agent_index,
-            clip.start,
-            clip.valid,
-            clip.collision,
-            clip.offroad,
-        )
-        self.segment, self.runs, self.start = segment, runs, clip.start
-        self.title = clip.title or segment.segment_id
-        self.steps = runs.position.shape[2]
-        self.others = np.setdiff1d(np.arange(segment.num_agents), runs.agents)
-        within = slice(clip.start, clip.start + self.steps)
-        log, logged = segment.position[runs.agents, within, :2], segment.valid[runs.agents, within]
-        self.log = np.where(logged[..., None], log, np.nan)
-        self.trails = np.concatenate([runs.position[runs.valid], log[logged]])
-        self.given = clip.view is not None
-        self.view = clip.view or view_around(self.trails)
+        self.clip, self.segment, self.steps = clip, clip.segment, clip.heading.shape[2]
+        self.view = clip.view or view_around(clip.points)
 
     @property
     def aspect(self) -> float:
@@ -157,20 +169,20 @@ class _Panel:
 
     def settle(self, axes: Axes) -> None:
         """Draw what never moves."""
-        self.axes, agents = axes, self.runs.agents
+        self.axes, clip = axes, self.clip
         entries = draw_roads(axes, self.segment.road, self.view)
         line: dict[str, Any] = {"color": INK, "linestyle": LOG_DASHES, "linewidth": 0.9}
-        for agent, way in zip(agents, self.log, strict=True):
+        for agent, way in zip(clip.agents, clip.log, strict=True):
             axes.plot(*way.T, zorder=5, gid=f"log-{agent}", **line)
         # The blanks are room for the seconds.
-        caption = f"{describe(self.segment)}   ·   {self.runs.words()}"
-        frame(axes, self.view, self.title, caption + " " * 12)
+        caption = f"{describe(self.segment)}   ·   {clip.words()}"
+        frame(axes, self.view, clip.title or self.segment.segment_id, caption + " " * 12)
         axes.set_anchor("N")
         self.still = set(axes.get_children())
         marks = self._draw_moving(self.steps - 1)
         self._remove_moving()
-        legend = [*agent_entries(self.segment, agents), Line2D([], [], label="log", **line), playback_entry()]
-        add_legend(axes, [*legend, *marks, *entries], self.trails)
+        legend = [*agent_entries(self.segment, clip.agents), Line2D([], [], label="log", **line)]
+        add_legend(axes, [*legend, playback_entry(), *marks, *entries], clip.points)
         self.still = set(axes.get_children())
 
     def above(self) -> list[Artist]:
@@ -186,38 +198,23 @@ class _Panel:
 
     def _draw_moving(self, at: int) -> list[Line2D]:
         """Add what moves, as it is at one of the steps; returns legend entries for lights and events."""
-        axes, segment, runs, step = self.axes, self.segment, self.runs, self.start + at
+        axes, segment, clip, step = self.axes, self.segment, self.clip, self.clip.start + at
         marks = draw_signals(axes, segment, step, self.view)
-        draw_playback(axes, segment, step, self.others)
-        alpha = float(np.clip(2.5 / len(runs.position), 0.3, 0.9))
-        for rank, (agent, color) in enumerate(zip(runs.agents, colors_of(segment, runs.agents), strict=True)):
-            past = slice(0, at + 1)
-            ways = [
-                pieces(way[past], seen[past])[0]
-                for way, seen in zip(runs.position[:, rank], runs.valid[:, rank], strict=True)
-            ]
-            axes.add_collection(
-                LineCollection(
-                    list(np.concatenate(ways)), colors=[to_rgba(color, alpha)], linewidths=1.4, zorder=8
-                ),
-                autolim=False,
-            )
-            here = runs.valid[:, rank, at]
-            position, heading = runs.position[here, rank, at], runs.heading[here, rank, at]
+        draw_playback(axes, segment, step, clip.others)
+        for rank, (agent, color) in enumerate(zip(clip.agents, colors_of(segment, clip.agents), strict=True)):
+            draw_ways(axes, clip, rank, color, width=1.4, until=at)
+            here = clip.valid[:, rank, at]
+            position, heading = clip.position[here, rank, at], clip.heading[here, rank, at]
             size = np.broadcast_to(segment.size[agent], (len(position), 3))
-            draw_boxes(axes, position, heading, size, color, alpha=max(alpha, 0.45), gid=f"box-{agent}")
-        self._draw_log(step)
-        marks += filter(None, (draw_events(axes, runs.until(at), *event) for event in EVENTS))
-        add_caption(axes, f"{step * segment.dt:.1f} s", right=True)
-        return marks
-
-    def _draw_log(self, step: int) -> None:
-        """Outline where the interactive agents were."""
-        segment = self.segment
-        seen = self.runs.agents[segment.valid[self.runs.agents, step]]
+            draw_boxes(axes, position, heading, size, color, alpha=max(clip.alpha, 0.45), gid=f"box-{agent}")
+        # The interactive agents are outlined where they were in the log.
+        seen = clip.agents[segment.valid[clip.agents, step]]
         boxes = place(CORNERS, segment.position[seen, step], segment.heading[seen, step], segment.size[seen])
         style: dict[str, Any] = {"facecolors": "none", "edgecolors": INK, "linewidths": 0.7, "zorder": 11}
-        self.axes.add_collection(PolyCollection(list(boxes), gid="log", **style), autolim=False)
+        axes.add_collection(PolyCollection(list(boxes), gid="log", **style), autolim=False)
+        marks += filter(None, (draw_events(axes, clip, *event, until=at) for event in EVENTS))
+        add_caption(axes, f"{step * segment.dt:.1f} s", right=True)
+        return marks
 
     def _moving(self) -> list[Artist]:
         return [artist for artist in self.axes.get_children() if artist not in self.still]
@@ -231,7 +228,7 @@ def _lay_out(panels: Sequence[_Panel], columns: int, size: float) -> Figure:
     """A figure with the panels settled in it, all of one size as far as nobody said what they show."""
     aspect = min(1.0, max(panel.aspect for panel in panels))
     for panel in panels:
-        if not panel.given:
+        if panel.clip.view is None:
             panel.view = with_aspect(panel.view, aspect)
     lines = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     heights = [size * min(1.0, max(panel.aspect for panel in line)) + HEAD for line in lines]

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 from symphony.roadgraph.routes import (
     Route,
-    feasible_routes,
     ground_truth_routes,
     route_errors,
     route_line,
@@ -27,7 +26,6 @@ __all__ = [
     "Route",
     "blend",
     "centre_line",
-    "feasible_routes",
     "ground_truth_routes",
     "lane_of",
     "route_errors",

@@ -17,6 +17,9 @@ LATERAL = 3.0
 TURN = math.pi / 3
 """Largest angle between a vehicle and its lane."""
 
+MARGIN = 1.5
+"""Metres by which a lane may be farther away than the nearest and is still one that a vehicle may be on."""
+
 _TIE = 0.25
 """Metres by which distances must differ to decide between lanes before the heading does."""
 
@@ -29,19 +32,17 @@ def lane_of(
     heading: NDArray[Any],
     *,
     tolerance: float = LATERAL,
-    max_turn: float = TURN,
 ) -> Indices:
     """Lane of each vehicle, -1 where there is none.
 
-    The nearest centre line that points the same way within ``max_turn``. Lanes within a quarter of a metre of the
-    nearest are told apart by heading, then by index.
+    It is the nearest centre line that points the same way within :data:`TURN`. Lanes within a quarter of a metre of
+    the nearest are told apart by heading, then by index.
 
     Args:
         graph: the lane graph.
         position: [..., 2] metres.
         heading: [...] radians.
         tolerance: largest distance from the centre line, metres.
-        max_turn: largest angle to the lane, radians.
 
     Raises:
         ValueError: a position or heading that is not finite; names the vehicle.
@@ -50,23 +51,15 @@ def lane_of(
     wrong = np.argwhere(~(np.isfinite(position).all(-1) & np.isfinite(heading)))
     if len(wrong):
         raise ValueError(f"vehicle {wrong[0].tolist()}: a position or heading that is not finite")
-    near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance, max_turn)
+    near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance)
     return _nearest(graph, near, turn, position[..., 0].size).reshape(position.shape[:-1])
 
 
-def starting_lanes(
-    graph: LaneGraph,
-    position: NDArray[Any],
-    heading: float,
-    *,
-    margin: float = 1.5,
-    tolerance: float = LATERAL,
-    max_turn: float = TURN,
-) -> list[tuple[int, float]]:
+def starting_lanes(graph: LaneGraph, position: NDArray[Any], heading: float) -> list[tuple[int, float]]:
     """Every lane one vehicle may be on: inside a junction, where lanes overlap, usually several.
 
-    Lanes at most ``margin`` metres farther away than the nearest one. Of a lane and its successor only the one
-    that the vehicle is alongside is kept. The lane that :func:`lane_of` names comes first, then by distance.
+    These are lanes at most :data:`MARGIN` metres farther away than the nearest one. Of a lane and its successor only
+    the one that the vehicle is alongside is kept. The lane that :func:`lane_of` names comes first, then by distance.
 
     Returns:
         Pairs (lane, metres from the lane's start); empty if the vehicle is on no lane.
@@ -77,14 +70,14 @@ def starting_lanes(
     position = np.asarray(position, dtype=np.float64).reshape(1, 2)
     if not (np.isfinite(position).all() and np.isfinite(heading)):
         raise ValueError("a position or heading that is not finite")
-    near, turn = _compatible(graph, position, np.array([heading]), tolerance, max_turn)
+    near, turn = _compatible(graph, position, np.array([heading]), LATERAL)
     if len(near.line) == 0:
         return []
     best = int(_nearest(graph, near, turn, 1)[0])
     found = {
         int(graph.usable_lanes[k]): (float(distance), float(along))
         for k, distance, along in zip(near.line, near.distance, near.along, strict=True)
-        if distance <= near.distance.min() + margin or graph.usable_lanes[k] == best
+        if distance <= near.distance.min() + MARGIN or graph.usable_lanes[k] == best
     }
     past = {k for k in found if found[k][1] >= graph.length[k] - 1e-6}
     gone = {k for k in past if any(s in found for s in graph.successors[k])}
@@ -108,10 +101,10 @@ def _nearest(graph: LaneGraph, near: Near, turn: NDArray[np.float64], count: int
 
 
 def _compatible(
-    graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], tolerance: float, max_turn: float
+    graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], tolerance: float
 ) -> tuple[Near, NDArray[np.float64]]:
     near = graph.index.near(position, tolerance)
     turn = turn_between(near.heading, np.asarray(heading, dtype=np.float64)[near.point])
-    keep = turn <= max_turn
+    keep = turn <= TURN
     point, line, distance, along, direction = near
     return Near(point[keep], line[keep], distance[keep], along[keep], direction[keep]), turn[keep]

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import shapely
@@ -17,42 +17,6 @@ from symphony.roadgraph.lines import Bools, Indices, LineIndex, Reals
 
 BIKE_LANE = 3
 """The lane type that vehicles keep off (see ``LaneType``)."""
-
-
-class Lines(Protocol):
-    """Ragged polylines: line k is ``points[offsets[k]:offsets[k + 1]]``."""
-
-    @property
-    def points(self) -> NDArray[Any]:
-        """[P, 2 or more]."""
-
-    @property
-    def offsets(self) -> NDArray[Any]:
-        """[K + 1]."""
-
-
-class Road(Protocol):
-    """The part of ``symphony.data.segment.RoadMap`` that a lane graph needs."""
-
-    @property
-    def lanes(self) -> Lines:
-        """Centre lines in the direction of travel."""
-
-    @property
-    def lane_type(self) -> NDArray[Any]:
-        """[L]."""
-
-    @property
-    def successors(self) -> NDArray[Any]:
-        """[E, 2] lane indices (from, to)."""
-
-    @property
-    def left_neighbors(self) -> NDArray[Any]:
-        """[E', 2] lane indices (lane, the lane on its left)."""
-
-    @property
-    def right_neighbors(self) -> NDArray[Any]:
-        """[E'', 2] lane indices (lane, the lane on its right)."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +51,7 @@ class LaneGraph:
     are not connected to anything and match no position.
 
     Args:
-        road: the map.
+        road: a :class:`symphony.data.segment.RoadMap`.
         exclude: lane types to leave out.
 
     Raises:
@@ -110,7 +74,7 @@ class LaneGraph:
         gentle: of lanes that were looked at already, see :func:`symphony.roadgraph.paths.gentle`.
     """
 
-    def __init__(self, road: Road, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
+    def __init__(self, road: Any, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
         points = np.asarray(road.lanes.points, dtype=np.float64)[:, :2]
         self.lines = [_distinct(points[a:b]) for a, b in pairwise(road.lanes.offsets)]
         self.arc = [_arc(line) for line in self.lines]

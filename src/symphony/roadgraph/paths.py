@@ -153,7 +153,7 @@ def gentle(graph: LaneGraph, lane: int) -> bool:
 
 
 def own_sharpest(graph: LaneGraph, lanes: Sequence[int]) -> float:
-    """The same of lanes themselves, were each to begin where the one before it ends."""
+    """What :func:`sharpest` gives for lanes themselves, were each to begin where the one before it ends."""
     parts, end = [graph.lines[lanes[0]]], graph.lines[lanes[0]][-1]
     for lane in lanes[1:]:
         line = graph.lines[lane] - graph.lines[lane][0] + end

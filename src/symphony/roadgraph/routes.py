@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from symphony.geometry.stations import stations_along, to_pieces
-from symphony.roadgraph.assign import starting_lanes
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Reals, turn_between
 from symphony.roadgraph.paths import (
@@ -72,23 +71,6 @@ Path = tuple[float, Route]
 """How far a route reaches ahead of the vehicle, in metres, and the route."""
 
 
-def feasible_routes(
-    graph: LaneGraph,
-    position: NDArray[Any],
-    heading: float,
-    *,
-    horizon: float = HORIZON,
-    limit: int = LIMIT,
-    lane_change: bool = True,
-) -> list[Route]:
-    """Routes of one vehicle from every lane it may be on; empty if it is on none.
-
-    See :func:`routes` for the order and :func:`symphony.roadgraph.assign.starting_lanes` for the lanes.
-    """
-    starts = starting_lanes(graph, position, heading)
-    return routes(graph, starts, horizon=horizon, limit=limit, lane_change=lane_change)
-
-
 def routes(
     graph: LaneGraph,
     starts: Sequence[tuple[int, float]],
@@ -96,7 +78,6 @@ def routes(
     horizon: float = HORIZON,
     onward: float = 0.0,
     limit: int = LIMIT,
-    lane_change: bool = True,
 ) -> list[Route]:
     """Lane sequences that follow every branch until they reach the horizon or the lanes end.
 
@@ -111,7 +92,6 @@ def routes(
         horizon: metres ahead of the vehicle within which every branch is followed.
         onward: metres past the horizon for which routes go on along the straightest lane.
         limit: most routes to return.
-        lane_change: whether to add the routes with a change.
 
     Raises:
         ValueError: the limit is not positive.
@@ -126,7 +106,7 @@ def routes(
 
     plain = sorted(_complete(graph, seeds, horizon, limit), key=order)
     changed: list[Path] = []
-    if lane_change and len(plain) < limit:
+    if len(plain) < limit:
         offered = _changes(graph, [route for _, route in plain], dict(starts), horizon)
         changed = sorted(_complete(graph, offered, horizon, limit), key=order)[: limit - len(plain)]
     return [_onward(graph, reach, route, horizon + onward) for reach, route in plain + changed]
@@ -223,8 +203,14 @@ def change_length(speed: float) -> float:
     return max(CHANGE_METRES, CHANGE_SECONDS * abs(speed))
 
 
-def route_line(graph: LaneGraph, route: Route, start: float = 0.0, speed: float = 0.0) -> Reals | None:
-    """The line [P, 2] that a vehicle follows on a route, in the graph's own points.
+def route_line(
+    graph: LaneGraph,
+    route: Route,
+    start: float = 0.0,
+    speed: float = 0.0,
+    changes: dict[Route, Reals | None] | None = None,
+) -> Reals | None:
+    """The line [P, 2] that a vehicle follows on a route, in the graph's own points; None where nobody can drive it.
 
     It is the centre line of the lanes, each joined to the one before. A change is a
     :func:`~symphony.roadgraph.paths.blend` from the lane it leaves to the one beside it, :func:`change_length` long,
@@ -235,21 +221,8 @@ def route_line(graph: LaneGraph, route: Route, start: float = 0.0, speed: float 
         route: one with a change begins on the lane that is left.
         start: metres along the first lane at which the line begins.
         speed: m/s of the vehicle where it begins.
-
-    Returns:
-        None for a route that nobody can drive.
+        changes: lines up to where changes are over, kept for other routes that have the same.
     """
-    return _line(graph, route, start, speed, {})
-
-
-def _line(
-    graph: LaneGraph,
-    route: Route,
-    start: float,
-    speed: float,
-    changes: dict[Route, Reals | None],
-) -> Reals | None:
-    """The line of a route. Changes up to where they are over are kept, as many routes have the same."""
     if not route.change:
         return centre_line(graph, route.lanes, start)
     reach, end = change_length(speed) + CHORD, route.change + 1
@@ -258,6 +231,7 @@ def _line(
         beyond += float(graph.length[route.lanes[end]])
         end += 1
     near = route._replace(lanes=route.lanes[:end])
+    changes = {} if changes is None else changes
     if near not in changes:
         changes[near] = _changed(graph, near, start, speed)
     line = changes[near]
@@ -312,7 +286,7 @@ def route_lines(
     ends: dict[tuple[int, int, int], list[int]] = {}
     changes: dict[Route, Reals | None] = {}
     for route in found:
-        line = _line(graph, route, along[route.lanes[0]], speed, changes)
+        line = route_line(graph, route, along[route.lanes[0]], speed, changes)
         if line is None:
             continue
         points = resampled(line, spacing, length)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from symphony import keys
 from symphony.data.segment import SignalState
@@ -211,10 +212,10 @@ def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
     points = torch.where((exist > 1)[..., None, None], points, straight)
     last = torch.where(exist > 1, exist, points.shape[2])[..., None] - 1
     ends = [points.gather(2, k[..., None].expand(*k.shape, 2))[:, :, 0] for k in (last - 1, last)]
-    onward = _unit(ends[1] - ends[0])
+    onward = normalize(ends[1] - ends[0], dim=-1, eps=1e-6)
     past = (place - last).clamp_min(0)[..., None]
     points = torch.where(past > 0, ends[1][:, :, None] + SPACING * past * onward[:, :, None], points)
-    first = _unit(points[:, :, 1] - points[:, :, 0])
+    first = normalize(points[:, :, 1] - points[:, :, 0], dim=-1, eps=1e-6)
     points = torch.cat(
         [
             (points[:, :, 0] - BEFORE * first)[:, :, None],
@@ -229,7 +230,7 @@ def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
     angle = torch.atan2(pieces[..., 1], pieces[..., 0])
     near = length.clamp_max(SPACING)
     bend = wrap(angle.diff(dim=-1)).abs() / (0.5 * (near[..., 1:] + near[..., :-1])).clamp_min(1e-3)
-    bend = torch.nn.functional.pad(bend, (1, 1))
+    bend = pad(bend, (1, 1))
     limit = _limits(scenes, points, driver.speed)
     limit = torch.minimum(limit, (driver.lateral / bend.clamp_min(1e-6)).sqrt())
     lines = _Lines(points, arc, limit, arc[..., :0])
@@ -267,7 +268,7 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
         line = _Lines(*(part[b] for part in lines))
         station, aside, _ = _project(line, point.expand(len(line.arc), -1, -1))
         beyond = torch.stack([_at(line, station[:, q] + STOP_CHORD) for q in range(len(which))], 1)
-        along = (_unit(beyond - point) * way).sum(-1)
+        along = (normalize(beyond - point, dim=-1, eps=1e-6) * way).sum(-1)
         along = along.masked_fill((aside.abs() > AT_STOP) | (station < -5.0), -torch.inf)
         same = (point[:, None] - point[None]).norm(dim=-1) < 1.0
         best = torch.where(same, along[:, None, :], -torch.inf).amax(-1)
@@ -310,7 +311,7 @@ def _project(
     if pieces is not None:
         squared = squared.masked_fill(~pieces[:, None], torch.inf)
     distance = squared.sqrt()
-    beside = torch.nn.functional.pad(distance, (1, 1), value=torch.inf)
+    beside = pad(distance, (1, 1), value=torch.inf)
     lowest = (distance <= beside[..., :-2]) & (distance <= beside[..., 2:])
     lowest &= distance <= distance.amin(-1, keepdim=True) + NEAR
     which = lowest.to(torch.uint8).argmax(-1, keepdim=True)
@@ -343,10 +344,6 @@ def _pairs(values: Tensor) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
     """Row and column of every element of a matrix."""
     row, column = (torch.arange(size, device=values.device) for size in values.shape)
     return row.repeat_interleave(len(column)), column.repeat(len(row))
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    return vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1e-6)
 
 
 def _among(shown: Tensor, states: tuple[SignalState, ...]) -> Tensor:

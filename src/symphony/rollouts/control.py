@@ -1,4 +1,4 @@
-"""What a user changes in the agents: goals of single ones, and how bold their draws are."""
+"""Changes that a user makes to agents: goals of single ones, their personas, and how bold their draws are."""
 
 from __future__ import annotations
 

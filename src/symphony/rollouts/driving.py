@@ -1,4 +1,4 @@
-"""What an agent does on a batch of scenes, as it was trained or as a configuration says."""
+"""Simulation of an agent on a batch of scenes, as it was trained or as a configuration says."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -27,7 +27,7 @@ from symphony.modules import SeededNoise
 from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.rollouts.background import CarFollower, ConstantSpeed
 from symphony.rollouts.control import Tempered, given_personas
-from symphony.rollouts.finite import FiniteWatch
+from symphony.rollouts.finite import NaNGuard
 from symphony.rollouts.search import going_back, pruning_rule, search
 from symphony.rollouts.unroll import (
     Rollouts,
@@ -43,11 +43,11 @@ RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
     "constant_velocity": ConstantSpeed,
     "idm": CarFollower,
 }
-"""What can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
+"""Rules that can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
 
 
 class Simulation(NamedTuple):
-    """What came of a simulation.
+    """The result of a simulation.
 
     Attributes:
         rollouts: [B, K, ...].
@@ -66,15 +66,6 @@ class Simulation(NamedTuple):
     steps: int = 0
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
-
-
-def simulated(agent: Agent, scenes: SceneBatch, config: EvaluateConfig) -> Rollouts:
-    """K rollouts of every scene [B, K, ...]; they depend on the seed and the segment, not on the batch.
-
-    Raises:
-        ConfigError, NotFiniteError: as :func:`simulation`.
-    """
-    return driven_by(agent, scenes, config).rollouts
 
 
 def simulation(
@@ -102,22 +93,24 @@ def simulation(
             rule drives the others than the agent.
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
-    policy = agent.policy
     _check_given(agent, scenes, config, given)
     if agent.rule:
         scenes, config = _ruled(agent, scenes, config, given)
-    if policy is None:
-        if egos is None:
-            raise ValueError("log playback has nothing to simulate")
-        if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
-            raise ConfigError("beside log playback the planner's ego is the only interactive agent")
-        policy = ConstantVelocity(Bicycle())
+    policy = _placeholder(scenes) if agent.policy is None else agent.policy
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
-    settings, (trees, branches, taken) = config.pruning(agent.search), planned_trees(agent, config)
-    watch = FiniteWatch(env)
-    goals = None if agent.goals is None else watch.watched(agent.goals, [keys.GOAL_LOGITS], "goal policy")
-    actor = acting(watch.watched(policy, [keys.LOGITS, keys.ACTION], "policy"), env, config)
+    kind, trees, branches, taken, settings = agent.plan(config)
+    searches = kind not in ("none", "log")
+    guards = [NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")]
+    actor = acting(guards[0], env, config)
+    goals: NaNGuard | None = None
+    scorer: NaNGuard | None = None
+    if agent.goals is not None:
+        goals = NaNGuard(env, agent.goals, [keys.GOAL_LOGITS], "goal policy")
+        guards.insert(0, goals)
+    if agent.discriminator is not None and searches:
+        scorer = NaNGuard(env, agent.discriminator, [keys.SCORE], "discriminator", scores=True)
+        guards.append(scorer)
     fix = _fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None)
     start = start_states(
         env,
@@ -130,34 +123,29 @@ def simulation(
         personas=given_personas(agent.personas, config.persona),
         fix=fix,
     )
-    planned, kind = None, search_kind(agent, config)
-
-    def begin(state: TensorDictBase) -> TensorDictBase:
-        if goals is None or config.logged_goals:
-            return state
-        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
-        return env.with_goals(state, fix(state.get(keys.SCENE).squeeze(-1), goal))
-
+    planned: EgoPolicy | None = None
+    result: BeamSearchResult | None = None
     if egos is not None:
         if kind == "backtrack":
             raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
-        forked = kind not in ("none", "log")
-        planned = egos.begin(env, start, seed=config.seed, forked=forked)
+        planned = EgoPolicy(env, egos, start, config.seed, forked=searches)
         actor = TensorDictSequential(actor, planned)
-    result, goal, number = None, start.get(keys.GOAL), start.get(keys.PLANNER, None)
-    drawn, steps = goal, start.numel() * env.decisions
-    if kind in ("none", "log"):
-        found = simulate(
-            env, TensorDictSequential(SeededNoise(config.seed, env.dynamics.numbers), actor), start
-        )
+    if not searches:
+        noise = SeededNoise(config.seed, env.dynamics.numbers)
+        found = simulate(env, TensorDictSequential(noise, actor), start)
+        steps, ends = start.numel() * env.decisions, start
     else:
-        best, scorer = kind == "best", None
+
+        def renewed(state: TensorDictBase) -> TensorDictBase:
+            if goals is None or config.logged_goals:
+                return state
+            goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
+            return env.with_goals(state, fix(state.get(keys.SCENE).squeeze(-1), goal))
+
         rules: dict[str, Callable[[], PruningRule | Backtrack]] = {
             "best": KeepAll,
-            "backtrack": lambda: going_back(env, settings.threshold, start.numel(), begin),
+            "backtrack": lambda: going_back(env, settings.threshold, start.numel(), renewed),
         }
-        if agent.discriminator is not None:
-            scorer = watch.watched(agent.discriminator, [keys.SCORE], "discriminator", scores=True)
         with torch.no_grad():
             result = search(
                 env,
@@ -167,31 +155,58 @@ def simulation(
                 seed=config.seed,
                 rule=rules.get(kind, lambda: pruning_rule(settings))(),
                 prune_every=settings.prune_every,
-                score=config.score,
-                leaves=None if best else taken,
+                score=settings.score,
+                leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
             )
         found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
-        # A copy of a branch follows the goals of its parent.
-        goal = result.trajectories.get(keys.GOAL)[..., -1, :]
-        number = result.trajectories.get(keys.PLANNER, None)
-        number = None if number is None else number[..., -1, :]
-        if best:
-            order = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[..., :1]
-            found = Rollouts(*(_branches(part, order) for part in found))
-            goal = _branches(goal, order)
-            number = None if number is None else _branches(number, order)
-        result = result if kind == "tree" else None
-    watch.check()
-    rollouts = Rollouts(*(part[:, :, :taken].flatten(1, 2) for part in found))
-    goal = goal[:, :, :taken].flatten(1, 2)
-    of_tree = None if result is None else drawn
-    whole = Simulation(rollouts, goal, result, at_states=rollouts.collision, steps=steps, drawn=of_tree)
-    if planned is None or number is None:
+        ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
+    for guard in guards:
+        guard.check()
+    # The rollouts [B, trees, taken] that count, of all branches.
+    chosen = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1)
+    if kind == "best" and result is not None:
+        chosen = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[..., :1]
+    goal = ends.get(keys.GOAL)
+    if kind == "backtrack" and result is not None:
+        # Lines are trees of one branch each; to be filled from each other they are the branches of one.
+        begun = result.alive.squeeze(-2)[..., :: result.prune_every]
+        totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)  # what follows an end is never bad
+        chosen = filled_lines(totals, settings.threshold)[:, None]
+        found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
+    rollouts = Rollouts(*(_branches(part, chosen).flatten(1, 2) for part in found))
+    goal = _branches(goal, chosen).flatten(1, 2)
+    tree = result if kind == "tree" else None
+    drawn = None if tree is None else start.get(keys.GOAL)
+    whole = Simulation(rollouts, goal, tree, at_states=rollouts.collision, steps=steps, drawn=drawn)
+    if planned is None:
         return whole
-    return _without_failed(whole, planned, number[:, :, :taken].flatten(1, 2))
+    return _without_failed(whole, planned, _branches(ends.get(keys.PLANNER), chosen).flatten(1, 2))
+
+
+def simulate_batch(
+    agent: Agent,
+    scenes: SceneBatch,
+    config: EvaluateConfig,
+    *,
+    keep_tree: bool = False,
+    egos: EgoPlanners | None = None,
+    given: Int[Tensor, "B N"] | None = None,
+) -> Simulation:
+    """Simulate an agent: :func:`playback` of the log, or a :func:`simulation` whose collisions are found between
+    states, too.
+    """
+    if agent.policy is not None or egos is not None:
+        found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        rollouts = found.rollouts
+        between = between_states(scenes, rollouts.state, existing(scenes, rollouts))
+        return found._replace(rollouts=rollouts._replace(collision=between))
+    _check_given(agent, scenes, config, given)
+    log = playback(scenes)
+    at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
+    return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
 
 
 def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
@@ -210,6 +225,13 @@ def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig
     if config.others in RULES:
         found = TensorDictSequential(found, RULES[config.others](env))
     return found
+
+
+def _placeholder(scenes: SceneBatch) -> TensorDictModuleBase:
+    """A policy for the ego of a planner beside log playback, whose actions nobody looks at."""
+    if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
+        raise ConfigError("beside log playback the planner's ego is the only interactive agent")
+    return ConstantVelocity(Bicycle())
 
 
 def _ruled(
@@ -239,7 +261,7 @@ def _check_given(
 def _fixed_goals(
     scenes: SceneBatch, given: Int[Tensor, "B N"] | None, *, along_log: bool, ego: bool
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """From rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
+    """A function from rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
 
     Args:
         scenes: B scenes.
@@ -278,35 +300,13 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
     return found._replace(rollouts=kept, failed=failed)
 
 
-def search_kind(agent: Agent, config: EvaluateConfig) -> str:
-    """How the rollouts come about: ``none``, ``tree``, ``backtrack`` or ``best``; ``log`` for playback."""
-    if agent.policy is None:
-        return "log"
-    blind = config.score == "discriminator" and agent.discriminator is None
-    if config.search == "agent":
-        return "tree" if agent.searches and not blind else "none"
-    if config.search != "none" and blind:
-        raise ConfigError(
-            f"search '{config.search}' needs an agent with a discriminator, {agent.name} has none, or another "
-            "score: --score flags or rule"
-        )
-    return config.search
-
-
-def planned_trees(agent: Agent, config: EvaluateConfig) -> tuple[int, int, int]:
-    """Trees per segment, branches per tree, and rollouts taken from each tree."""
-    kind = search_kind(agent, config)
-    if kind in ("none", "log", "backtrack"):
-        return config.rollouts, 1, 1
-    branches = config.pruning(agent.search).test_branches
-    if kind == "best":
-        return config.rollouts, branches, 1
-    taken = config.rollouts // config.trees
-    if taken > branches:
-        raise ConfigError(
-            f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-        )
-    return config.trees, branches, taken
+def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
+    """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
+    planner once for each branch; trees where there shall be branches.
+    """
+    if config.search != "agent":
+        return config
+    return dataclasses.replace(config, search="tree" if config.branches or config.trees > 1 else "none")
 
 
 def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
@@ -316,12 +316,11 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
     rollouts than a tree has branches come from as few trees as that takes.
     """
-    kind, least = search_kind(agent, config), -(-runs // segments)
-    branches = config.pruning(agent.search).test_branches
+    plan, least = agent.plan(dataclasses.replace(config, rollouts=config.trees)), -(-runs // segments)
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
-        trees = max(config.trees, -(-each // branches)) if kind == "tree" else 1
+        trees = max(config.trees, -(-each // plan.branches)) if plan.kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
     exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
@@ -329,33 +328,26 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
     return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
 
 
+def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor, "B K"]:
+    """Which line stands in each place after backtracking: its own, but a good one of its scene where it stayed bad.
+
+    The places of bad lines take the good ones in turn, so that none is copied much more often than another.
+
+    Args:
+        totals: of the periods of every line.
+        threshold: the highest one of a good period.
+    """
+    good = (totals <= threshold).all(-1)
+    count, place = good.sum(-1, keepdim=True), torch.arange(good.shape[-1], device=good.device)
+    good_first = (~good).to(torch.int8).argsort(dim=-1, stable=True)
+    turn = ((~good).cumsum(-1) - 1) % count.clamp_min(1)
+    return torch.where(good | (count == 0), place, good_first.gather(-1, turn.clamp_min(0)))
+
+
 def _branches(part: Tensor, order: Tensor) -> Tensor:
     """part [B, trees, S, ...] at the branches order [B, trees, K]."""
     index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
     return part.gather(2, index)
-
-
-def driven_by(
-    agent: Agent,
-    scenes: SceneBatch,
-    config: EvaluateConfig,
-    *,
-    keep_tree: bool = False,
-    egos: EgoPlanners | None = None,
-    given: Int[Tensor, "B N"] | None = None,
-) -> Simulation:
-    """What an agent does: :func:`playback` of the log, or a :func:`simulation`; collisions of the rollouts are found
-    between states, too.
-    """
-    if agent.policy is not None or egos is not None:
-        found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
-        rollouts = found.rollouts
-        between = between_states(scenes, rollouts.state, existing(scenes, rollouts))
-        return found._replace(rollouts=rollouts._replace(collision=between))
-    _check_given(agent, scenes, config, given)
-    log = playback(scenes)
-    at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
-    return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:

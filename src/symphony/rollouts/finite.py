@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -43,42 +43,44 @@ class NotFiniteError(SymphonyError):
         return NotFiniteError(self.what, self.row, self.step, self.agent, segment)
 
 
-class FiniteWatch:
-    """Remembers in which scenes, and when first, what networks put out was not finite; looked at once, at the end,
-    so that no step waits for the device.
+class NaNGuard(TensorDictModuleBase):
+    """A module that remembers in which scenes, and when first, what it put out was not finite; looked at once, at the
+    end, so that no step waits for the device.
 
     Args:
         env: of the simulation.
+        module: reads and writes TensorDicts of the environment.
+        guarded: floating-point entries [*b, N, ...] that must be finite for valid agents; absent ones are not looked
+            at.
+        what: its name in the error.
+        scores: whether it scores states, the last of a scene among them; others act in those before. Past a scene's
+            end there is only the padding of its batch.
     """
 
-    def __init__(self, env: DrivingEnv) -> None:
-        self.env = env
-        self._first: dict[str, Tensor] = {}
+    def __init__(
+        self,
+        env: DrivingEnv,
+        module: TensorDictModuleBase,
+        guarded: Sequence[keys.Key],
+        what: str,
+        *,
+        scores: bool = False,
+    ) -> None:
+        super().__init__()
+        self.env, self.module, self.guarded, self.what, self.scores = env, module, guarded, what, scores
+        self.in_keys, self.out_keys = module.in_keys, module.out_keys
+        self._first: Tensor | None = None
 
-    def watched(
-        self, module: TensorDictModuleBase, out_keys: Sequence[keys.Key], what: str, *, scores: bool = False
-    ) -> Watched:
-        """A module whose output is watched.
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Call the module."""
+        out = self.module(tensordict)
+        for key in self.guarded:
+            value = out.get(key, None)
+            if value is not None and value.is_floating_point():
+                self._see(out, value)
+        return out
 
-        Args:
-            module: reads and writes TensorDicts of the environment.
-            out_keys: floating-point entries [*b, N, ...] that must be finite for valid agents; absent ones are not
-                looked at.
-            what: its name in the error.
-            scores: whether it scores states, the last of a scene among them; others act in those before. Past a
-                scene's end there is only the padding of its batch.
-        """
-        return Watched(module, out_keys, lambda tensordict, value: self._see(tensordict, value, what, scores))
-
-    def check(self) -> None:
-        """Raise NotFiniteError for the first scene in which something was not finite."""
-        for what, first in self._first.items():
-            bad = (first < _NEVER).nonzero()
-            if len(bad):
-                row = int(bad[0])
-                raise NotFiniteError(what, row, *divmod(int(first[row]), self.env.num_agents))
-
-    def _see(self, tensordict: TensorDictBase, value: Tensor, what: str, scores: bool) -> None:
+    def _see(self, tensordict: TensorDictBase, value: Tensor) -> None:
         if on_host(value) and bool(value.sum().isfinite()):
             return  # a sum of numbers one of which is not finite isn't either
         valid = tensordict.get(keys.VALID)
@@ -86,34 +88,19 @@ class FiniteWatch:
         finite = finite.flatten(valid.ndim).all(-1) if finite.ndim > valid.ndim else finite
         scene, step = tensordict.get(keys.SCENE).squeeze(-1), tensordict.get(keys.STEP).squeeze(-1)
         wrong = valid & ~finite
-        bad = wrong.any(-1) & (step < self.env.scenes.last_step[scene] + scores)
+        bad = wrong.any(-1) & (step < self.env.scenes.last_step[scene] + self.scores)
         # The step, then the first agent of it.
         step = torch.where(bad, step * self.env.num_agents + wrong.int().argmax(-1), _NEVER)
-        first = self._first.get(what)
-        if first is None:
-            first = torch.full((len(self.env.scenes),), _NEVER, dtype=step.dtype, device=step.device)
+        if self._first is None:
+            self._first = torch.full((len(self.env.scenes),), _NEVER, dtype=step.dtype, device=step.device)
         # Branches of a scene share its row: the earliest of them counts.
-        self._first[what] = first.scatter_reduce(0, scene.flatten(), step.flatten(), "amin")
+        self._first = self._first.scatter_reduce(0, scene.flatten(), step.flatten(), "amin")
 
-
-class Watched(TensorDictModuleBase):
-    """A module that shows somebody what it writes."""
-
-    def __init__(
-        self,
-        module: TensorDictModuleBase,
-        out_keys: Sequence[keys.Key],
-        see: Callable[[TensorDictBase, Tensor], None],
-    ) -> None:
-        super().__init__()
-        self.module, self.shown, self.see = module, out_keys, see
-        self.in_keys, self.out_keys = module.in_keys, module.out_keys
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Call the module."""
-        out = self.module(tensordict)
-        for key in self.shown:
-            value = out.get(key, None)
-            if value is not None and value.is_floating_point():
-                self.see(out, value)
-        return out
+    def check(self) -> None:
+        """Raise NotFiniteError for the first scene in which something was not finite."""
+        if self._first is None:
+            return
+        bad = (self._first < _NEVER).nonzero()
+        if len(bad):
+            row = int(bad[0])
+            raise NotFiniteError(self.what, row, *divmod(int(self._first[row]), self.env.num_agents))

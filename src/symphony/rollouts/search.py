@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -31,36 +31,38 @@ from symphony.envs.flags import collision_flags
 from symphony.imports import build_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
+from symphony.rollouts.unroll import draw_goals
 from symphony.streams import Stream, fold_in, uniform
 
 FILL, FEW = 4, 256
-"""Where lines go back, those of so many times the usual run segments are simulated one after the other, as many at a
-time as usual: else the last steps of every batch would be of few lines.
+"""Lines that go back: those of so many times the usual run segments are simulated one after the other, as many at a
+time as usual, at least so many: else the last steps of every batch would be of few lines.
 """
 AHEAD = 0.5
 """Seconds that :func:`rule_score` looks ahead."""
-OUTCOME: Sequence[keys.Key] = [
-    ("next", *key) for key in (keys.STATE, keys.VALID, keys.PROGRESS, keys.COLLISION, keys.OFFROAD)
-]
 KEPT: Sequence[keys.Key] = [
-    keys.SCENE,
-    keys.STEP,
-    keys.STREAM,
-    keys.VALID,
-    keys.GOAL,
-    keys.PROGRESS,
-    keys.STATE,
-    keys.ACTION,
-    keys.NOISE,
-    *OUTCOME,
+    *(keys.SCENE, keys.STEP, keys.STREAM, keys.VALID, keys.GOAL, keys.PROGRESS),
+    *(keys.STATE, keys.ACTION, keys.NOISE),
+    *(("next", *key) for key in (keys.STATE, keys.VALID, keys.PROGRESS, keys.COLLISION, keys.OFFROAD)),
 ]
-"""What is kept of every step of a search: enough to observe its states anew."""
+"""Entries that are kept of every step of a search, enough to observe its states anew; beside them personas of agents
+that have some, and in open traffic who has not entered yet.
+"""
 
 
-def kept_keys(env: DrivingEnv, also: Sequence[keys.Key] = ()) -> list[keys.Key]:
-    """:data:`KEPT`, with the personas of agents that have them, and in open traffic who has not entered yet."""
-    persona, waiting = env.observation.persona, env.open_traffic
-    return [*KEPT, *([keys.PERSONA] if persona else []), *([keys.WAITING] if waiting else []), *also]
+def _settings(
+    env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[keys.Key] = ()
+) -> dict[str, Any]:
+    """Settings that every search of driving gives the collector."""
+    persona = [keys.PERSONA] if env.observation.persona else []
+    waiting = [keys.WAITING] if env.open_traffic else []
+    return {
+        "aggregate": max_then_sum,
+        # A copy takes the random numbers of the place it lands in, so that forks part.
+        "slot_keys": (keys.STREAM,),
+        "group_key": keys.GOAL if takes_groups(rule) else None,
+        "keep": [*KEPT, *persona, *waiting, *also],
+    }
 
 
 def pruning_rule(config: SearchConfig) -> PruningRule:
@@ -96,15 +98,6 @@ def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
     return torch.maximum(flag_score(state), (close & there).float())
 
 
-SCORES: dict[Score, Callable[[DrivingEnv, TensorDictModuleBase | None], Callable[[TensorDictBase], Tensor]]]
-SCORES = {
-    "discriminator": lambda env, network: KeyScore(keys.SCORE, network, valid_key=keys.VALID),
-    "flags": lambda env, network: flag_score,
-    "rule": lambda env, network: partial(rule_score, env),
-}
-"""What a search looks for in a state, by name, from the environment and the agent's discriminator."""
-
-
 def realism_score(
     env: DrivingEnv,
     discriminator: TensorDictModuleBase | None,
@@ -117,10 +110,14 @@ def realism_score(
     Args:
         env: whose states are scored.
         discriminator: writes them, where they are its own.
-        score: which of :data:`SCORES`.
+        score: what a search looks for in a state.
         ego: whether the first agent is scored; else its score is 0, as that of background agents is.
     """
-    of_states = SCORES[score](env, discriminator)
+    of_states: Callable[[TensorDictBase], Tensor]
+    if score == "discriminator":
+        of_states = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID)
+    else:
+        of_states = flag_score if score == "flags" else partial(rule_score, env)
 
     def of_scored(state: TensorDictBase) -> Float[Tensor, "*b N"]:
         found = of_states(state).masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
@@ -133,6 +130,28 @@ def branched_streams(start: TensorDictBase) -> TensorDictBase:
     """A start state [*b, S] whose branches each have a stream of random numbers of their own."""
     slot = torch.arange(start.shape[-1], device=start.device)[:, None]
     return start.set(keys.STREAM, fold_in(start.get(keys.STREAM), slot))
+
+
+def with_drawn_goals(
+    env: DrivingEnv,
+    goals: TensorDictModuleBase,
+    start: TensorDictBase,
+    seed: int,
+    goals_per: Literal["tree", "branch"] = "tree",
+) -> TensorDictBase:
+    """Start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws.
+
+    Args:
+        env: the environment.
+        goals: the goal policy.
+        start: all branches of a tree, in one stream of random numbers.
+        seed: of the draw.
+        goals_per: who draws goals together: all branches of a tree (paper, section IV-B), or each branch alone.
+    """
+    start = branched_streams(start)
+    first = start if goals_per == "branch" else start[..., :1]
+    goal = draw_goals(env, goals, first, seed, first.get(keys.STREAM).squeeze(-1))
+    return env.with_goals(start, goal.expand(*start.shape, -1))
 
 
 def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
@@ -150,8 +169,8 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 def collector_settings(
     config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset, segments: int
 ) -> dict[str, Any]:
-    """What a collector of driving needs beside environment, policy and scores: whole trees, random numbers that
-    depend on nothing but seed, segment, branch and step.
+    """Settings that a collector of driving needs beside environment, policy and scores: whole trees, random numbers
+    that depend on nothing but seed, segment, branch and step.
 
     Args:
         config: of the search.
@@ -165,12 +184,8 @@ def collector_settings(
         "leaves": config.branches,
         "keep_tree": True,
         "prune_every": config.prune_every,
-        "aggregate": max_then_sum,
         "rule_noise": pruning_noise(seed),
-        # A copy takes the random numbers of the place it lands in, so that forks part.
-        "slot_keys": (keys.STREAM,),
-        "group_key": keys.GOAL if takes_groups(pruning_rule(config)) else None,
-        "keep": kept_keys(env),
+        **_settings(env, pruning_rule(config)),
         "frames_per_batch": min(segments, len(data)) * config.branches * data.decisions,
         "total_frames": -1,
     }
@@ -201,7 +216,7 @@ def search(
         seed: of the actions.
         rule: which branches go on.
         prune_every: T_p.
-        score: which of :data:`SCORES`.
+        score: what it looks for.
         leaves: return only so many of each tree, the best of their scene's last period; by default all.
         keep_tree: also return the pruned branches.
         ego: whether the first agent is scored, too.
@@ -216,14 +231,10 @@ def search(
         steps=steps,
         prune_every=prune_every,
         rule=rule,
-        aggregate=max_then_sum,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
         leaves=leaves,
-        # A copy takes the random numbers of the place it lands in, so that forks part.
-        slot_keys=(keys.STREAM,),
-        group_key=keys.GOAL if takes_groups(rule) else None,
-        keep=kept_keys(env, also),
         keep_tree=keep_tree,
+        **_settings(env, rule, also),
     )
 
 

@@ -26,7 +26,7 @@ _WORLD = 1 << 22
 
 
 class Rollouts(NamedTuple):
-    """What became of the interactive agents. T simulated steps, after the first state.
+    """Rollouts of the interactive agents over T simulated steps, after the first state.
 
     Attributes:
         state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
@@ -42,7 +42,7 @@ class Rollouts(NamedTuple):
     counted: Bool[Tensor, "*b T N"]
 
     def cpu(self) -> Rollouts:
-        """The same on the CPU."""
+        """The rollouts on the CPU."""
         return Rollouts(*(part.cpu() for part in self))
 
 
@@ -185,7 +185,7 @@ def start_states(
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
-    """What the evaluator reads, from the leaves [..., L, T] of a search that began in ``start`` [..., S], S >= L."""
+    """The rollouts that the evaluator reads, from leaves [..., L, T] of a search from ``start`` [..., S], S >= L."""
     start = start[..., : trajectories.shape[-2]]
     state = torch.cat([start.get(keys.STATE)[..., None, :, :], trajectories.get(("next", *keys.STATE))], -3)
     collision, offroad = (
@@ -198,7 +198,7 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
 def counted_steps(
     env: DrivingEnv, start: TensorDictBase, there: Bool[Tensor, "*b T N"]
 ) -> Bool[Tensor, "*b T N"]:
-    """Where agents are there, of the states after each step, and their segment still has logged steps."""
+    """The steps after which agents are there and their segment still has logged steps."""
     step = start.get(keys.STEP) + torch.arange(1, there.shape[-2] + 1, device=start.device)
     return (step <= env.scenes.last_step[start.get(keys.SCENE)])[..., None] & there
 

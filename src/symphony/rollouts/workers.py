@@ -15,7 +15,6 @@ from symphony.config.evaluation import TOGETHER
 from symphony.errors import ConfigError, SymphonyError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.parallel import WorkerError, ordered_map
-from symphony.rollouts.driving import planned_trees, search_kind
 from symphony.rollouts.search import FILL
 
 POINTS = 1 << 19
@@ -29,7 +28,7 @@ NAMED = 8
 T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T], R]
-"""What is done with a task, such as a batch of items; a picklable object, with the dataset and the agent inside."""
+"""The work on a task, such as a batch of items: a picklable object, with the dataset and the agent inside."""
 
 
 def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
@@ -44,10 +43,10 @@ def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) ->
     if config.batch:
         return config.batch
     everyone = config.interactive == "all" or config.open_traffic or config.others != "log"
-    trees, branches, _ = planned_trees(agent, config)
-    agents = trees * branches * (IN_TRAFFIC if everyone else interactive)
+    plan = agent.plan(config)
+    agents = plan.trees * plan.branches * (IN_TRAFFIC if everyone else interactive)
     found = min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
-    return found * FILL if search_kind(agent, config) == "backtrack" else found
+    return found * FILL if plan.kind == "backtrack" else found
 
 
 def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:

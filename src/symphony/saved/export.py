@@ -98,7 +98,9 @@ def _obstacles(saved: SavedRollouts, rollout: int) -> list[ET.Element]:
         for k, steps in enumerate(np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)):
             spare += k > 0
             node = ET.Element("dynamicObstacle", id=str(spare if k else int(ids[row])))
-            _text(node, "type", _obstacle_type(segment, row))
+            kind, length = AgentType(segment.agent_type[row]), segment.size[row, 0]
+            vehicle = "truck" if length >= TRUCK else "car"
+            _text(node, "type", vehicle if kind == AgentType.VEHICLE else _TYPES.get(kind, "unknown"))
             shape = ET.SubElement(ET.SubElement(node, "shape"), "rectangle")
             for tag, value in zip(("length", "width"), segment.size[row], strict=False):
                 _text(shape, tag, float(value))
@@ -109,13 +111,6 @@ def _obstacles(saved: SavedRollouts, rollout: int) -> list[ET.Element]:
                     _state(ET.SubElement(trajectory, "state"), world, row, step, segment.origin)
             found.append(node)
     return found
-
-
-def _obstacle_type(segment: RunSegment, row: int) -> str:
-    kind = AgentType(segment.agent_type[row])
-    if kind == AgentType.VEHICLE:
-        return "truck" if segment.size[row, 0] >= TRUCK else "car"
-    return _TYPES.get(kind, "unknown")
 
 
 def _state(node: ET.Element, world: World, row: int, step: int, origin: Reals) -> None:
@@ -129,8 +124,7 @@ class _Network:
     """Lanelets, speed limits, lights and the turns at intersections, with ids from ``first`` on."""
 
     def __init__(self, segment: RunSegment, within: slice, first: int) -> None:
-        self.segment, self.road, self.next = segment, segment.road, first
-        self.states = segment.signal_state[:, within]
+        self.segment, self.road, self.within, self.next = segment, segment.road, within, first
         self.lines = {}
         for k in range(len(self.road.lanes)):
             line = self.road.lanes[k][:, :2].astype(np.float64)
@@ -138,80 +132,74 @@ class _Network:
             if len(line) > 1:
                 self.lines[k] = line + segment.origin[:2]
         self.ids = {k: self._number() for k in self.lines}
+        self.flow = self._pairs("successors")
 
     def _number(self) -> int:
         self.next += 1
         return self.next - 1
 
-    def add(self, root: ET.Element) -> None:
-        """Add all elements in the order that the format wants."""
-        limits = self.road.speed_limit
-        # Of the lanes that are written: one of a single point is not.
-        known = limits[list(self.lines)]
-        signs = {float(limit): self._number() for limit in np.unique(known[np.isfinite(known)])}
-        lights = self._lights()
-        for k in self.lines:
-            self._lanelet(
-                root, k, signs.get(float(limits[k])), [i for i, _, lanes, _ in lights if k in lanes]
-            )
-        for limit, number in signs.items():
-            self._sign(root, number, limit)
-        for number, light, _, turn in lights:
-            self._light(root, number, light, turn)
-        self._intersections(root, lights)
-
     def _pairs(self, name: str) -> list[tuple[int, int]]:
         pairs = getattr(self.road, name).tolist()
         return [(a, b) for a, b in pairs if a in self.lines and b in self.lines]
 
-    def _lanelet(self, root: ET.Element, k: int, sign: int | None, lights: list[int]) -> None:
+    def add(self, root: ET.Element) -> None:
+        """Add all elements in the order that the format wants."""
+        limits = self.road.speed_limit
+        known = limits[list(self.lines)]
+        signs = {float(limit): self._number() for limit in np.unique(known[np.isfinite(known)])}
+        # Id, row, lanes that lead to it, and the direction it is for: the format hangs a light on the lane before it
+        # and tells turns apart by direction.
+        lights: list[tuple[int, int, list[int], str]] = []
+        for light, lane in enumerate(self.segment.signal_lane.tolist()):
+            if lane in self.lines:
+                before = [a for a, b in self.flow if b == lane]
+                turn = self._turn(lane) if before else "all"
+                lights.append((self._number(), light, before or [lane], turn))
+        for k in self.lines:
+            refs = [("trafficSignRef", signs[limit]) for limit in [float(limits[k])] if limit in signs]
+            refs += [("trafficLightRef", number) for number, _, lanes, _ in lights if k in lanes]
+            self._lanelet(root, k, refs)
+        for limit, number in signs.items():
+            node = ET.SubElement(root, "trafficSign", id=str(number))
+            element = ET.SubElement(node, "trafficSignElement")
+            _text(element, "trafficSignID", "274")
+            _text(element, "additionalValue", limit)
+            first = next(k for k in self.lines if float(limits[k]) == limit)
+            _point(ET.SubElement(node, "position"), self.lines[first][0])
+            _text(node, "virtual", "true")
+        for number, light, _, turn in lights:
+            self._light(root, number, light, turn)
+        # An intersection for each lane with lights, so that readers can tell which way each of its turns goes.
+        for lane in sorted({lane for _, _, lanes, turn in lights for lane in lanes if turn != "all"}):
+            node = ET.SubElement(root, "intersection", id=str(self._number()))
+            incoming = ET.SubElement(node, "incoming", id=str(self._number()))
+            ET.SubElement(incoming, "incomingLanelet", ref=str(self.ids[lane]))
+            after = sorted((self._turn(b), b) for a, b in self.flow if a == lane)
+            for turn in ("right", "straight", "left"):
+                for _, other in (pair for pair in after if pair[0] == turn):
+                    ET.SubElement(incoming, f"successors{turn.capitalize()}", ref=str(self.ids[other]))
+
+    def _lanelet(self, root: ET.Element, k: int, refs: list[tuple[str, int]]) -> None:
         node = ET.SubElement(root, "lanelet", id=str(self.ids[k]))
-        width = float(self.road.lane_width[k])
+        width, kind = float(self.road.lane_width[k]), LaneType(self.road.lane_type[k])
         if not np.isfinite(width):
-            width = WIDTHS.get(LaneType(self.road.lane_type[k]), NOMINAL_WIDTH)
+            width = WIDTHS.get(kind, NOMINAL_WIDTH)
         aside = 0.5 * width * _normals(self.lines[k])
         for tag, bound in (("leftBound", self.lines[k] + aside), ("rightBound", self.lines[k] - aside)):
             side = ET.SubElement(node, tag)
             for place in bound:
                 _point(side, place)
-        flow = self._pairs("successors")
-        for tag, others in (
-            ("predecessor", [a for a, b in flow if b == k]),
-            ("successor", [b for a, b in flow if a == k]),
-        ):
-            for other in others:
-                ET.SubElement(node, tag, ref=str(self.ids[other]))
+        links = [("predecessor", a) for a, b in self.flow if b == k]
+        links += [("successor", b) for a, b in self.flow if a == k]
+        for tag, other in links:
+            ET.SubElement(node, tag, ref=str(self.ids[other]))
         for tag, name in (("adjacentLeft", "left_neighbors"), ("adjacentRight", "right_neighbors")):
             beside = [b for a, b in self._pairs(name) if a == k]
-            # The format knows one on either side.
-            if beside:
+            if beside:  # the format knows one on either side
                 ET.SubElement(node, tag, ref=str(self.ids[beside[0]]), drivingDir="same")
-        _text(node, "laneletType", _LANES.get(LaneType(self.road.lane_type[k]), "unknown"))
-        if sign is not None:
-            ET.SubElement(node, "trafficSignRef", ref=str(sign))
-        for light in lights:
-            ET.SubElement(node, "trafficLightRef", ref=str(light))
-
-    def _sign(self, root: ET.Element, number: int, limit: float) -> None:
-        node = ET.SubElement(root, "trafficSign", id=str(number))
-        element = ET.SubElement(node, "trafficSignElement")
-        _text(element, "trafficSignID", "274")
-        _text(element, "additionalValue", limit)
-        first = next(k for k in self.lines if float(self.road.speed_limit[k]) == limit)
-        _point(ET.SubElement(node, "position"), self.lines[first][0])
-        _text(node, "virtual", "true")
-
-    def _lights(self) -> list[tuple[int, int, list[int], str]]:
-        """Id, row, lanes that lead to it, and the direction it is for.
-
-        The format hangs a light on the lane before it and tells turns apart by direction.
-        """
-        flow, found = self._pairs("successors"), []
-        for light, lane in enumerate(self.segment.signal_lane.tolist()):
-            if lane in self.lines:
-                before = [a for a, b in flow if b == lane]
-                found.append((self._number(), light, before or [lane], self._turn(lane) if before else "all"))
-        return found
+        _text(node, "laneletType", _LANES.get(kind, "unknown"))
+        for tag, number in refs:
+            ET.SubElement(node, tag, ref=str(number))
 
     def _turn(self, lane: int) -> str:
         heading = np.unwrap(np.arctan2(*np.diff(self.lines[lane], axis=0).T[::-1]))
@@ -221,8 +209,8 @@ class _Network:
     def _light(self, root: ET.Element, number: int, light: int, turn: str) -> None:
         node = ET.SubElement(root, "trafficLight", id=str(number))
         cycle = ET.SubElement(node, "cycle")
-        colors = [_COLORS.get(SignalState(state), "inactive") for state in self.states[light].tolist()]
-        for color, run in groupby(colors):
+        states = self.segment.signal_state[light, self.within].tolist()
+        for color, run in groupby(_COLORS.get(SignalState(state), "inactive") for state in states):
             element = ET.SubElement(cycle, "cycleElement")
             _text(element, "duration", str(len(list(run))))
             _text(element, "color", color)
@@ -231,18 +219,6 @@ class _Network:
         _point(ET.SubElement(node, "position"), place)
         _text(node, "direction", turn)
         _text(node, "active", "true")
-
-    def _intersections(self, root: ET.Element, lights: list[tuple[int, int, list[int], str]]) -> None:
-        """One for each lane with lights, so that readers can tell which way each of its turns goes."""
-        flow = self._pairs("successors")
-        for lane in sorted({lane for _, _, lanes, turn in lights for lane in lanes if turn != "all"}):
-            node = ET.SubElement(root, "intersection", id=str(self._number()))
-            incoming = ET.SubElement(node, "incoming", id=str(self._number()))
-            ET.SubElement(incoming, "incomingLanelet", ref=str(self.ids[lane]))
-            after = sorted((self._turn(b), b) for a, b in flow if a == lane)
-            for turn in ("right", "straight", "left"):
-                for _, other in (pair for pair in after if pair[0] == turn):
-                    ET.SubElement(incoming, f"successors{turn.capitalize()}", ref=str(self.ids[other]))
 
 
 def _normals(line: Reals) -> Reals:
@@ -268,16 +244,8 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
     place = world.position + segment.origin[:2]
 
     def agent(row: int) -> dict[str, Any]:
-        steps = np.flatnonzero(world.valid[row])
-        parts = (
-            steps[:, None],
-            place[row, steps],
-            world.heading[row, steps, None],
-            world.speed[row, steps, None],
-        )
-        states = [
-            [int(state[0]), *(round(v, 6) for v in state[1:])] for state in np.concatenate(parts, 1).tolist()
-        ]
+        steps = np.flatnonzero(world.valid[row]).tolist()
+        values = np.column_stack([place[row], world.heading[row], world.speed[row]])
         found = {
             "id": int(segment.agent_id[row]),
             "type": AgentType(segment.agent_type[row]).name.lower(),
@@ -285,7 +253,7 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
             "width": float(segment.size[row, 1]),
             "ego": row == segment.ego,
             "driver": drivers.get(row, PLAYBACK),
-            "states": states,
+            "states": [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps],
         }
         if row in rank:
             n = rank[row]

@@ -1,4 +1,4 @@
-"""The folder that saved rollouts lie in: ``docs/rollouts.md`` describes the format."""
+"""The folder that saved rollouts lie in: ``docs/formats.md`` describes the format."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from types import NoneType
-from typing import Any, overload
+from typing import Any
 from urllib.parse import quote
 
 from safetensors.numpy import save
@@ -31,23 +30,21 @@ LOCK = "rollouts.lock"
 LATER = ("weights", "specification", "planner", "planner_seconds")
 """Settings that a manifest has since November 2026."""
 _BEGUN = (LOCK, SEGMENTS, INDEX)
-"""In a folder whose writer died before there was a manifest."""
+"""Names in a folder whose writer died before there was a manifest."""
 _LONGEST = 120
-_KINDS: dict[str, tuple[type, ...]] = {
-    "segment": (str,),
+"""Letters of a file's name."""
+_MANIFEST_KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
+_ENTRY_KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("segment", "file", "sha256", "group"), (str,)),
     "rollouts": (int,),
-    "file": (str,),
-    "sha256": (str,),
     "dt": (int, float),
     "failed": (str, NoneType),
-    "group": (str,),
 }
-"""Of the values of an entry."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What all rollouts of a folder have in common.
+    """Facts that all rollouts of a folder have in common.
 
     Attributes:
         agent: name of what is evaluated.
@@ -64,25 +61,23 @@ class About:
     store: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, agent: str, store: SegmentStore, settings: Any, *, seed: int = 0) -> About:
-        """Of interactive agents that one agent drives beside log playback.
+    def of(cls, agent: str, store: SegmentStore, settings: Any, *, seed: int = 0, planner: str = "") -> About:
+        """The facts of rollouts of one agent beside log playback.
 
         Args:
             agent: its name.
             store: the run segments.
             settings: a dataclass such as :class:`symphony.config.EvaluateConfig`, or a dictionary.
             seed: of everything drawn at random.
+            planner: of the ego, which the agent then does not drive.
         """
         plain = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else dict(settings)  # type: ignore[arg-type]
         drivers = {"interactive": agent, "others": "playback"}
+        if planner:
+            agent, drivers = f"{planner} among {agent}", {"ego": planner, **drivers}
         # As JSON gives it back, so that an equal simulation is seen to be equal.
         plain = json.loads(json.dumps(plain, default=str))
         return cls(agent, seed, drivers, plain, {"path": str(store.path), "checksum": store.checksum()})
-
-    def with_ego(self, planner: str) -> About:
-        """The same with a planner in the ego's place."""
-        agent = f"{planner} among {self.agent}"
-        return dataclasses.replace(self, agent=agent, drivers={"ego": planner, **self.drivers})
 
 
 @dataclass(frozen=True)
@@ -123,31 +118,30 @@ class RolloutWriter:
             self.path.mkdir(parents=True, exist_ok=True)
         self._lock = Lock(self.path / LOCK)
         try:
-            if not (self.path / MANIFEST).exists() and any(p.name not in _BEGUN for p in self.path.iterdir()):
+            manifest = {"format": FORMAT, **dataclasses.asdict(about)}
+            changed = list(manifest)
+            if (self.path / MANIFEST).exists():
+                changed = _differing(manifest, _read_manifest(self.path))
+                # One that holds nothing yet is nobody's.
+                if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
+                    message = (
+                        f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
+                    )
+                    at = changed[0].partition(".")[0]
+                    raise DataError(message, file=self.path / MANIFEST, field=at)
+            elif any(path.name not in _BEGUN for path in self.path.iterdir()):
                 raise foreign
-            self._begin({"format": FORMAT, **dataclasses.asdict(about)})
+            with naming(self.path):
+                (self.path / SEGMENTS).mkdir(exist_ok=True)
+                with (self.path / INDEX).open("ab+") as file:  # a line that was not finished is cut off
+                    file.seek(0)
+                    file.truncate(file.read().rfind(b"\n") + 1)
+            if changed:
+                write_json(self.path / MANIFEST, manifest)
+            self._entries = _read_index(self.path)
         except BaseException:
             self.close()
             raise
-
-    def _begin(self, manifest: dict[str, Any]) -> None:
-        if (self.path / MANIFEST).exists():
-            held = _read_manifest(self.path)
-            changed = _differing(manifest, held)
-            # One that holds nothing yet is nobody's.
-            if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
-                message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
-                raise DataError(message, file=self.path / MANIFEST, field=changed[0].partition(".")[0])
-            (self.path / SEGMENTS).mkdir(exist_ok=True)
-            _repair(self.path / INDEX)
-            if changed:
-                write_json(self.path / MANIFEST, manifest)
-        else:
-            with naming(self.path):
-                (self.path / SEGMENTS).mkdir(parents=True, exist_ok=True)
-                (self.path / INDEX).touch()
-            write_json(self.path / MANIFEST, manifest)
-        self._entries = _read_index(self.path)
 
     def close(self) -> None:
         """Let others write."""
@@ -188,14 +182,13 @@ class RolloutWriter:
 
     def _record(self, entry: Entry) -> None:
         self._lock.check()
-        path = self.path / INDEX
-        given = dataclasses.asdict(entry)
+        path, given = self.path / INDEX, dataclasses.asdict(entry)
         if not entry.group:
             del given["group"]
-        # A failure has neither file nor time step.
-        values = {name: given[name] for name in given if entry.failed is None or given[name] == given[name]}
+        if entry.failed is not None:
+            del given["dt"]
         with naming(path), path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(values, ensure_ascii=False) + "\n")
+            file.write(json.dumps(given, ensure_ascii=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
         self._entries[entry.segment] = entry
@@ -204,16 +197,15 @@ class RolloutWriter:
 def _differing(mine: Mapping[str, Any], held: Mapping[str, Any]) -> list[str]:
     """Names of what two manifests differ in; of their settings each."""
     found = [name for name in mine if name != "settings" and mine[name] != held.get(name)]
-    before = held.get("settings")
+    now, before = mine["settings"], held.get("settings")
     if not isinstance(before, dict):
         return [*found, "settings"]
-    now = mine["settings"]
-    # Folders from before these were kept don't say.
+    # Folders from before the later settings were kept don't say.
     names = [name for name in dict.fromkeys([*now, *before]) if name not in LATER or name in before]
     return found + [f"settings.{name}" for name in names if now.get(name) != before.get(name)]
 
 
-class RolloutFolder(Sequence[SavedRollouts]):
+class RolloutFolder:
     """Read access to a folder of rollouts: ``folder[i]`` reads and checks that segment only.
 
     Args:
@@ -226,57 +218,44 @@ class RolloutFolder(Sequence[SavedRollouts]):
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         manifest = _read_manifest(self.path)
-        names = {item.name for item in dataclasses.fields(About)}
-        missing = sorted(names - manifest.keys())
-        if missing:
-            raise DataError("is missing", file=self.path / MANIFEST, field=missing[0])
-        kinds = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
-        for name, kind in kinds.items():
-            if type(manifest[name]) is not kind:
+        for name, kind in _MANIFEST_KINDS.items():
+            if type(manifest.get(name)) is not kind:
                 raise DataError(f"must be {kind.__name__}", file=self.path / MANIFEST, field=name)
-        self.about = About(**{name: manifest[name] for name in names})
+        self.about = About(**{name: manifest[name] for name in _MANIFEST_KINDS})
         found = _read_index(self.path).values()
         self.entries = [entry for entry in found if entry.failed is None]
         self.failures = [entry for entry in found if entry.failed is not None]
 
     def only(self, segments: Iterable[str]) -> RolloutFolder:
-        """The same with some segments only."""
+        """The folder with some of its segments only."""
         wanted, found = set(segments), copy.copy(self)
         found.entries = [entry for entry in self.entries if entry.segment in wanted]
         found.failures = [entry for entry in self.failures if entry.segment in wanted]
-        found.__dict__.pop("ids", None)  # kept once it was asked for
         return found
 
     def __len__(self) -> int:
         return len(self.entries)
 
-    @overload
-    def __getitem__(self, index: int) -> SavedRollouts: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[SavedRollouts]: ...
-    def __getitem__(self, index: int | slice) -> SavedRollouts | list[SavedRollouts]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+    def __getitem__(self, index: int) -> SavedRollouts:
         entry = self.entries[index]
-        file = self.path / entry.file
+        file, segment = self.path / entry.file, entry.segment
         try:
             data = file.read_bytes()
         except OSError as error:
-            raise DataError(
-                f"can't be read: {error.strerror or error}", file=file, segment=entry.segment
-            ) from error
+            message = f"can't be read: {error.strerror or error}"
+            raise DataError(message, file=file, segment=segment) from error
         if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise DataError("damaged: not what was written", file=file, segment=entry.segment, field="sha256")
-        saved = read_tensors(data, file, entry.segment)
+            raise DataError("damaged: not what was written", file=file, segment=segment, field="sha256")
+        saved = read_tensors(data, file, segment)
         if saved.rollouts != entry.rollouts:
             message = f"holds {saved.rollouts} rollouts, the index says {entry.rollouts}"
-            raise DataError(message, file=file, segment=entry.segment, field="state")
+            raise DataError(message, file=file, segment=segment, field="state")
         return saved
 
     def __iter__(self) -> Iterator[SavedRollouts]:
         return (self[i] for i in range(len(self)))
 
-    @cached_property
+    @property
     def ids(self) -> list[str]:
         """Segment ids in the order they were written."""
         return [entry.segment for entry in self.entries]
@@ -335,11 +314,9 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         values = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise DataError(f"not valid JSON ({error})", file=file) from error
-    if not isinstance(values, dict):
-        raise DataError("not a JSON object", file=file)
-    if values.pop("format", None) != FORMAT:
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise DataError(f"of another version, this one reads format {FORMAT}", file=file, field="format")
-    return {"format": FORMAT, **values}
+    return values
 
 
 def _read_index(path: Path) -> dict[str, Entry]:
@@ -351,28 +328,17 @@ def _read_index(path: Path) -> dict[str, Entry]:
     found: dict[str, Entry] = {}
     for number, line in enumerate(lines, start=1):
         try:
-            values = json.loads(line)
-            entry = Entry(**values)
+            entry = Entry(**json.loads(line))
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(f"line {number} is damaged ({error})", file=file) from error
-        for name, kinds in _KINDS.items():
+        for name, kinds in _ENTRY_KINDS.items():
             if type(getattr(entry, name)) not in kinds:
                 raise DataError(f"line {number}: of a wrong type", file=file, field=name)
         if not 0 <= entry.rollouts <= MAX_LENGTH:
             raise DataError(f"line {number}: {entry.rollouts} rollouts", file=file, field="rollouts")
-        if entry.failed is None and not (
-            entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1 and entry.file.isprintable()
-        ):
+        inside = entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1
+        if entry.failed is None and not (inside and entry.file.isprintable()):
             raise DataError(f"line {number} names no file of this folder", file=file, segment=entry.segment)
         found.pop(entry.segment, None)
         found[entry.segment] = entry
     return found
-
-
-def _repair(index: Path) -> None:
-    """Cut off a line that was not finished."""
-    if not index.is_file():
-        return
-    with index.open("rb+") as file:
-        data = file.read()
-        file.truncate(data.rfind(b"\n") + 1)

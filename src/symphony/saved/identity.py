@@ -21,12 +21,11 @@ from symphony.planners.interface import PIPE, planner_maker
 from symphony.planners.view import FunctionPlanner
 
 _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
+"""The place of an object in memory, in what Python prints of it."""
 
 
 def identity_of(agent: Agent) -> dict[str, str]:
-    """Digests of an agent's weights and of what it is built and searched by, as settings: another agent of the same
-    name is another simulation.
-    """
+    """Digests of an agent's weights and of what it is built and searched by, as settings."""
     if not agent.modules:
         return {}
     digest = hashlib.sha256()
@@ -39,11 +38,11 @@ def identity_of(agent: Agent) -> dict[str, str]:
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it (by
-    ``functools.partial``, as an object's attributes, by the function around it): one that was changed is another one.
+    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it: by
+    ``functools.partial``, as an object's attributes, by the function around it.
 
-    Of a command what it starts, where that is a file, and the first other word that is one. Empty for what comes with
-    the package, and where no source is known.
+    For a command it is that of what it starts, where that is a file, and of the first other word that is one. Empty
+    for what comes with the package, and where no source is known.
     """
     if isinstance(planner, str) and planner.startswith(PIPE):
         words = shlex.split(planner.removeprefix(PIPE))
@@ -55,7 +54,12 @@ def source_of(planner: str | Callable[..., Any]) -> str:
     while isinstance(given, partial):
         bound += _content((given.args, given.keywords))
         given = given.func
-    held = _held_by(given)
+    if inspect.isfunction(given):
+        held = inspect.getclosurevars(given).nonlocals
+    elif inspect.isclass(given):
+        held = {}
+    else:
+        held = getattr(getattr(given, "__self__", given), "__dict__", {})
     bound += _content(held) if held else ""
     code = _code_of(given)
     return _short((code + bound).encode()) if bound else code
@@ -85,26 +89,16 @@ def _content(value: Any, inside: tuple[int, ...] = ()) -> str:
     elif type(value).__repr__ is object.__repr__ and getattr(value, "__dict__", None):
         parts = [_content(vars(value), inside)]
     else:
-        # Where an object lies in memory is nothing of it.
         return _PLACE.sub("", repr(value))
     return f"{type(value).__qualname__}({', '.join(parts)})"
-
-
-def _held_by(given: Any) -> Mapping[str, Any]:
-    """What an object or a function has beside its code, by name."""
-    if inspect.isfunction(given):
-        return inspect.getclosurevars(given).nonlocals
-    owner = given.__self__ if inspect.ismethod(given) else given
-    return {} if inspect.isclass(owner) else getattr(owner, "__dict__", {})
 
 
 def _code_of(given: Any) -> str:
     module = inspect.getmodule(given)
     if module is None or module.__name__.partition(".")[0] == "symphony":
         return ""
-    file = getattr(module, "__file__", None)
-    if file is not None:
-        return _digest(file)
+    if getattr(module, "__file__", None) is not None:
+        return _digest(str(module.__file__))
     try:  # of a notebook, say
         return _short(inspect.getsource(given).encode())
     except (OSError, TypeError):
@@ -116,8 +110,8 @@ def _short(data: bytes) -> str:
 
 
 def _digest(file: str) -> str:
-    """Of what a file holds; empty where there is none that can be read."""
+    """A digest of what a file holds; empty where there is none that can be read."""
     try:
-        return _short(Path(file).read_bytes()) if Path(file).is_file() else ""
+        return _short(Path(file).read_bytes())
     except OSError:
         return ""

@@ -10,24 +10,26 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from symphony import keys
-from symphony.collectors import BeamSearchResult
 from symphony.data.levels import agent_heights
 from symphony.data.segment import Polylines, RunSegment
-from symphony.envs.scene import SceneBatch
-from symphony.errors import DataError
-from symphony.rollouts.unroll import Rollouts
+
+if TYPE_CHECKING:  # who only reads rollouts waits for no torch
+    from torch import Tensor
+
+    from symphony.collectors import BeamSearchResult
+    from symphony.envs.scene import SceneBatch
+    from symphony.rollouts.unroll import Rollouts
 
 PLAYBACK = "playback"
 """The driver of every agent of the log that is not named."""
 BACKGROUND = "background:"
-"""What the names of drivers begin with whose agents nobody evaluates."""
+"""The begin of the names of drivers whose agents nobody evaluates."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +167,6 @@ def saved_rollouts(
         driver: of all interactive agents, or of each [N].
         others: what drives background agents.
         failed: see :class:`SavedRollouts`.
-
-    Raises:
-        DataError: a search without its tree, or whose leaves are not the rollouts.
     """
     real = scenes.interactive_valid[row].cpu().numpy()
     steps = min(segment.num_steps - 1, rollouts.collision.shape[-2])
@@ -190,7 +189,7 @@ def saved_rollouts(
         routes=routes,
         drivers=tuple(name for name, there in zip(names, real, strict=True) if there),
         failed=dict(failed or {}),
-        trees=None if search is None else _trees(search, row, steps, real, len(counted), segment.segment_id),
+        trees=None if search is None else _trees(search, row, steps, real),
     )
 
 
@@ -215,15 +214,9 @@ def _routes(
     return line[number.reshape(chosen.shape)], Polylines.of(lines)
 
 
-def _trees(
-    search: BeamSearchResult, row: int, steps: int, real: NDArray[np.bool_], rollouts: int, segment_id: str
-) -> SavedTrees:
+def _trees(search: BeamSearchResult, row: int, steps: int, real: NDArray[np.bool_]) -> SavedTrees:
     if search.tree is None:
-        raise DataError("the search did not keep its tree", segment=segment_id, field="tree")
-    slots = _array(search.slots[row])
-    if slots.shape[0] * slots.shape[-1] != rollouts:
-        message = f"{slots.shape[0]} trees of {slots.shape[-1]} leaves are not {rollouts} rollouts"
-        raise DataError(message, segment=segment_id, field="tree.slots")
+        raise ValueError("the search did not keep its tree")
     state, there, collision, offroad = (
         _array(search.tree.get(("next", *key))[row])[:, :, :steps, real]
         for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
@@ -238,6 +231,6 @@ def _trees(
         score=_array(search.simulated_scores[row])[:, :, :steps, real],
         totals=totals,
         parents=parents,
-        slots=slots[:, :periods],
+        slots=_array(search.slots[row])[:, :periods],
         prune_every=search.prune_every,
     )

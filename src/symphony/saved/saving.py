@@ -19,7 +19,7 @@ from symphony.planners.calls import SECONDS
 from symphony.planners.driver import EgoPlanners
 from symphony.planners.interface import planner_maker, planner_name
 from symphony.rollouts.control import given_goals
-from symphony.rollouts.driving import driven_by
+from symphony.rollouts.driving import beside_planner, simulate_batch
 from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutFolder, RolloutWriter
@@ -52,7 +52,7 @@ def save_simulation(
         path: the folder.
         agent: on ``config.device``; log playback is kept as it is.
         dataset: in the agent's action space, with routes if it follows goals.
-        config: how it is simulated.
+        config: how it is simulated; with a planner without a search unless one is asked for.
         keep_tree: of a search keep all branches with their scores, too.
         planner: of the ego, or its name, as of :func:`symphony.planners.interface.planner_maker`; then the dataset
             holds routes and the agent drives the other interactive agents. Segments whose ego can't be driven are put
@@ -68,24 +68,25 @@ def save_simulation(
     """
     if planner:
         planner_maker(planner)  # or complain before anything is simulated
+        config = beside_planner(config)
     settings = plain_settings(config, dataset.interactive, dataset.duration) | identity_of(agent)
     if goals:
         settings["goal"] = list(goals)
     if planner:
         settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds}
-    about = About.of(agent.name, dataset.store, settings, seed=config.seed)
-    with RolloutWriter(path, about.with_ego(planner_name(planner)) if planner else about) as writer:
+    name = planner_name(planner) if planner else ""
+    about = About.of(agent.name, dataset.store, settings, seed=config.seed, planner=name)
+    with RolloutWriter(path, about) as writer:
         names = [dataset.store.ids[i] for i in dataset.indices]
-        todo = [i for i, name in enumerate(names) if not writer.has(name)]
+        todo = [i for i, segment in enumerate(names) if not writer.has(segment)]
         if planner:
-            todo = _with_ego(writer, dataset, todo, config.rollouts)
+            todo = [i for i in todo if _has_ego(writer, dataset, i, config.rollouts)]
         done = len(names) - len(todo)
         drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
         together = segments_together(agent, config, dataset.interactive)
         if planner and not config.batch:
             together = min(together, PLANNED)
-        tasks = batches(todo, together, config)
-        with closing(shared(drive, tasks, config, dataset)) as results:
+        with closing(shared(drive, batches(todo, together, config), config, dataset)) as results:
             for saved in results:
                 for one in saved:
                     writer.add(one)
@@ -108,20 +109,22 @@ class _Drive:
     goals: tuple[str, ...]
 
     def __call__(self, items: list[int]) -> list[SavedRollouts]:
-        """What they did in each."""
+        """Rollouts of each segment."""
+        agent, config = self.agent, self.config
         with naming(self.dataset, items):
-            scenes = self.dataset.scenes(items).to(torch.device(self.config.device))
+            scenes = self.dataset.scenes(items).to(torch.device(config.device))
             segments = [self.dataset.segment(i) for i in items]
-            egos = None
+            driver: str | list[str] = PLAYBACK if agent.policy is None else agent.name
+            egos = given = None
             if self.planner:
                 name, make = planner_name(self.planner), planner_maker(self.planner)
                 egos = EgoPlanners(name, make, segments, self.planner_seconds)
-            given = (
-                given_goals(self.goals, segments, scenes, planned=bool(self.planner)) if self.goals else None
-            )
+                driver = [name, *[str(driver)] * (scenes.interactive.shape[1] - 1)]
+            if self.goals:
+                given = given_goals(self.goals, segments, scenes, planned=bool(self.planner))
             try:
-                found = driven_by(
-                    self.agent, scenes, self.config, keep_tree=self.keep_tree, egos=egos, given=given
+                found = simulate_batch(
+                    agent, scenes, config, keep_tree=self.keep_tree, egos=egos, given=given
                 )
             except NotFiniteError as error:
                 raise error.named(segments[error.row].segment_id) from error
@@ -134,35 +137,24 @@ class _Drive:
                     b,
                     goal=found.goal,
                     search=found.search if self.keep_tree else None,
-                    driver=self._drivers(on_cpu.interactive.shape[1]),
-                    others=self.config.others,
+                    driver=driver,
+                    others=config.others,
                     failed=found.failed[b] if found.failed else None,
                 )
                 for b, segment in enumerate(segments)
             ]
 
-    def _drivers(self, agents: int) -> str | list[str]:
-        name = PLAYBACK if self.agent.policy is None else self.agent.name
-        if not self.planner:
-            return name
-        return [planner_name(self.planner), *[name] * (agents - 1)]
 
-
-def _with_ego(writer: RolloutWriter, dataset: SceneDataset, items: Sequence[int], rollouts: int) -> list[int]:
-    """Those whose first interactive agent is the ego; the others are put on record as failed."""
-    found = []
-    for i in items:
-        segment = dataset.segment(i)
-        try:
-            usable = int(dataset.scene(i).interactive[0, 0]) == segment.ego
-            why = "the ego is no vehicle that is seen at the first step"
-        except DataError as error:
-            usable, why = False, error.message
-        if usable:
-            found.append(i)
-        else:
-            writer.fail(segment.segment_id, rollouts, why, segment.group)
-    return found
+def _has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
+    """Whether the first interactive agent of an item is the ego; else it is put on record as failed."""
+    segment, why = dataset.segment(item), "the ego is no vehicle that is seen at the first step"
+    try:
+        if int(dataset.scene(item).interactive[0, 0]) == segment.ego:
+            return True
+    except DataError as error:
+        why = error.message
+    writer.fail(segment.segment_id, rollouts, why, segment.group)
+    return False
 
 
 def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:

@@ -6,9 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import from_numpy
 
-from symphony.envs.objects import nearest_logged
 from symphony.saved.rollouts import SavedRollouts
 
 Reals = NDArray[np.float64]
@@ -64,7 +62,8 @@ def _heights(saved: SavedRollouts, rollout: int) -> NDArray[np.float32] | None:
     segment, agents = saved.segment, saved.agents[:, None]
     log, valid = segment.position[agents, :, :2], segment.valid[agents]
     place = saved.state[rollout].swapaxes(0, 1)[..., :2]
-    step = nearest_logged(from_numpy(log), from_numpy(valid), from_numpy(place)).numpy()
+    away = np.square(log - place[:, :, None]).sum(-1)
+    step = np.where(valid, away, np.inf).argmin(-1)
     found = saved.log_height[saved.start : saved.last + 1].swapaxes(0, 1).copy()
     found[saved.agents] = saved.log_height[step, agents]
     return found

@@ -1,16 +1,15 @@
-"""The one trainer: loop, resume, validation, previews, alarms, logging, processes."""
+"""The one trainer: loop, resume, alarms, logging, processes, and hooks that validate and show."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from symphony.imports import lazily
-from symphony.training.processes import Processes, processes
 
 if TYPE_CHECKING:
-    from symphony.training.phases import Phase, Updates, cosine
-    from symphony.training.trainer import Trainer
+    from symphony.training.processes import Processes
+    from symphony.training.trainer import Phase, Trainer, Updates, cosine
 
-__all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine", "processes"]
+__all__ = ["Phase", "Processes", "Trainer", "Updates", "cosine"]
 
 __getattr__, __dir__ = lazily(__name__)

@@ -114,7 +114,7 @@ class Tracker:
 
 
 def _run_id(folder: Path, *, again: bool) -> str:
-    """What Weights & Biases calls a run: the same when it goes on, so that its parts become one there."""
+    """The id of a run at Weights & Biases: the same when it goes on, so that its parts become one there."""
     path = folder / ID
     known = path.read_text(encoding="utf-8", errors="replace").strip() if again and path.is_file() else ""
     if not re.fullmatch(r"[0-9a-z]{4,32}", known):

@@ -25,7 +25,7 @@ from symphony.streams import stream_of
 
 _SEED_STRIDE = 1 << 20
 _PATIENCE = timedelta(days=1)
-"""For the others to arrive, one of which may be validating; that one has died torchrun notices by itself."""
+"""Time that the others have to arrive, one of which may be validating; torchrun itself notices one that has died."""
 
 
 class SharedLoss(DistributedDataParallel):
@@ -46,7 +46,7 @@ class SharedLoss(DistributedDataParallel):
 
 @dataclass(frozen=True)
 class Processes:
-    """Those that train one run together, seen from one of them.
+    """The processes that train one run together, seen from one of them.
 
     Attributes:
         device: where this one computes.
@@ -59,7 +59,7 @@ class Processes:
     count: int = 1
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this is the one that validates, writes and speaks."""
         return self.rank == 0
 
@@ -75,7 +75,7 @@ class Processes:
         if self.count > 1:
             torch.manual_seed(stream_of(f"update {seed} {self.rank} {step}"))
 
-    def share(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
+    def wrap_ddp(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
         """A loss that is that of the batches of all processes; itself where there is one process only."""
         if self.count == 1:
             return loss

@@ -1,16 +1,19 @@
-"""The one trainer: runs what a recipe has built."""
+"""The one trainer: runs what a recipe has built, from its last checkpoint, from another run's networks, or anew."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import json
+import math
 import random
 import time
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -20,22 +23,25 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from symphony import allocator
-from symphony.agents.agent import FILE, Agent
-from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoint, prune, save_checkpoint
-from symphony.agents.choice import Best
-from symphony.config import RunConfig, to_json
-from symphony.errors import ConfigError, DataError
+from symphony.agents.agent import FILE, Agent, read_spec
+from symphony.agents.checkpoint import (
+    MANIFEST,
+    CheckpointError,
+    latest,
+    load_checkpoint,
+    parts_of,
+    prune,
+    save_checkpoint,
+)
+from symphony.agents.choice import Best, choose, split_name
+from symphony.config import AgentSpec, RunConfig, read_json, to_json
+from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.files import Lock, write_file
-from symphony.training.alarms import ALARMS, NORM, Alarms, Skips, loss_of
-from symphony.training.logging import Tracker
-from symphony.training.phases import Phase
+from symphony.training.logging import RECORDS, Tracker
 from symphony.training.processes import Processes
-from symphony.training.resume import checkpoint_to_resume, warm_start
 
 if TYPE_CHECKING:
     from symphony.learning import SceneDataset, SearchReplay
-    from symphony.training.previews import Previewer
-    from symphony.training.validation import Validator
 
 KEEP = 3
 """Checkpoints kept in a run's folder, the last ones; the best beside them."""
@@ -43,15 +49,150 @@ CLIP = 1.0
 """Largest norm of a network's gradient."""
 LOCK = "run.lock"
 """Held by the process that trains."""
+NORM = "gradient_norm_"
+PATIENCE = 20
+"""Updates in a row that may be skipped."""
+WINDOW = 10
+"""Records that an alarm looks back on."""
+ALARMS = {
+    "discriminator_too_strong": (
+        "the discriminator tells simulated from logged states almost without fail (AUC above 0.98 in the last 10 "
+        "records): its scores rank little; consider a lower rate, a gradient penalty or noise for it"
+    ),
+    "discriminator_blind": (
+        "the discriminator can't tell simulated from logged states (AUC below 0.52 in the last 10 records): its "
+        "scores are chance; consider a higher rate, or more features or states for it"
+    ),
+}
+"""Values that `alarm` in the metrics may have, and what they mean."""
+FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every")
+"""Settings that may be others when a run goes on."""
 _SEED_STRIDE = 1_000_003
+
+Updates = Iterator[tuple[str, TensorDictBase]]
+"""Losses one by one, each with the name of the optimizer that descends it before the next is computed. What has no
+optimizer of its name is recorded only.
+"""
+Rates = Callable[[int], Mapping[str, float]]
+"""Learning rates by optimizer at an update."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of updates of one kind.
+
+    Attributes:
+        until: the first update, counted from the start of the run, that no longer belongs to it.
+        update: computes the losses of an update; see :data:`Updates`.
+        rates: of the optimizers.
+    """
+
+    until: int
+    update: Callable[[int], Updates]
+    rates: Rates
+
+
+def cosine(rates: Mapping[str, float], end: int, begin: int = 0) -> Rates:
+    """Rates that fall to a tenth along a cosine, from update ``begin`` to ``end``."""
+
+    def at(step: int) -> Mapping[str, float]:
+        share = 0.5 * (1 + math.cos(math.pi * (step - begin) / (end - begin)))
+        return {name: rate * (0.1 + 0.9 * share) for name, rate in rates.items()}
+
+    return at
+
+
+class TrainingError(SymphonyError):
+    """Training that can't go on."""
+
+
+@dataclass
+class Skips:
+    """Steps of optimizers that were left out because the gradient was not finite.
+
+    Attributes:
+        total: of all networks, since the run began.
+        in_row: of each network, up to now.
+    """
+
+    total: int = 0
+    in_row: dict[str, int] = field(default_factory=dict)
+
+    def count(self, values: Mapping[str, Tensor]) -> list[str]:
+        """Count those of one update, from its norms of the gradient; returns the networks concerned.
+
+        Raises:
+            TrainingError: if a network had to skip too many in a row.
+        """
+        norms = {name.removeprefix(NORM): value for name, value in values.items() if name.startswith(NORM)}
+        if not norms:
+            return []
+        # One transfer from the device for all.
+        finite = torch.stack([norm.detach() for norm in norms.values()]).isfinite().tolist()
+        bad = [name for name, good in zip(norms, finite, strict=True) if not good]
+        self.total += len(bad)
+        for name in norms:
+            self.in_row[name] = self.in_row.get(name, 0) + 1 if name in bad else 0
+            if self.in_row[name] >= PATIENCE:
+                loss = f"loss_{name}"
+                told = f" ({loss} is {values[loss].item():g})" if loss in values else ""
+                raise TrainingError(
+                    f"the gradient of the {name} network{told} was not finite in {PATIENCE} updates in a row; "
+                    "the last checkpoint is intact: lower the learning rate, or check the data"
+                )
+        return bad
+
+
+class Alarms:
+    """Watches the records of a run for a discriminator that has won or learns nothing.
+
+    Args:
+        records: earlier ones of a run that goes on.
+    """
+
+    def __init__(self, records: Iterable[Mapping[str, Any]] = ()) -> None:
+        self._recent: deque[float] = deque(maxlen=WINDOW)
+        for record in records:
+            self.check(record)
+
+    def check(self, record: Mapping[str, Any]) -> str | None:
+        """The alarm (see :data:`ALARMS`) that is on after this record, if any."""
+        value = record.get("discriminator_auc")
+        if value is None or math.isnan(value):
+            return None
+        self._recent.append(value)
+        if len(self._recent) < WINDOW:
+            return None
+        if min(self._recent) > 0.98:
+            return "discriminator_too_strong"
+        return "discriminator_blind" if max(self._recent) < 0.52 else None
+
+
+class Validation(Protocol):
+    """A hook that evaluates the agent as it is after an update; gives numbers for the record.
+
+    Attributes:
+        best: the best checkpoint so far.
+        what: the run segments it is evaluated on and how often: scores of something else can't be compared.
+        dataset: these run segments.
+    """
+
+    best: Best | None
+    what: str
+    dataset: SceneDataset
+
+    def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]: ...  # noqa: D102
+
+
+Preview = Callable[[int, Tracker], dict[str, float]]
+"""A hook that shows the agent as it is after an update, also to the tracker; gives numbers for the record."""
 
 
 class Trainer:
     """Runs the updates of a recipe: records, validation, previews and checkpoints, in that order.
 
     All that is random in an update derives from the seed and the number of the update, and checkpoints hold weights
-    and optimizers, so a run that was stopped and resumed ends with the same weights as one that was not. With a store
-    to validate on, the checkpoint that does best there is the run's agent.
+    and optimizers, so a run that was stopped and resumed ends with the same weights as one that was not.
 
     Args:
         config: of the run; the folder gets it whole.
@@ -63,10 +204,17 @@ class Trainer:
         processes: those that train together.
         replay: what is drawn from searches, where there are any.
 
+    Attributes:
+        validator: a hook called at every checkpoint, of which the best then is the run's agent.
+        previewer: a hook called every ``preview.every`` updates; see :func:`symphony.training.hooks.add_hooks`.
+
     Raises:
         ConfigError: if the folder holds another run, or settings can't be used.
         DataError: if a store can't be read or holds nothing to learn from.
     """
+
+    validator: Validation | None = None
+    previewer: Preview | None = None
 
     def __init__(
         self,
@@ -85,12 +233,20 @@ class Trainer:
                 f"({replay.every}), so that a resumed run repeats no search"
             )
         self.config, self.agent, self.data, self.phases = config, agent, data, phases
-        self.optimizers, self.rng, self.world = dict(optimizers), rng, processes
+        self.optimizers, self.rng, self.world, self.replay = dict(optimizers), rng, processes, replay
         self.seed = processes.seed(config.seed)
         self.skips, self.told = Skips(), set[str]()
         self.best: Best | None = None
         self.validated: str | None = None
-        self.progress = _progress(shown=processes.leads)
+        self.progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=not processes.is_main,
+        )
         self.tracker: Tracker | None = None
         self.checksum = data.checksum()
         self.done = checkpoint_to_resume(config)
@@ -98,18 +254,6 @@ class Trainer:
             warm_start(agent, config.warm_start)
         if agent.personas is not None and self.done is None:
             agent.personas.copy_(data.personas.table())
-        self.validator: Validator | None = None
-        self.previewer: Previewer | None = None
-        # Only a run that simulates its agent loads what simulates, judges and draws.
-        if self.world.leads and config.validation.data is not None:
-            from symphony.training.validation import Validator  # noqa: PLC0415
-
-            self.validator = Validator(config.validation, agent, processes.device)
-        if self.world.leads and 0 < config.preview.every <= config.steps:
-            from symphony.training.previews import Previewer  # noqa: PLC0415
-
-            shown = data if self.validator is None else self.validator.dataset
-            self.previewer = Previewer(config, agent, shown, processes.device, replay)
 
     def run(self) -> Path:
         """Train to the end.
@@ -125,7 +269,7 @@ class Trainer:
         with contextlib.ExitStack() as held:
             # No process writes before all have looked at what there is.
             self.world.wait()
-            if self.world.leads:
+            if self.world.is_main:
                 self.config.out.mkdir(parents=True, exist_ok=True)
                 self._lock = held.enter_context(Lock(self.config.out / LOCK))
                 if checkpoint_to_resume(self.config) != self.done:
@@ -139,7 +283,7 @@ class Trainer:
         # Kept with checkpoints like torch's, which the recipe has seeded: those of equal runs are equal files.
         random.seed(config.seed)
         np.random.seed(config.seed % 2**32)  # noqa: NPY002
-        if self.world.leads:
+        if self.world.is_main:
             write_file(config.out / "config.json", to_json(config))
             write_file(config.out / FILE, to_json(self.agent.spec))
         if self.done is not None:
@@ -158,16 +302,10 @@ class Trainer:
         for store in (dataset.store for dataset in (self.data, *others)):
             if store.unfinished is not None:
                 self._warn(str(store.path), f"{store.path} {store.unfinished}")
-        if self.world.leads:
+        if self.world.is_main:
             # The process before may have died between a checkpoint and the removal of old ones.
             self._prune()
-            settings = json.loads(to_json(config))
-            self.tracker = Tracker(
-                config.out,
-                settings,
-                config.wandb,
-                after=step,
-            )
+            self.tracker = Tracker(config.out, json.loads(to_json(config)), config.wandb, after=step)
             self.alarms = Alarms(self.tracker.kept)
         try:
             with self.progress:
@@ -200,9 +338,12 @@ class Trainer:
                 continue
             paused = time.perf_counter()
             if self.validator is not None and (last or step % config.checkpoint_every == 0):
-                numbers |= self._validate(self.validator, step)
+                numbers |= self.validator(step, self._show_validated)
+                self.best, self.validated = self.validator.best, self.validator.what
             if self.previewer is not None and (last or step % config.preview.every == 0):
-                numbers |= self._preview(self.previewer, self.tracker, step)
+                self.progress.update(self.task, description="previewing")
+                numbers |= self.previewer(step, self.tracker)
+            self.progress.update(self.task, description="training")
             began += time.perf_counter() - paused
             if numbers:
                 self.tracker.log(step, numbers)
@@ -249,14 +390,13 @@ class Trainer:
         return {**named, f"loss_{name}": total.detach(), f"{NORM}{name}": norm}
 
     def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
-        """What the loop adds to a record, and shows."""
+        """Show the numbers of a record; returns what the loop adds to it."""
         added: dict[str, float | str] = {}
         if "policy" in self.optimizers:
             added["learning_rate"] = self.optimizers["policy"].param_groups[0]["lr"]
         added["skipped_updates"] = self.skips.total
-        loss = loss_of("policy")
-        if loss in numbers:
-            self.progress.update(self.task, loss=f"{numbers[loss]:.3f}")
+        if "loss_policy" in numbers:
+            self.progress.update(self.task, loss=f"{numbers['loss_policy']:.3f}")
         self.progress.update(self.task, speed=f"{numbers['updates_per_second']:.3g}")
         alarm = self.alarms.check(numbers)
         if alarm is not None:
@@ -266,25 +406,12 @@ class Trainer:
 
     def _warn(self, condition: str, message: str) -> None:
         """Tell the user, once."""
-        if condition not in self.told and self.world.leads:
+        if condition not in self.told and self.world.is_main:
             self.told.add(condition)
             self.progress.console.print(f"warning: {message}", style="yellow", soft_wrap=True)
 
-    def _validate(self, validator: Validator, step: int) -> dict[str, float]:
-        def show(done: int, total: int) -> None:
-            self.progress.update(self.task, description=f"validating {done}/{total}")
-
-        numbers = validator(step, show)
-        self.best, self.validated = validator.best, validator.what
-        self.progress.update(self.task, description="training")
-        return numbers
-
-    def _preview(self, previewer: Previewer, tracker: Tracker, step: int) -> dict[str, float]:
-        self.progress.update(self.task, description="previewing")
-        preview = previewer(step)
-        tracker.preview(step, preview.samples, preview.video)
-        self.progress.update(self.task, description="training")
-        return preview.numbers()
+    def _show_validated(self, done: int, total: int) -> None:
+        self.progress.update(self.task, description=f"validating {done}/{total}")
 
     def _save(self, step: int) -> None:
         """Write a checkpoint; by now all records up to it are on the disk."""
@@ -311,20 +438,18 @@ class Trainer:
 
     def _restore(self, extra: Mapping[str, Any]) -> None:
         before = extra.get("processes", 1)
-        if type(before) is not int or before < 1:
-            raise CheckpointError("no number of processes", field="extra.processes")
         if before != self.world.count:
             raise ConfigError(
                 f"{self.config.out}: trained by {before} processes so far, can't be resumed by {self.world.count}"
             )
         if extra.get("data", self.checksum) != self.checksum:
             raise DataError(
-                f"not the run segments, or the record of hard ones, that {self.config.out} learned from so far: "
+                f"not the run segments that {self.config.out} learned from so far: "
                 f"checksum {self.checksum[:12]}, then {str(extra['data'])[:12]}",
                 file=self.data.store.path,
             )
         self.best, self.validated = Best.of(extra), extra.get("validated")
-        self.skips = Skips.of(extra)
+        self.skips = Skips(**extra.get("skips") or {})
         if self.validator is not None:
             if self.best is not None and self.validated not in (None, self.validator.what):
                 raise ConfigError(
@@ -334,13 +459,79 @@ class Trainer:
             self.validator.best = self.best
 
 
-def _progress(*, shown: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        disable=not shown,
-    )
+def checkpoint_to_resume(config: RunConfig) -> Path | None:
+    """The checkpoint to go on from; None for a new run.
+
+    Raises:
+        ConfigError: if the folder holds a run that is not to be gone on with, or another one.
+    """
+    path, records = config.out / "config.json", config.out / RECORDS
+    found = latest(config.out / "checkpoints")
+    if path.exists():
+        # One that failed at its first update, say for a wrong setting, has nothing to lose.
+        if not config.resume and found is None and not (records.exists() and records.stat().st_size):
+            return None
+        if not config.resume:
+            raise ConfigError(f"{config.out} holds a run already; choose another folder or --resume")
+        before = read_json(type(config), path)
+        # More updates, another machine or fewer records do not make it another run.
+        free = {name: getattr(config, name) for name in FREE}
+        # Scores on other segments could not be compared with those so far.
+        free["validation"] = config.validation
+        if before.validation.data is not None:
+            free["validation"] = dataclasses.replace(before.validation, data=config.validation.data)
+        before = dataclasses.replace(before, **free)
+        changed = _changed(before, config)
+        if changed:
+            raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
+    if found is not None and not path.exists():
+        raise ConfigError(
+            f"{config.out} holds checkpoints of a run whose config.json is gone; choose another folder"
+        )
+    return found
+
+
+def _changed(before: Any, after: Any, where: str = "") -> list[str]:
+    """Settings that differ, those within others by their full names, with what they were."""
+    found = []
+    for name in (item.name for item in dataclasses.fields(after)):
+        one, other = getattr(before, name), getattr(after, name)
+        if dataclasses.is_dataclass(one) and type(one) is type(other):
+            found += _changed(one, other, f"{where}{name}.")
+        elif one != other:
+            found.append(f"{where}{name} (was {one})")
+    return found
+
+
+def warm_start(agent: Agent, run: Path) -> None:
+    """Take over the networks that another run has too; personas that they had not change nothing at first.
+
+    Raises:
+        ConfigError: if there is no such run, or it learned another time step.
+        CheckpointError: if its networks have other shapes; names the settings of the agent that differ.
+    """
+    folder, which = split_name(str(run))
+    source = choose(folder, which)
+    there = parts_of(source)
+    shared = {name: module for name, module in agent.modules.items() if name in there}
+    before = read_spec(folder)
+    if agent.spec is not None:
+        dataclasses.replace(agent, name=str(run), spec=before).check_step(agent.spec.dt)
+    widen = agent.spec is not None and _only_personas(before, agent.spec)
+    try:
+        load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=widen)
+    except CheckpointError as error:
+        changed = [] if agent.spec is None else _changed(before.agent, agent.spec.agent, "agent.")
+        if changed:
+            error.message += f"; its agent has another {', '.join(changed)}"
+        raise
+
+
+def _only_personas(before: AgentSpec, after: AgentSpec) -> bool:
+    """Whether personas are all that is new to the networks, and come after all that they knew.
+
+    Any other input would stand before inputs that are learned already, whose weights it would get.
+    """
+    told = dataclasses.replace(before.agent, persona=True, interactive=after.agent.interactive)
+    alike = told == after.agent and before.goals == after.goals and before.action_space == after.action_space
+    return alike and not before.agent.persona and after.agent.features != "road"

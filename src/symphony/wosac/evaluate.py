@@ -22,7 +22,6 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import BASELINES
 from symphony.evaluation.paired import clustered_mean
 from symphony.metrics import OrderStatistics
-from symphony.rollouts.driving import search_kind
 from symphony.rollouts.workers import shared
 from symphony.wosac.passing import PassingGaps, order_of, passing_gaps, passing_pairs
 from symphony.wosac.records import DT
@@ -148,19 +147,19 @@ def flat_numbers(numbers: dict[str, tuple[float, float]]) -> dict[str, float | N
 def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
     """What decides the rollouts, with what was left to the agent filled in."""
     config = settings.config(ROLLOUTS, settings.seed)
-    kind, pruning = search_kind(agent, config), config.pruning(agent.search)
+    kind, _, branches, _, pruning = agent.plan(config)
     found: dict[str, Any] = {"search": kind, "seed": settings.seed}
     found |= {"horizon": settings.horizon} if settings.future != FUTURE else {}
     if agent.goals is not None:
         found["logged_goals"] = settings.logged_goals
     if settings.action_temperature != 1.0:
         found["action_temperature"] = settings.action_temperature
-    if kind != "none" and settings.score != "discriminator":
-        found["score"] = settings.score
+    if kind != "none" and pruning.score != "discriminator":
+        found["score"] = pruning.score
     if kind == "backtrack":
         found |= {"prune_every": pruning.prune_every, "threshold": pruning.threshold}
     if kind in ("tree", "best"):
-        found["branches"] = pruning.test_branches
+        found["branches"] = branches
     if kind == "tree":
         found |= {"rule": pruning.rule, "prune_every": pruning.prune_every, "goals": pruning.goals}
         found |= {"temperature": pruning.temperature} if pruning.rule == "systematic" else {}

@@ -25,7 +25,7 @@ from symphony.envs.routes import route_table
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
-from symphony.rollouts.driving import planned_trees, search_kind, simulation
+from symphony.rollouts.driving import simulation
 from symphony.rollouts.finite import NotFiniteError
 from symphony.wosac.records import CURRENT, DT
 from symphony.wosac.rollouts import RolloutArrays
@@ -221,13 +221,12 @@ def _driven(
         taken = [route_table(log, graph, int(row)).logged for row in vehicles]
         scenes.route_logged = torch.tensor([taken])
     scenes = scenes.to(torch.device(settings.device))
-    one = settings.config(1, 0)
-    if search_kind(agent, one) == "none":
+    one = agent.plan(settings.config(1, 0))
+    if one.kind == "none":
         plans = [settings.config(ROLLOUTS, settings.seed)]
     else:
         # All branches of all trees together would take gigabytes.
-        _, branches, _ = planned_trees(agent, one)
-        trees = max(AT_ONCE // (branches * len(vehicles)), 1)
+        trees = max(AT_ONCE // (one.branches * len(vehicles)), 1)
         plans = [
             settings.config(min(trees, ROLLOUTS - first), settings.seed * ROLLOUTS + first)
             for first in range(0, ROLLOUTS, trees)

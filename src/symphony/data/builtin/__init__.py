@@ -1,4 +1,4 @@
-"""The run segments that come with the package (made with SUMO by ``scripts/make_builtin.py``)."""
+"""The run segments that come with the package (made with SUMO by ``benchmarks/make_builtin.py``)."""
 
 from __future__ import annotations
 

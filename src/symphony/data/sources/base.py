@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +14,16 @@ from numpy.typing import NDArray
 from symphony.data.bounds import MAX_FILE
 from symphony.data.odd import mended
 from symphony.data.resample import EVEN
-from symphony.data.segment import Floats, RunSegment, validate
+from symphony.data.segment import AgentType, Bools, Floats, RunSegment, validate
 from symphony.errors import DataError
 
+T = TypeVar("T")
 Item = RunSegment | DataError
 """One record of a file: a valid run segment, or why there is none."""
+NEAR = 50.0
+"""Metres within which another agent counts as a neighbour of an ego candidate."""
+MOVING = 2.0
+"""Metres an agent must get away from where it is first seen to count as moving."""
 
 
 class UnexpectedError(DataError):
@@ -42,9 +46,8 @@ class Reader(ABC):
     def read(self, path: str | Path) -> Iterator[Item]:
         """Yield one item per record of a file, in file order; no file makes it raise.
 
-        A record that can't be used is yielded as an error naming file, segment (where known) and field, so
-        that the caller can count it and go on. Where the rest of the file can't be read, such an error comes
-        last. That holds for whatever a reader or a library raises on content it did not expect.
+        A record that can't be used is yielded as an error naming file, segment (where known) and field. Where the
+        rest of the file can't be read, such an error comes last.
         """
         path = Path(path)
         try:
@@ -65,10 +68,6 @@ class Reader(ABC):
         """Further files that a file of this format is read together with, such as its map; none by default."""
         return ()
 
-    def optional(self, path: Path) -> tuple[Path, ...]:
-        """Those of the :meth:`companions` without which a file can be read, since many have none; none by default."""
-        return ()
-
     @staticmethod
     def _checked(item: Item, path: Path) -> Item:
         if isinstance(item, DataError):
@@ -78,9 +77,10 @@ class Reader(ABC):
             try:
                 return validate(item)
             except DataError as error:
-                return _mended(item) or DataError(
-                    error.message, file=path, segment=error.segment, field=error.field
-                )
+                # What is left of it once single agents, states and lines are left out, if that is a segment.
+                with contextlib.suppress(DataError, IndexError, ValueError, TypeError):
+                    return validate(mended(item))
+                return DataError(error.message, file=path, segment=error.segment, field=error.field)
         except Exception as error:  # arrays of other kinds than a segment has
             return unexpected(error, file=path, segment=item.segment_id)
 
@@ -89,11 +89,14 @@ class Reader(ABC):
         """Yield the records, not validated yet; may raise :class:`DataError` where it can't read on."""
 
 
-def _mended(segment: RunSegment) -> RunSegment | None:
-    """What is left of a segment that breaks the schema, if that is one (see :func:`symphony.data.odd.mended`)."""
-    with contextlib.suppress(DataError, IndexError, ValueError, TypeError):
-        return validate(mended(segment))
-    return None
+def readable(kind: str, odd: dict[str, str], read: Callable[..., T | None], *arguments: Any) -> Iterator[T]:
+    """What ``read`` gives, if anything; where it raises a :class:`DataError`, the first of the kind is noted."""
+    try:
+        found = read(*arguments)
+        if found is not None:
+            yield found
+    except DataError as error:
+        odd.setdefault(kind, f"{error.field}: {error.message}")
 
 
 def unexpected(error: Exception, *, file: object = None, segment: str | None = None) -> UnexpectedError:
@@ -103,20 +106,13 @@ def unexpected(error: Exception, *, file: object = None, segment: str | None = N
 
 
 def read_whole(path: Path) -> bytes:
-    """The content of a file of at most :data:`MAX_FILE` bytes.
-
-    Raises:
-        DataError: there are more.
-        OSError: it can't be read.
-    """
-    with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > MAX_FILE:
-            message = f"{size} bytes, at most {MAX_FILE}: too large for a file of this format"
-            raise DataError(message, file=path)
-        data = file.read(size + 1)
-    if len(data) > size:
-        raise DataError("grew while it was read", file=path)
+    """The content of a file; a :class:`DataError` if it is empty or has more than :data:`MAX_FILE` bytes."""
+    size = path.stat().st_size
+    if size > MAX_FILE:
+        raise DataError(f"{size} bytes, at most {MAX_FILE}: too large for a file of this format", file=path)
+    data = path.read_bytes()
+    if not data.strip():
+        raise DataError("the file is empty", file=path)
     return data
 
 
@@ -127,11 +123,7 @@ def to_float32(array: NDArray[np.float64]) -> Floats:
 
 
 def codes(values: NDArray[np.int64], count: int, field: str) -> NDArray[np.uint8]:
-    """Enumeration values as uint8.
-
-    Raises:
-        DataError: a value is outside 0 … count - 1.
-    """
+    """Enumeration values as uint8; a :class:`DataError` where one is outside 0 … count - 1."""
     bad = np.unique(values[(values < 0) | (values >= count)])
     if len(bad):
         raise DataError(f"unknown value {bad[0]}, expected 0 … {count - 1}", field=field)
@@ -147,10 +139,8 @@ def time_step(times: NDArray[np.float64], field: str) -> float:
     """Seconds between steps that begin at ``times`` [T], T at least 2; to the millisecond where that fits the log.
 
     At 15 or 30 Hz it does not: with rounded steps a log would run up to a percent too fast or slow. Where steps are
-    off by more than a tenth it is the usual one, to which :func:`symphony.data.resample.evened` brings the log.
-
-    Raises:
-        DataError: more than a third of the steps are no such ones, or half of them are missing; names ``field``.
+    off by more than a tenth it is the usual one, to which :func:`symphony.data.resample.evened` brings the log. A
+    :class:`DataError` where more than a third of the steps are no such ones, or half of them are missing.
     """
     gaps = np.diff(times)
     mean = float(gaps.mean())
@@ -165,3 +155,27 @@ def time_step(times: NDArray[np.float64], field: str) -> float:
         raise DataError(f"steps of {gaps.min():g} to {gaps.max():g} s are uneven", field=field)
     mean = float((times[-1] - times[0]) / steps.sum())
     return round(mean, 3) if abs(round(mean, 3) - mean) <= 1e-2 * mean else mean
+
+
+def busiest_first(
+    agent_id: NDArray[np.int64],
+    agent_type: NDArray[np.uint8],
+    position: NDArray[np.float64],
+    valid: Bools,
+    dynamic: Bools | None = None,
+) -> NDArray[np.int64]:
+    """Rows of the vehicles that move and are valid at every step, most moving neighbours first, then lowest id.
+
+    Takes fields of a segment, positions [A, T, 2] in metres; ``dynamic`` [A] are those that may be egos.
+    """
+    # Not the length of the path: the jitter of a parked car's track would add up.
+    start = position[np.arange(len(position)), valid.argmax(1), None]
+    away = np.hypot(*np.moveaxis(position - start, -1, 0))
+    moving = np.where(valid, away, 0).max(axis=1, initial=0) > MOVING
+    able = (agent_type == AgentType.VEHICLE) & moving & valid.all(axis=1)
+    rows = np.flatnonzero(able if dynamic is None else able & dynamic)
+    scores = []
+    for row in rows:
+        distance = np.hypot(*np.moveaxis(position[moving] - position[row], -1, 0))
+        scores.append(int(((distance < NEAR) & valid[moving]).sum()))
+    return rows[np.lexsort((agent_id[rows], -np.array(scores, np.int64)))]

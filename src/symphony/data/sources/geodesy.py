@@ -25,15 +25,8 @@ def utm(places: Doubles, origin: Doubles) -> Doubles:
     fourth order in the third flattening (Karney, 2011, arXiv:1002.1417, eq. 35): well below a millimetre inside a
     zone.
 
-    Args:
-        places: [N, 2] latitude and longitude in degrees.
-        origin: [2] likewise.
-
-    Returns:
-        [N, 2] metres, x towards the grid's east, y towards its north.
-
-    Raises:
-        DataError: a place outside latitudes -84 to 84 and longitudes -180 to 180.
+    Takes places [N, 2] and an origin [2] of latitude and longitude in degrees, and gives [N, 2] metres, x towards the
+    grid's east, y towards its north. Latitudes beyond 84 degrees are a :class:`DataError`.
     """
     _check(places)
     _check(origin)

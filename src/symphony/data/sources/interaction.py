@@ -26,8 +26,11 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 from __future__ import annotations
 
+import csv
+import io
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -39,25 +42,32 @@ from numpy.typing import NDArray
 from symphony.data.bounds import check_counts
 from symphony.data.resample import MAX_GAP, evened
 from symphony.data.segment import Bools, RoadMap, RunSegment
-from symphony.data.sources.base import Item, Reader, to_float32
-from symphony.data.sources.egos import busiest_first
+from symphony.data.sources.base import Item, Reader, busiest_first, to_float32
 from symphony.data.sources.geodesy import mercator, utm
-from symphony.data.sources.interaction_files import Files, find_files, read_meta
-from symphony.data.sources.interaction_motion import from_positions, headings
-from symphony.data.sources.interaction_signals import NO_LIGHTS, Lights, read_lights
+from symphony.data.sources.interaction_signals import Lights, read_lights, states_at
 from symphony.data.sources.interaction_tracks import (
     NOMINAL,
     Rows,
     check_motion,
+    from_positions,
+    headings,
     joined,
     merged,
     read_rows,
     resolved,
     stepped,
 )
-from symphony.data.sources.lanelet2 import Projection, read_lanelet2
-from symphony.data.sources.lanelet2_road import center, lane_lanelets, middle, road_map, stop_line, successors
-from symphony.data.sources.lines import Doubles
+from symphony.data.sources.lanelet2 import (
+    Projection,
+    lane_lanelets,
+    middle,
+    read_lanelet2,
+    road_map,
+    stop_line,
+    successors,
+)
+from symphony.data.sources.lines import Doubles, lights
+from symphony.data.sources.xml_files import number
 from symphony.errors import ConfigError, DataError
 
 FAR = 200.0
@@ -66,20 +76,6 @@ HISTORY = 9
 """The last step of a case's first second."""
 MAX_STEPS = 360_000
 """Steps of a recording, which is cut into windows: ten hours at 10 Hz."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What the windows of one file share; ``start`` is the time of step 0 in milliseconds."""
-
-    name: str
-    file: str
-    dt: float
-    start: float
-    road: RoadMap
-    lights: Lights
-    origin: Doubles
-    odd: Mapping[str, str]
 
 
 class InteractionReader(Reader):
@@ -112,12 +108,11 @@ class InteractionReader(Reader):
             raise ConfigError(f"egos must be 'one' or 'all', is {egos!r}")
         if motion not in {"logged", "positions"}:
             raise ConfigError(f"motion must be 'logged' or 'positions', is {motion!r}")
-        if not 0 < window <= 600:
-            raise ConfigError(f"window must be above 0 and at most 600 s, is {window}")
-        if stride is not None and not 0 < stride <= 600:
-            raise ConfigError(f"stride must be above 0 and at most 600 s, is {stride}")
         self.egos, self.motion, self.window = egos, motion, window
         self.stride = window if stride is None else stride
+        for name, seconds in (("window", self.window), ("stride", self.stride)):
+            if not 0 < seconds <= 600:
+                raise ConfigError(f"{name} must be above 0 and at most 600 s, is {seconds}")
 
     def companions(self, path: Path) -> tuple[Path, ...]:
         """The map, and whatever else the recording has."""
@@ -127,10 +122,6 @@ class InteractionReader(Reader):
             return ()
         more = (found.map, found.walkers, found.meta, found.phases, found.topology)
         return tuple(file for file in more if file is not None)
-
-    def optional(self, path: Path) -> tuple[Path, ...]:
-        """The file of pedestrians, which many recordings don't have."""
-        return tuple(file for file in self.companions(path) if file.name.startswith("pedestrian_tracks_"))
 
     def _read(self, path: Path) -> Iterator[Item]:
         rows = read_rows(path)
@@ -145,9 +136,10 @@ class InteractionReader(Reader):
         # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
         with np.errstate(over="ignore", invalid="ignore"):
             known = resolved(rows, dt, by_positions=self.motion == "positions")
-            yield from self._segments(known, _scene(files, rows, dt, start), files)
+            yield from self._segments(known, _scene(files, rows, dt, start))
 
-    def _segments(self, rows: Rows, scene: Scene, files: Files) -> Iterator[Item]:
+    def _segments(self, rows: Rows, scene: _Scene) -> Iterator[Item]:
+        files = scene.files
         cases = np.unique(rows.case)
         for case in cases:
             mine = rows.take(slice(*np.searchsorted(rows.case, [case, case + 1])))
@@ -160,7 +152,7 @@ class InteractionReader(Reader):
                 begin = first + start
                 part = mine.take(slice(*np.searchsorted(mine.time, [begin, first + stop])))
                 what = f"t{round(start * scene.dt, 3):g}" if single else f"case{case}"
-                name = f"{scene.name}_{files.part}_{what}"
+                name = f"{files.map.stem}_{files.part}_{what}"
                 try:
                     yield from self._window(part, scene, name, begin, stop - start, 0 if single else HISTORY)
                 except DataError as error:
@@ -177,7 +169,7 @@ class InteractionReader(Reader):
         return found
 
     def _window(
-        self, rows: Rows, scene: Scene, name: str, begin: int, steps: int, current: int
+        self, rows: Rows, scene: _Scene, name: str, begin: int, steps: int, current: int
     ) -> Iterator[RunSegment]:
         if not len(rows):
             raise DataError("nobody is there", field="track_id")
@@ -201,6 +193,7 @@ class InteractionReader(Reader):
         if not len(candidates):
             raise DataError("no moving vehicle is observed at every step", field="track_id")
         times = np.rint(scene.start + 1000 * scene.dt * (begin + there)).astype(np.int64)
+        shown = {k: (place, states_at(since, s, times)) for k, (place, since, s) in scene.lights.items()}
         segment = RunSegment(
             segment_id=name,
             source=self.name,
@@ -214,14 +207,12 @@ class InteractionReader(Reader):
             velocity=to_float32(state[:, there, 2:4]),
             valid=valid[:, there],
             road=scene.road,
-            signal_lane=scene.lights.lane,
-            signal_point=to_float32(np.pad(scene.lights.point - scene.origin, ((0, 0), (0, 1)))),
-            signal_state=scene.lights.at(times),
+            **lights(shown, len(there), scene.origin),
             origin=np.array([*scene.origin, 0.0]),
             current_step=min(int(np.searchsorted(there, current)), len(there) - 1),
-            predict=_marked(rows.marks[:, 0], row),
-            interest=_marked(rows.marks[:, 1], row),
-            file=scene.file,
+            predict=np.unique(row[rows.marks[:, 0]]).astype(np.int32),
+            interest=np.unique(row[rows.marks[:, 1]]).astype(np.int32),
+            file=scene.files.tracks.name,
             group=name.rpartition("_")[0],
             odd=scene.odd,
         )
@@ -242,10 +233,6 @@ def _lost(valid: Bools, dt: float) -> Bools:
     return lost
 
 
-def _marked(mark: Bools, row: NDArray[np.int64]) -> NDArray[np.int32]:
-    return np.unique(row[mark]).astype(np.int32)
-
-
 def _sizes(rows: Rows, row: NDArray[np.int64], kind: NDArray[np.int64]) -> NDArray[np.float32]:
     """[A, 3] the first size given of each agent, else the nominal one; height 0."""
     size = np.zeros((len(kind), 3))
@@ -256,7 +243,20 @@ def _sizes(rows: Rows, row: NDArray[np.int64], kind: NDArray[np.int64]) -> NDArr
     return to_float32(size)
 
 
-def _scene(files: Files, rows: Rows, dt: float, start: float) -> Scene:
+@dataclass(frozen=True)
+class _Scene:
+    """What the windows of one file share; ``start`` is the time of step 0 in milliseconds."""
+
+    files: Files
+    dt: float
+    start: float
+    road: RoadMap
+    lights: Lights
+    origin: Doubles
+    odd: Mapping[str, str]
+
+
+def _scene(files: Files, rows: Rows, dt: float, start: float) -> _Scene:
     projection: Projection = partial(utm, origin=np.zeros(2))
     has_phases = files.phases is not None
     if files.meta is not None:
@@ -269,25 +269,102 @@ def _scene(files: Files, rows: Rows, dt: float, start: float) -> Scene:
         road = road_map(source, origin)
     except DataError as error:
         raise error.at(file=files.map) from error
-    lights = NO_LIGHTS
+    found: Lights = {}
     if has_phases:
         if files.phases is None or files.topology is None:
             raise DataError("its signal phases, or the one *_map.kml that goes with them, are missing")
-        lines = [center(lane) for lane in lanes]
+        entered = {lane: lanes[lane].center for lane in np.unique(links[:, 1]).tolist()}
         until = int(start + 1000 * dt * rows.time.max())
-        lights = read_lights(
-            files.phases, files.topology, lines, np.unique(links[:, 1]).tolist(), projection, until
-        )
+        found = read_lights(files.phases, files.topology, entered, projection, until)
         # A stop line that the map names is better than the end of a KML lane.
-        lines_of = [(after, stop_line(lanes[before], source.rules)) for before, after in links.tolist()]
-        stops = {lane: line for lane, line in lines_of if line is not None}
-        points = [
-            stops.get(lane, place) for lane, place in zip(lights.lane.tolist(), lights.point, strict=True)
-        ]
-        lights = replace(lights, point=np.array(points))
+        for before, after in links.tolist():
+            line = stop_line(lanes[before], source.rules)
+            if after in found and line is not None:
+                found[after] = (line, *found[after][1:])
     reach = np.abs(np.concatenate([lane.ring for lane in lanes]) - origin).max(axis=0)
     away = np.hypot(*np.maximum(np.abs(rows.state[:, :2] - origin) - reach, 0).T)
     if float(np.median(away)) > FAR:
         message = f"the tracks are {np.median(away):.0f} m away from the map: another origin or projection"
         raise DataError(message, field="x, y")
-    return Scene(files.scene, files.tracks.name, dt, start, road, lights, origin, source.odd)
+    return _Scene(files, dt, start, road, found, origin, source.odd)
+
+
+_NUMBERED = re.compile(r"vehicle_tracks_(\w+)\.csv")
+_SPLIT = re.compile(r"(\w.*)_(train|val)\.csv")
+
+
+@dataclass(frozen=True)
+class Files:
+    """A file of tracks and what it is read with."""
+
+    tracks: Path
+    part: str
+    map: Path
+    walkers: Path | None = None
+    meta: Path | None = None
+    phases: Path | None = None
+    topology: Path | None = None
+
+
+def find_files(path: Path) -> Files:
+    """The files a file of tracks is read with; a :class:`DataError` if it is named otherwise, or has no map."""
+    numbered, split = _NUMBERED.fullmatch(path.name), _SPLIT.fullmatch(path.name)
+    if numbered is None:
+        if split is None:
+            raise DataError("expected a name like vehicle_tracks_000.csv or SCENE_train.csv", file=path)
+        # Its name says which map it needs: another place's would fit nowhere, and nobody would be told.
+        return Files(path, split[2], _map(path, split[1], alone=False))
+    folder, number_ = path.parent, numbered[1]
+
+    def beside(name: str) -> Path | None:
+        return folder / name if (folder / name).is_file() else None
+
+    topology = sorted(folder.glob("*_map.kml"))
+    return Files(
+        path,
+        number_,
+        _map(path, folder.resolve().name),
+        beside(f"pedestrian_tracks_{number_}.csv"),
+        beside("meta_data.csv"),
+        beside(f"signal_phases_{number_}.csv"),
+        topology[0] if len(topology) == 1 else None,
+    )
+
+
+def _map(path: Path, scene: str, *, alone: bool = True) -> Path:
+    """The map of a place; if ``alone``, a single map beside the tracks does, whatever its name."""
+    folders = (path.parent, path.parent.parent / "maps", path.parent.parent.parent / "maps")
+    for folder in folders:
+        for suffix in ("osm_xy", "osm"):
+            if (folder / f"{scene}.{suffix}").is_file():
+                return folder / f"{scene}.{suffix}"
+    if not alone:
+        raise DataError(f"the map is missing: no maps/{scene}.osm_xy or .osm", file=path)
+    maps = sorted(path.parent.glob("*.osm")) + sorted(path.parent.glob("*.osm_xy"))
+    if len(maps) != 1:
+        raise DataError(
+            f"the map is missing: no maps/{scene}.osm, and not one map beside the tracks", file=path
+        )
+    return maps[0]
+
+
+def read_meta(path: Path, part: str) -> tuple[Doubles, bool]:
+    """(latitude and longitude of the origin [2], whether there are signal phases) of a recording."""
+    try:
+        data = path.read_bytes()
+        if not data.endswith(b"\n") or len(data) > 1 << 20:
+            raise DataError("empty, cut short, or larger than 1 MiB")
+        table = csv.DictReader(io.StringIO(data.decode("ascii", errors="replace")))
+        found = [row for row in table if row.get("id") == part]
+        if len(found) != 1:
+            raise DataError(f"{len(found)} rows for recording {part}, expected one", field="id")
+        origin = np.array([number(found[0].get(name), name) for name in ("originLat", "originLon")])
+        # Both spellings occur.
+        spat = found[0].get("spatAvailable") or found[0].get("spatAvailible") or "no"
+        if spat not in {"yes", "no"}:
+            raise DataError(f"{spat[:20]!r} is neither yes nor no", field="spatAvailable")
+        return origin, spat == "yes"
+    except csv.Error as error:
+        raise DataError(f"not a CSV file: {error}", file=path) from error
+    except DataError as error:
+        raise error.at(file=path) from error

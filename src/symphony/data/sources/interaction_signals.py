@@ -7,18 +7,18 @@ at the junction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import SignalState
-from symphony.data.sources.commonroad_xml import integer, load_xml, number
 from symphony.data.sources.interaction_tracks import MAX_BYTES
 from symphony.data.sources.lanelet2 import Projection
 from symphony.data.sources.lines import Doubles
+from symphony.data.sources.xml_files import integer, load_xml, number
 from symphony.errors import DataError
 
 START, END = 3.0, 8.0
@@ -42,8 +42,7 @@ _STATES = {
 _COLUMNS = ("signal_group_id", "timestamp_ms", "movement_state")
 
 
-@dataclass(frozen=True)
-class Connection:
+class Connection(NamedTuple):
     """A way through the junction: from a stop point [2] to an exit [2], let go by a signal group."""
 
     start: Doubles
@@ -51,41 +50,20 @@ class Connection:
     group: int
 
 
-@dataclass(frozen=True)
-class Lights:
-    """The lights of a junction.
-
-    Attributes:
-        lane: [Q] int32 lane indices, each once.
-        point: [Q, 2] stop points in metres.
-        times: per light, [N] milliseconds from which a state holds.
-        states: per light, [N] that state.
-    """
-
-    lane: NDArray[np.int32]
-    point: Doubles
-    times: tuple[NDArray[np.int64], ...]
-    states: tuple[NDArray[np.uint8], ...]
-
-    def at(self, times: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """[Q, T] states at times in milliseconds: the latest known, UNKNOWN before the first."""
-        found = np.full((len(self.lane), len(times)), SignalState.UNKNOWN, np.uint8)
-        for row, (since, states) in enumerate(zip(self.times, self.states, strict=True)):
-            last = np.searchsorted(since, times, side="right") - 1
-            found[row, last >= 0] = states[last[last >= 0]]
-        return found
+Lights = dict[int, tuple[Doubles, NDArray[np.int64], NDArray[np.uint8]]]
+"""Lane -> (its stop point [2] in metres, milliseconds [N] from which a state holds, that state [N])."""
 
 
-NO_LIGHTS = Lights(np.zeros(0, np.int32), np.zeros((0, 2)), (), ())
+def states_at(
+    since: NDArray[np.int64], states: NDArray[np.uint8], times: NDArray[np.int64]
+) -> NDArray[np.uint8]:
+    """[T] states of a light at times in milliseconds: the latest known, UNKNOWN before the first."""
+    last = np.searchsorted(since, times, side="right") - 1
+    return np.where(last >= 0, states[last], SignalState.UNKNOWN).astype(np.uint8)
 
 
 def read_lights(
-    phases: Path,
-    topology: Path,
-    lanes: Sequence[Doubles],
-    entered: Sequence[int],
-    projection: Projection,
-    until: int,
+    phases: Path, topology: Path, lanes: Mapping[int, Doubles], projection: Projection, until: int
 ) -> Lights:
     """Read both files and find the lane of each connection.
 
@@ -96,8 +74,7 @@ def read_lights(
     Args:
         phases: the CSV file.
         topology: the KML file.
-        lanes: centre lines [P, 2] in metres.
-        entered: indices of the lanes that have a predecessor.
+        lanes: centre lines [P, 2] in metres of the lanes that are entered from another.
         projection: of the map.
         until: milliseconds at which the tracks end.
 
@@ -105,28 +82,20 @@ def read_lights(
         DataError: a file can't be read, the phases end more than :data:`LATE` before the tracks, or no light belongs
             to any lane.
     """
-    try:
-        groups = read_phases(phases)
-        end = min(int(times[-1]) for times, _ in groups.values())
-        if end < until - LATE:
-            raise DataError(f"end at {end} ms, the tracks at {until} ms", field="timestamp_ms")
-    except DataError as error:
-        raise error.at(file=phases) from error
+    groups = read_phases(phases)
+    end = min(int(times[-1]) for times, _ in groups.values())
+    if end < until - LATE:
+        raise DataError(f"end at {end} ms, the tracks at {until} ms", file=phases, field="timestamp_ms")
     connections = read_connections(topology, projection)
-    found: dict[int, Connection] = {}
-    for lane in entered:
-        near = [(_miss(c, lanes[lane]), k) for k, c in enumerate(connections) if c.group in groups]
+    found: Lights = {}
+    for lane, line in lanes.items():
+        near = [(_miss(c, line), k) for k, c in enumerate(connections) if c.group in groups]
         miss, best = min(near, default=(np.inf, 0))
         if np.isfinite(miss):
-            found[lane] = connections[best]
+            found[lane] = (connections[best].start, *groups[connections[best].group])
     if not found:
         raise DataError("no connection with a signal group fits a lane of the map", file=topology)
-    return Lights(
-        lane=np.array(list(found), np.int32),
-        point=np.array([c.start for c in found.values()]),
-        times=tuple(groups[c.group][0] for c in found.values()),
-        states=tuple(groups[c.group][1] for c in found.values()),
-    )
+    return found
 
 
 def _miss(connection: Connection, line: Doubles) -> float:
@@ -135,11 +104,7 @@ def _miss(connection: Connection, line: Doubles) -> float:
 
 
 def read_phases(path: Path) -> dict[int, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Signal group -> (times [N] in milliseconds, rising; states [N] from then on).
-
-    Raises:
-        DataError: the file can't be read; names the line.
-    """
+    """Signal group -> (times [N] in milliseconds, rising; states [N] from then on)."""
     if path.stat().st_size > MAX_BYTES:
         raise DataError(f"more than {MAX_BYTES} bytes", file=path)
     data = path.read_bytes()
@@ -165,11 +130,7 @@ def read_phases(path: Path) -> dict[int, tuple[NDArray[np.int64], NDArray[np.uin
 
 
 def read_connections(path: Path, projection: Projection) -> list[Connection]:
-    """The connections that a signal group controls.
-
-    Raises:
-        DataError: the file is no KML of lanes.
-    """
+    """The connections that a signal group controls."""
     try:
         root = load_xml(path, "KML")
         starts: dict[int, Doubles] = {}
@@ -184,8 +145,9 @@ def read_connections(path: Path, projection: Projection) -> list[Connection]:
                 raise DataError(f"{str(data['Source'])[:40]!r} is not one lane", field="Source")
             source = sources[0]
             starts[source] = _start(line.text, f"lane {source}", projection)
+            field = f"lane {source}"
             sinks, groups = (
-                _integers(data.get(name), f"lane {source}: {name}") for name in ("Sink", "SignalGroup")
+                _integers(data.get(name), f"{field}: {name}") for name in ("Sink", "SignalGroup")
             )
             if len(sinks) != len(groups):
                 raise DataError(f"{len(groups)} for {len(sinks)} sinks", field=f"lane {source}: SignalGroup")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,18 +11,16 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.resample import EVEN, wrap
+from symphony.data.resample import EVEN, local_line, wrap
 from symphony.data.segment import AgentType, Bools
 from symphony.data.sources.lines import Doubles
 from symphony.errors import DataError
 
 MAX_BYTES = 1 << 29
-"""Of one file; the largest published ones have a fourth of it."""
+"""Bytes of one file; the largest published ones have a fourth of it."""
 CHUNK = 50_000
 """Lines that are parsed at a time."""
 
-_NUMBERS = ("x", "y", "vx", "vy", "psi_rad", "length", "width")
-_NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
 _TYPES = {
     **dict.fromkeys(("car", "truck", "bus", "van", "motorcycle"), AgentType.VEHICLE),
     **dict.fromkeys(("bike", "bicycle", "cyclist"), AgentType.CYCLIST),
@@ -35,8 +33,15 @@ CYCLING = 2.5
 """m/s: of the type ``pedestrian/bicycle``, tracks whose fastest tenth is faster are cyclists."""
 MAX_GAP_MS = 1000
 """Longest time step that is taken for one."""
+SIGMA = 0.2
+"""Seconds: of the Gaussian weights of the line whose slope is the velocity."""
+WALKING = 1.0
+"""m/s above which the direction of motion is a heading."""
+OFF = np.deg2rad(45)
+"""Angle to the motion from which on a logged heading does not count."""
 _MOVING = 3.0
 _ENOUGH = 20
+_HINT = " (motion='positions' takes both from the positions)"
 
 
 @dataclass(frozen=True)
@@ -64,14 +69,7 @@ class Rows:
 
     def take(self, where: NDArray[np.integer] | slice) -> Rows:
         """Some of the rows."""
-        return Rows(
-            self.case[where],
-            self.time[where],
-            self.track[where],
-            self.kind[where],
-            self.state[where],
-            self.marks[where],
-        )
+        return Rows(*(array[where] for array in vars(self).values()))
 
 
 def read_rows(path: Path) -> Rows:
@@ -86,35 +84,25 @@ def read_rows(path: Path) -> Rows:
         raise DataError(f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
     try:
         with path.open("rb") as file:
-            return _parsed(file)
+            head = file.readline()
+            if not head.strip():
+                raise DataError("the file is empty")
+            names = [name.strip() for name in _text(head, 1).split(",")]
+            for name in ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy"):
+                if names.count(name) != 1:
+                    raise DataError(f"{names.count(name)} columns of that name, expected one", field=name)
+            parts = [_rows(names, lines, first) for first, lines in _chunks(file)]
+            if not parts:
+                raise DataError("the file has no rows")
+            return joined(*parts)
     except DataError as error:
         raise error.at(file=path) from error
 
 
-def _parsed(file: BinaryIO) -> Rows:
-    head = file.readline()
-    if not head.strip():
-        raise DataError("the file is empty")
-    names = [name.strip() for name in _text(head, 1).split(",")]
-    for name in _NEEDED:
-        if names.count(name) != 1:
-            raise DataError(f"{names.count(name)} columns of that name, expected one", field=name)
-    parts = [_rows(names, lines, first) for first, lines in _chunks(file)]
-    if not parts:
-        raise DataError("the file has no rows")
-    joined = [np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts), strict=True)]
-    return ordered(Rows(*joined))
-
-
-def ordered(rows: Rows) -> Rows:
-    """By case, time and track."""
+def joined(*parts: Rows) -> Rows:
+    """The rows of all, by case, time and track."""
+    rows = Rows(*(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True)))
     return rows.take(np.lexsort((rows.track, rows.time, rows.case)))
-
-
-def joined(one: Rows, two: Rows) -> Rows:
-    """The rows of both."""
-    arrays = zip(vars(one).values(), vars(two).values(), strict=True)
-    return ordered(Rows(*(np.concatenate(pair) for pair in arrays)))
 
 
 def _chunks(file: BinaryIO) -> Iterator[tuple[int, list[list[str]]]]:
@@ -140,74 +128,59 @@ def _rows(names: list[str], lines: list[list[str]], first: int) -> Rows:
         if len(line) != len(names):
             raise DataError(f"{len(line)} fields, expected {len(names)}", field=f"line {first + k}")
     columns = dict(zip(names, zip(*lines, strict=True), strict=True))
-    count = len(lines)
-    missing = ("nan",) * count
-    state = [_numbers(columns.get(name, missing), name, first) for name in _NUMBERS]
-    flags = [
-        _flags(columns.get(name), count, name, first) for name in ("track_to_predict", "interesting_agent")
+
+    def column(name: str, value: Callable[[str], Any], what: str, default: str = "") -> NDArray[Any]:
+        texts = columns.get(name, (default,) * len(lines))
+        found = []
+        for k, text in enumerate(texts):
+            try:
+                found.append(value(text))
+            except (KeyError, ValueError):
+                message = f"{what.format(repr(text[:40]))}"
+                raise DataError(message, field=f"line {first + k}: {name}") from None
+        return np.array(found)
+
+    needed = [column(name, _metres, "{} is not a number of metres") for name in ("x", "y", "vx", "vy")]
+    given = [
+        column(n, _metres_or_none, "{} is not a number of metres") for n in ("psi_rad", "length", "width")
     ]
-    case = columns.get("case_id")
+    marks = [
+        column(n, _whole, "{} is not a whole number", "0") for n in ("track_to_predict", "interesting_agent")
+    ]
     return Rows(
-        case=np.zeros(count, np.int64) if case is None else _whole(case, "case_id", first),
-        time=_times(columns["timestamp_ms"], "timestamp_ms", first),
-        track=_mapped(columns["track_id"], _track_id, "track_id", first),
-        kind=_mapped(columns["agent_type"], lambda t: _TYPES[t.strip().lower()], "agent_type", first),
-        state=np.stack(state, axis=-1),
-        marks=np.stack(flags, axis=-1),
+        case=column("case_id", _whole, "{} is not a whole number", "0"),
+        time=column("timestamp_ms", _time, "{} is not a time"),
+        track=column("track_id", _track_id, "unknown value {}"),
+        kind=column("agent_type", lambda text: int(_TYPES[text.strip().lower()]), "unknown value {}"),
+        state=np.stack([*needed, *given], axis=-1),
+        marks=np.stack(marks, axis=-1) != 0,
     )
 
 
-def _numbers(texts: tuple[str, ...], name: str, first: int) -> Doubles:
-    """NaN where a field is empty; only the optional ones may be."""
-    try:
-        values = np.array([text if text.strip() else "nan" for text in texts]).astype(np.float64)
-    except ValueError:
-        values = np.array([_number(text, name, first + k) for k, text in enumerate(texts)])
-    wrong = ~(np.abs(values) <= 1e8)
-    if name not in _NEEDED:
-        wrong &= ~np.isnan(values)
-    if wrong.any():
-        k = int(np.argmax(wrong))
-        raise DataError(f"{texts[k][:40]!r} is not a number of metres", field=f"line {first + k}: {name}")
-    return values
+def _metres(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= 1e8:
+        raise ValueError(text)
+    return value
 
 
-def _number(text: str, name: str, line: int) -> float:
-    try:
-        return float(text) if text.strip() else np.nan
-    except ValueError:
-        raise DataError(f"{text[:40]!r} is not a number", field=f"line {line}: {name}") from None
+def _metres_or_none(text: str) -> float:
+    """NaN where a field is empty."""
+    return _metres(text) if text.strip().lower() not in {"", "nan"} else np.nan
 
 
-def _times(texts: tuple[str, ...], name: str, first: int, what: str = "a time") -> Doubles:
-    values = np.array([_number(text, name, first + k) for k, text in enumerate(texts)])
-    wrong = ~(np.abs(values) < 2**53)
-    if what != "a time":
-        wrong |= values != np.round(values)
-    if wrong.any():
-        k = int(np.argmax(wrong))
-        raise DataError(f"{texts[k][:40]!r} is not {what}", field=f"line {first + k}: {name}")
-    return values
+def _time(text: str) -> float:
+    value = float(text)
+    if not abs(value) < 2**53:
+        raise ValueError(text)
+    return value
 
 
-def _whole(texts: tuple[str, ...], name: str, first: int) -> NDArray[np.int64]:
-    return _times(texts, name, first, "a whole number").astype(np.int64)
-
-
-def _flags(texts: tuple[str, ...] | None, count: int, name: str, first: int) -> Bools:
-    return np.zeros(count, np.bool_) if texts is None else _whole(texts, name, first) != 0
-
-
-def _mapped(texts: tuple[str, ...], value: object, name: str, first: int) -> NDArray[np.int64]:
-    """Each distinct text is looked at once."""
-    known: dict[str, int] = {}
-    for k, text in enumerate(texts):
-        if text not in known:
-            try:
-                known[text] = value(text)  # type: ignore[operator]
-            except (KeyError, ValueError):
-                raise DataError(f"unknown value {text[:40]!r}", field=f"line {first + k}: {name}") from None
-    return np.array([known[text] for text in texts], np.int64)
+def _whole(text: str) -> int:
+    value = _time(text)
+    if value != round(value):
+        raise ValueError(text)
+    return int(value)
 
 
 def _track_id(text: str) -> int:
@@ -245,13 +218,13 @@ def stepped(rows: Rows) -> tuple[Rows, float, float]:
     return replace(rows, time=number[which]), step / 1000, float(times[0])
 
 
-def check_motion(rows: Rows, dt: float, start: float = 0.0) -> None:
+def check_motion(rows: Rows, dt: float, start: float) -> None:
     """See that velocities and headings of vehicles that move are those of their positions.
 
     Compared over a second: medians over all vehicles, so that single wild tracks do not count.
 
     Args:
-        rows: of :func:`stepped`.
+        rows: those of :func:`stepped`.
         dt: seconds per step.
         start: milliseconds at step 0.
 
@@ -285,9 +258,6 @@ def check_motion(rows: Rows, dt: float, start: float = 0.0) -> None:
             raise DataError(f"points {np.degrees(error):.0f} degrees off the motion{_HINT}", field=name)
 
 
-_HINT = " (motion='positions' takes both from the positions)"
-
-
 def _twice(rows: Rows) -> NDArray[np.int64]:
     keys = np.stack([rows.case, rows.time, rows.track])
     return np.flatnonzero((keys[:, 1:] == keys[:, :-1]).all(axis=0)) + 1
@@ -307,6 +277,25 @@ def merged(rows: Rows) -> Rows:
     return replace(found, state=np.concatenate([mean, found.state[:, 4:]], axis=1))
 
 
+def resolved(rows: Rows, dt: float, *, by_positions: bool) -> Rows:
+    """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists.
+
+    Args:
+        rows: those of :func:`stepped`.
+        dt: seconds per step.
+        by_positions: take speeds from the positions, not from the velocities.
+    """
+    kind = rows.kind.copy()
+    unknown = np.flatnonzero(kind == AgentType.UNSET)
+    speed = _speeds(rows, dt) if by_positions else np.hypot(rows.state[:, 2], rows.state[:, 3])
+    keys = np.stack([rows.case[unknown], rows.track[unknown]])
+    for case, track in np.unique(keys, axis=1).T:
+        mine = unknown[(keys[0] == case) & (keys[1] == track)]
+        fast = np.percentile(speed[mine], 90) > CYCLING
+        kind[mine] = AgentType.CYCLIST if fast else AgentType.PEDESTRIAN
+    return replace(rows, kind=kind)
+
+
 def _speeds(rows: Rows, dt: float) -> Doubles:
     """[N] m/s to the next state of the same track, at its last from the one before; 0 for a single one."""
     order = np.lexsort((rows.time, rows.track, rows.case))
@@ -320,20 +309,41 @@ def _speeds(rows: Rows, dt: float) -> Doubles:
     return found
 
 
-def resolved(rows: Rows, dt: float, *, by_positions: bool = False) -> Rows:
-    """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists.
+def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
+    """States [A, T, 5] (x, y, velocity, heading) with velocities that are slopes of the positions.
 
-    Args:
-        rows: of :func:`stepped`.
-        dt: seconds per step.
-        by_positions: take speeds from the positions, not from the velocities.
+    Headings that are far off the motion become NaN, which :func:`headings` fills. They are compared with the motion
+    at the nearest step at which the agent moves: trackers give 0 to what stands before it moves. An agent that never
+    moves keeps what was logged; that one drives backwards can't be told.
     """
-    kind = rows.kind.copy()
-    unknown = np.flatnonzero(kind == AgentType.UNSET)
-    speed = _speeds(rows, dt) if by_positions else np.hypot(rows.state[:, 2], rows.state[:, 3])
-    keys = np.stack([rows.case[unknown], rows.track[unknown]])
-    for case, track in np.unique(keys, axis=1).T:
-        mine = unknown[(keys[0] == case) & (keys[1] == track)]
-        fast = np.percentile(speed[mine], 90) > CYCLING
-        kind[mine] = AgentType.CYCLIST if fast else AgentType.PEDESTRIAN
-    return replace(rows, kind=kind)
+    # The line reaches over 4 sigma: at least to the next step.
+    _, slope, _ = local_line(state[..., :2], valid, dt, max(SIGMA, dt / 4))
+    found = state.copy()
+    found[..., 2:4] = slope
+    course = _nearest_course(found, valid)
+    found[np.abs(wrap(found[..., 4] - course)) > OFF, 4] = np.nan
+    return found
+
+
+def headings(state: Doubles, valid: Bools) -> Doubles:
+    """States [A, T, 5] with the direction of motion for headings that are NaN, or that of the nearest step with one.
+
+    One that never moves and has no heading gets 0. Masked states become 0.
+    """
+    found = np.where(valid[..., None], state, 0.0)
+    unknown = np.isnan(found[..., 4])
+    found[unknown, 4] = np.nan_to_num(_nearest_course(found, valid)[unknown])
+    return found
+
+
+def _nearest_course(state: Doubles, valid: Bools) -> Doubles:
+    """[A, T] direction of motion at the step nearest to each at which the agent moves; NaN if it never does."""
+    velocity = state[..., 2:4]
+    moves = valid & (np.hypot(velocity[..., 0], velocity[..., 1]) > WALKING)
+    steps = np.arange(valid.shape[1])
+    course = np.full(valid.shape, np.nan)
+    for agent in np.flatnonzero(moves.any(axis=1)):
+        known = np.flatnonzero(moves[agent])
+        nearest = known[np.abs(steps[:, None] - known).argmin(axis=1)]
+        course[agent] = np.arctan2(velocity[agent, nearest, 1], velocity[agent, nearest, 0])
+    return course

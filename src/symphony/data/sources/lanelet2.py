@@ -1,28 +1,49 @@
 """Lanelet2 maps: OpenStreetMap XML whose relations are lanelets and regulatory elements.
 
-What is read, and what is not:
+What is read, and what becomes of it:
 
 - Every relation of type ``lanelet`` with one way on its left and one on its right, every relation of type
-  ``regulatory_element`` with its lines, and areas (``multipolygon``) that vehicles may use. Other areas are not read.
-  Elements that an editor marked as deleted do not count.
+  ``regulatory_element`` with its lines, and areas (``multipolygon``) that vehicles may use. Elements that an editor
+  marked as deleted do not count.
 - Ways may be drawn in either direction: here both bounds of a lanelet run in its direction of travel, the left one
-  on its left.
+  on its left. One that is open in both directions counts in the one it is drawn in.
 - A node lies where its file says in metres (attributes ``x``, ``y`` as in INTERACTION's ``.osm_xy`` files, else tags
   ``local_x``, ``local_y``), if that holds for every node; else its latitude and longitude are projected.
+- Lanes are the lanelets for vehicles or bicycles; footways, stairs and rails are left out, crosswalks are marks. A
+  centre line is halfway between points at equal shares of the bounds' lengths.
+- A lane's successors begin with the two nodes its bounds end with. Its neighbour shares the whole bound between them,
+  in the same direction, unless the bound may not be crossed there (a solid line, a kerb, the tag ``lane_change``).
+- The boundary encloses the union of these lanelets and of the areas for vehicles (parking lots, exits, free space),
+  and is open where no lane goes on (see :func:`.lines.cut_ends`).
+- A stop sign that the map has is a mark; so are painted lines.
+- What can't be read is left out, and noted.
 """
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
+import shapely
 
-from symphony.data.sources.commonroad_xml import integer, load_xml, number
-from symphony.data.sources.lines import Doubles
+from symphony.data.segment import LaneType, MarkType, RoadMap
+from symphony.data.sources import lines
+from symphony.data.sources.base import pairs, readable
+from symphony.data.sources.lines import (
+    Doubles,
+    Lane,
+    Links,
+    cut_ends,
+    drivable_rings,
+    matched,
+    median_width,
+    opened,
+)
+from symphony.data.sources.xml_files import integer, load_xml, number
 from symphony.errors import DataError
 
 MAX_NODES = 2_000_000
@@ -37,10 +58,21 @@ NO_NODE = "a node left out that the map lacks"
 NO_LANELET = "a lanelet left out that can't be read"
 NO_AREA = "an area left out that can't be read"
 
-T = TypeVar("T")
-
 Projection = Callable[[Doubles], Doubles]
 """[N, 2] latitude and longitude in degrees to metres."""
+Tags = dict[str, str]
+
+MPH, KMH = 0.44704, 1 / 3.6
+_NO_LANES = frozenset({"walkway", "shared_walkway", "crosswalk", "stairs", "rail"})
+_TYPES = {
+    "bicycle_lane": LaneType.BIKE_LANE,
+    "bikelane": LaneType.BIKE_LANE,
+    "highway": LaneType.FREEWAY,
+}
+_EDGES = frozenset({"road_border", "curbstone", "fence", "wall", "guard_rail", "jersey_barrier"})
+_PAINT = frozenset({"line_thin", "line_thick", "stop_line"})
+_STOP_SIGNS = re.compile(r"(de206|r1-1(?!\d)|\bstop\b)", re.IGNORECASE)
+_SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|m/s|mps)?\s*$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -50,7 +82,7 @@ class Way:
     way_id: int
     nodes: tuple[int, ...]
     line: Doubles
-    tags: dict[str, str]
+    tags: Tags
 
     def turned(self) -> Way:
         """The same in the other direction."""
@@ -63,7 +95,8 @@ class Lanelet:
 
     Attributes:
         lanelet_id: of the relation.
-        left, right: bounds.
+        left: left bound.
+        right: right bound.
         turned: whether left and right run against their way's own direction.
         tags: of the relation.
         rules: ids of its regulatory elements.
@@ -73,7 +106,7 @@ class Lanelet:
     left: Way
     right: Way
     turned: tuple[bool, bool]
-    tags: dict[str, str]
+    tags: Tags
     rules: tuple[int, ...]
 
     @property
@@ -86,39 +119,25 @@ class Lanelet:
         """[P, 2] closed outline."""
         return np.concatenate([self.left.line, self.right.line[::-1], self.left.line[:1]])
 
+    @property
+    def bounds(self) -> tuple[Doubles, Doubles]:
+        """Both bounds with as many points."""
+        return matched(self.left.line, self.right.line, f"lanelet {self.lanelet_id}")
+
+    @property
+    def center(self) -> Doubles:
+        """[P, 2] the middle line."""
+        left, right = self.bounds
+        return (left + right) / 2
+
 
 @dataclass(frozen=True)
 class Rule:
-    """A regulatory element.
-
-    Attributes:
-        rule_id: of the relation.
-        tags: its ``subtype`` says what it is: traffic_light, traffic_sign, speed_limit, right_of_way …
-        lines: role (``refers``, ``ref_line`` …) -> its ways.
-        lanelets: role (``yield``, ``right_of_way`` …) -> ids of lanelets.
-    """
+    """A regulatory element: tags, of which ``subtype`` says what it is, and the stop lines it names."""
 
     rule_id: int
-    tags: dict[str, str]
-    lines: dict[str, tuple[Way, ...]]
-    lanelets: dict[str, tuple[int, ...]]
-
-
-@dataclass(frozen=True)
-class Area:
-    """A place for vehicles that has no direction, such as a parking lot.
-
-    Attributes:
-        area_id: of the relation.
-        outer: [P, 2] closed outline.
-        inner: likewise of each hole.
-        tags: of the relation.
-    """
-
-    area_id: int
-    outer: Doubles
-    inner: tuple[Doubles, ...]
-    tags: dict[str, str]
+    tags: Tags
+    stops: tuple[Way, ...]
 
 
 @dataclass(frozen=True)
@@ -131,20 +150,20 @@ class LaneletMap:
     lanelets: tuple[Lanelet, ...]
     ways: dict[int, Way]
     rules: dict[int, Rule]
-    areas: tuple[Area, ...] = ()
+    areas: tuple[shapely.Polygon, ...] = ()
     odd: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
-    """Read a map.
+    """Read an ``.osm`` or ``.osm_xy`` file.
 
     Args:
-        path: an ``.osm`` or ``.osm_xy`` file.
+        path: the file.
         projection: for files without metres, such as ``partial(utm, origin=...)``.
 
     Raises:
-        DataError: it is no OSM XML, declares a document type, an element can't be read, or it has no lanelets with
-            both bounds; names the file and the element.
+        DataError: it is no OSM XML, declares a document type, a node, way or rule can't be read, or it has no
+            lanelets with both bounds; names the file and the element.
     """
     try:
         root = load_xml(path, "OSM")
@@ -152,20 +171,21 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
             raise DataError(f"not an OSM file: its root is <{root.tag[:40]}>", field="osm")
         odd: dict[str, str] = {}
         ways = _ways(root, projection, odd)
-        relations = [(node, _tags(node)) for node in _living(root, "relation")]
-        rules = [_rule(n, tags, ways) for n, tags in relations if tags.get("type") == "regulatory_element"]
-        wanted = [(n, tags) for n, tags in relations if tags.get("type") == "lanelet"]
-        lanelets = tuple(_all_but(_lanelet, wanted, ways, NO_LANELET, odd))
+        kinds: dict[str, list[tuple[ET.Element, Tags]]] = {}
+        for node in _living(root, "relation"):
+            tags = _tags(node)
+            kinds.setdefault(tags.get("type", ""), []).append((node, tags))
+        rules = [_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ())]
+        wanted = kinds.get("lanelet", ())
+        lanelets = [
+            each for relation in wanted for each in readable(NO_LANELET, odd, _lanelet, *relation, ways)
+        ]
         if not lanelets:
             missing = f": {odd[NO_LANELET]}" if NO_LANELET in odd else ""
             raise DataError(f"has no lanelets{missing}", field="relation")
-        wanted = [
-            (n, tags)
-            for n, tags in relations
-            if tags.get("type") in ("multipolygon", "area") and _for_vehicles(tags)
-        ]
-        areas = tuple(_all_but(_area, wanted, ways, NO_AREA, odd))
-        return LaneletMap(lanelets, ways, {rule.rule_id: rule for rule in rules}, areas, odd)
+        wanted = [each for kind in ("multipolygon", "area") for each in kinds.get(kind, ())]
+        areas = [each for relation in wanted for each in readable(NO_AREA, odd, _area, *relation, ways)]
+        return LaneletMap(tuple(lanelets), ways, {rule.rule_id: rule for rule in rules}, tuple(areas), odd)
     except DataError as error:
         raise error.at(file=path) from error
     except OSError as error:
@@ -176,23 +196,8 @@ def _living(root: ET.Element, tag: str) -> Iterator[ET.Element]:
     return (node for node in root.iter(tag) if node.get("action") != "delete")
 
 
-def _tags(node: ET.Element) -> dict[str, str]:
+def _tags(node: ET.Element) -> Tags:
     return {child.get("k", ""): child.get("v", "").strip() for child in node.findall("tag")}
-
-
-def _all_but(
-    read: Callable[[ET.Element, dict[str, str], dict[int, Way]], T],
-    relations: list[tuple[ET.Element, dict[str, str]]],
-    ways: dict[int, Way],
-    kind: str,
-    odd: dict[str, str],
-) -> Iterator[T]:
-    """The relations that are whole; the first of the others is noted."""
-    for node, tags in relations:
-        try:
-            yield read(node, tags, ways)
-        except DataError as error:
-            odd.setdefault(kind, f"{error.field}: {error.message}")
 
 
 def _ways(root: ET.Element, projection: Projection, odd: dict[str, str]) -> dict[int, Way]:
@@ -246,7 +251,7 @@ def _members(node: ET.Element, kind: str, field: str) -> dict[str, list[int]]:
     return found
 
 
-def _lanelet(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Lanelet:
+def _lanelet(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> Lanelet:
     lanelet_id = integer(node.get("id"), "relation id")
     field = f"lanelet {lanelet_id}"
     members = _members(node, "way", field)
@@ -281,7 +286,7 @@ def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
     return left, along, (False, twist)
 
 
-def _for_vehicles(tags: dict[str, str]) -> bool:
+def _for_vehicles(tags: Tags) -> bool:
     """Whether vehicles may be on an area: as its participants say, else by its subtype."""
     named = {name: value for name, value in tags.items() if name.startswith("participant:")}
     if named:
@@ -289,53 +294,145 @@ def _for_vehicles(tags: dict[str, str]) -> bool:
     return tags.get("subtype") in _DRIVABLE
 
 
-def _area(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Area:
-    area_id = integer(node.get("id"), "relation id")
-    field = f"area {area_id}"
+def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon | None:
+    """A place for vehicles that has no direction, such as a parking lot; None for others."""
+    if not _for_vehicles(tags):
+        return None
+    field = f"area {integer(node.get('id'), 'relation id')}"
     members = _members(node, "way", field)
-    found = {role: _closed(members.get(role, []), ways, f"{field}: {role}") for role in ("outer", "inner")}
-    if len(found["outer"]) != 1:
-        raise DataError(f"{len(found['outer'])} outlines, expected one", field=f"{field}: outer")
-    return Area(area_id, found["outer"][0], tuple(found["inner"]), tags)
+    outer, inner = (_closed(members.get(role, []), ways, f"{field}: {role}") for role in ("outer", "inner"))
+    if len(outer) != 1:
+        raise DataError(f"{len(outer)} outlines, expected one", field=f"{field}: outer")
+    return shapely.Polygon(outer[0].exterior, [hole.exterior for hole in inner])
 
 
-def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[Doubles]:
-    """Rings [P, 2] of ways that follow one another, drawn in either direction."""
+def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[shapely.Polygon]:
+    """What ways that meet in their nodes enclose, drawn in either direction."""
     absent = [ref for ref in refs if ref not in ways or len(ways[ref].line) < 2]
     if absent:
         raise DataError(f"there is no way {absent[0]} of two points or more", field=field)
-    if len(set(refs)) < len(refs):
-        raise DataError("one way twice", field=field)
-    rings: list[Doubles] = []
-    ring: list[Way] = []
-    for k, way in enumerate(ways[ref] for ref in refs):
-        # What a way must begin with; the first of a ring may turn to where the next one is.
-        onward = ways[refs[k + 1]].nodes if k + 1 < len(refs) else ()
-        turns = (
-            ring[-1].nodes[-1] != way.nodes[0] if ring else way.nodes[-1] not in (onward[:1] + onward[-1:])
-        )
-        closed = not ring and way.nodes[0] == way.nodes[-1]
-        ring.append(way.turned() if turns and not closed else way)
-        if len(ring) > 1 and ring[-2].nodes[-1] != ring[-1].nodes[0]:
-            raise DataError(f"way {way.way_id} does not go on where the one before it ends", field=field)
-        if ring[0].nodes[0] == ring[-1].nodes[-1]:
-            line = np.concatenate([part.line[:-1] for part in ring] + [ring[0].line[:1]])
-            if len(line) < 4:
-                raise DataError("a ring of fewer than 3 points", field=field)
-            rings.append(line)
-            ring = []
-    if ring:
+    found, *rest = shapely.polygonize_full([shapely.LineString(ways[ref].line) for ref in refs])
+    if any(len(each.geoms) for each in rest):
         raise DataError("is not closed", field=field)
-    return rings
+    return list(found.geoms)
 
 
-def _rule(node: ET.Element, tags: dict[str, str], ways: dict[int, Way]) -> Rule:
+def _rule(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> Rule:
     rule_id = integer(node.get("id"), "relation id")
-    field = f"regulatory element {rule_id}"
-    lines = {
-        # Lines outside the map's section are missing in it.
-        role: tuple(ways[ref] for ref in refs if ref in ways and len(ways[ref].line))
-        for role, refs in _members(node, "way", field).items()
-    }
-    lanelets = {role: tuple(refs) for role, refs in _members(node, "relation", field).items()}
-    return Rule(rule_id, tags, lines, lanelets)
+    refs = _members(node, "way", f"regulatory element {rule_id}").get("ref_line", [])
+    # Lines outside the map's section are missing in it.
+    return Rule(rule_id, tags, tuple(ways[ref] for ref in refs if ref in ways and len(ways[ref].line)))
+
+
+def lane_lanelets(source: LaneletMap) -> tuple[Lanelet, ...]:
+    """The lanelets that are lanes, at least one; lane k of :func:`road_map` is number k."""
+    lanes = tuple(lanelet for lanelet in source.lanelets if lanelet.subtype not in _NO_LANES)
+    if not lanes:
+        raise DataError("has no lanes", field="lanelet")
+    if len({lane.lanelet_id for lane in lanes}) < len(lanes):
+        raise DataError("two lanelets of one id", field="lanelet")
+    return lanes
+
+
+def middle(source: LaneletMap) -> Doubles:
+    """[2] the middle of the box around all lanes, rounded to metres: an origin for everything on the map."""
+    points = np.concatenate([lane.ring for lane in lane_lanelets(source)])
+    return np.round((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
+    """The map relative to an origin [2]; z is 0. A :class:`DataError` says if no area can be formed of its lanes."""
+    ways = lane_lanelets(source)
+    lanes = [
+        Lane(
+            way.lanelet_id,
+            way.center,
+            _TYPES.get(way.subtype, LaneType.SURFACE_STREET),
+            median_width(*way.bounds),
+            _speed_limit(way, source.rules),
+        )
+        for way in ways
+    ]
+    links = successors(ways)
+    rings = drivable_rings([*(way.ring for way in ways), *source.areas], field="lanelet, area")
+    boundary = opened(rings, cut_ends([(way.left.line, way.right.line) for way in ways], links))
+    beside = _beside(ways, left=True), _beside(ways, left=False)
+    return lines.road_map(lanes, origin, boundary, list(_marks(source)), links=links, beside=beside)
+
+
+def successors(lanes: Sequence[Lanelet]) -> Links:
+    """[E, 2] lane indices (from, to)."""
+    starts: dict[tuple[int, int], list[int]] = {}
+    for k, lane in enumerate(lanes):
+        starts.setdefault((lane.left.nodes[0], lane.right.nodes[0]), []).append(k)
+    ends = [(lane.left.nodes[-1], lane.right.nodes[-1]) for lane in lanes]
+    return pairs([(k, after) for k, end in enumerate(ends) for after in starts.get(end, []) if after != k])
+
+
+def _beside(lanes: Sequence[Lanelet], left: bool) -> Links:
+    """[E, 2] (lane, the one on that side that a lane change may reach)."""
+    others: dict[tuple[int, ...], list[int]] = {}
+    for k, lane in enumerate(lanes):
+        others.setdefault((lane.right if left else lane.left).nodes, []).append(k)
+    found = []
+    for k, lane in enumerate(lanes):
+        bound = lane.left if left else lane.right
+        if _may_cross(bound, lane.turned[0 if left else 1], to_left=left):
+            found += [(k, other) for other in others.get(bound.nodes, []) if other != k]
+    return pairs(found)
+
+
+def _may_cross(bound: Way, turned: bool, to_left: bool) -> bool:
+    """Whether the line between two lanes may be crossed; of unknown and unmarked ones it is assumed."""
+    explicit = bound.tags.get("lane_change")
+    if explicit in {"yes", "no"}:
+        return explicit == "yes"
+    if bound.tags.get("type") in _EDGES:
+        return False
+    # The names give the left line first, seen along the way as it is drawn: the near one counts.
+    first, _, second = bound.tags.get("subtype", "").partition("_")
+    near = (second or first) if to_left != turned else first
+    return near != "solid"
+
+
+def _speed_limit(lane: Lanelet, rules: dict[int, Rule]) -> float:
+    """m/s: the lowest of the lanelet's own tags and its rules; NaN where none can be understood."""
+    texts = [lane.tags.get(name, "") for name in ("speed_limit", "maxspeed")]
+    for rule in (rules[ref] for ref in lane.rules if ref in rules):
+        if rule.tags.get("subtype") == "speed_limit":
+            texts.append(rule.tags.get("limit") or rule.tags.get("sign_type", ""))
+    return min((speed for speed in map(_speed, texts) if 0 < speed < 60), default=np.nan)
+
+
+def _speed(text: str) -> float:
+    """Of ``50``, ``50 km/h``, ``25 mph``, ``de274-50``, ``us_r2-1-25``; km/h where there is no unit; else 0."""
+    found = _SPEED.search(text)
+    if found is None:
+        return 0.0
+    unit = (found[2] or ("mph" if text.lower().startswith("us") else "km/h")).lower()
+    return float(found[1]) * {"mph": MPH, "m/s": 1.0, "mps": 1.0}.get(unit, KMH)
+
+
+def _marks(source: LaneletMap) -> Iterable[tuple[Doubles, MarkType]]:
+    for way in source.ways.values():
+        kind = way.tags.get("type")
+        if kind in _PAINT and len(way.line) > 1:
+            yield way.line, MarkType.ROAD_LINE
+        elif kind == "traffic_sign" and len(way.line) and _is_stop(way.tags):
+            yield way.line.mean(axis=0, keepdims=True), MarkType.STOP_SIGN
+    for lanelet in source.lanelets:
+        if lanelet.subtype == "crosswalk":
+            yield lanelet.ring, MarkType.CROSSWALK
+
+
+def stop_line(lane: Lanelet, rules: dict[int, Rule]) -> Doubles | None:
+    """[2] the middle of the stop line that a traffic light of the lanelet names; None where none does."""
+    for rule in (rules[ref] for ref in lane.rules if ref in rules):
+        if rule.tags.get("subtype") == "traffic_light":
+            for way in rule.stops:
+                return way.line.mean(axis=0)
+    return None
+
+
+def _is_stop(tags: Tags) -> bool:
+    return any(_STOP_SIGNS.search(tags.get(name, "")) for name in ("subtype", "sign_type"))

@@ -1,16 +1,18 @@
-"""Plane geometry that readers of lane bounds and drivable areas share."""
+"""Lanes, boundaries and lights as the readers of maps share them, and their plane geometry."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely.geometry.polygon import orient
 
-from symphony.data.segment import Polylines
-from symphony.data.sources.base import to_float32
+from symphony.data.segment import MarkType, Polylines, RoadMap
+from symphony.data.sources.base import pairs, to_float32
 from symphony.errors import DataError
 
 Doubles = NDArray[np.float64]
@@ -21,8 +23,116 @@ MAX_NEAR, MAX_CROSSINGS, MAX_KNOTS = 2_000_000, 50_000, 500
 and memory of a union grow with them, with the last by a power. Maps of 7 000 edges had 1 500 crossings, and outlines
 one with themselves."""
 PROBES = 200
+MAX_BOUND, SPACING = 10_000.0, 2.0
+"""Metres of a lane's bound, at most, and between the points of a centre line."""
+CUT = 0.3
+"""Metres by which a ring may miss the cut it was closed along."""
 SLIT = 0.1
 """Metres by which neighbouring areas may miss each other on either side and still bound no slit."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A lane in the coordinates and by the ids of its source.
+
+    Attributes:
+        name: its id.
+        line: [P, 2 or 3] centre line in the direction of travel.
+        kind: :class:`~symphony.data.segment.LaneType`.
+        width: metres; NaN where unknown.
+        speed_limit: m/s; NaN where unknown.
+        successors: ids of lanes that traffic flows into.
+        predecessors: ids of lanes that traffic comes from.
+        left: ids of the neighbours on the left that a lane change may reach.
+        right: ids of those on the right.
+    """
+
+    name: Any
+    line: Doubles
+    kind: int
+    width: float = np.nan
+    speed_limit: float = np.nan
+    successors: Iterable[Any] = ()
+    predecessors: Iterable[Any] = ()
+    left: Iterable[Any] = ()
+    right: Iterable[Any] = ()
+
+
+Links = NDArray[np.int32]
+"""[E, 2] lane indices (from, to)."""
+
+
+def named(lanes: Sequence[Lane], field: str) -> list[tuple[int, int]]:
+    """(lane, lane it names in a field) by index; names of lanes that are not there are left out."""
+    index = {lane.name: k for k, lane in enumerate(lanes)}
+    return [(k, index[ref]) for k, lane in enumerate(lanes) for ref in getattr(lane, field) if ref in index]
+
+
+def flow(lanes: Sequence[Lane]) -> Links:
+    """Which lanes lead to which, as either of the two tells."""
+    return pairs(named(lanes, "successors") + [(b, a) for a, b in named(lanes, "predecessors")])
+
+
+def road_map(
+    lanes: Sequence[Lane],
+    origin: Doubles,
+    boundary: Sequence[Doubles],
+    marks: Sequence[tuple[Doubles, MarkType]],
+    *,
+    links: Links | None = None,
+    beside: tuple[Links, Links] | None = None,
+    ids: Sequence[int] | None = None,
+) -> RoadMap:
+    """The map relative to an origin [2 or 3]; z is 0 where lines have none.
+
+    Args:
+        lanes: the lanes.
+        origin: what is subtracted.
+        boundary: lines with the drivable side on their left.
+        marks: other lines, each with what it is.
+        links: successors; by default what the lanes say.
+        beside: left and right neighbours; by default what the lanes say.
+        ids: numbers of the lanes; by default their names, which are numbers.
+    """
+    left, right = beside or (pairs(named(lanes, "left")), pairs(named(lanes, "right")))
+    widths = np.array([lane.width for lane in lanes], np.float64)
+    return RoadMap(
+        lanes=polylines([lane.line for lane in lanes], origin),
+        lane_id=np.array([lane.name for lane in lanes] if ids is None else ids, np.int64),
+        lane_type=np.array([lane.kind for lane in lanes], np.uint8),
+        speed_limit=to_float32(np.array([lane.speed_limit for lane in lanes], np.float64)),
+        lane_width=to_float32(np.where(widths > 0, widths, np.nan)),
+        successors=flow(lanes) if links is None else links,
+        left_neighbors=left,
+        right_neighbors=right,
+        boundary=polylines(boundary, origin),
+        marks=polylines([line for line, _ in marks], origin),
+        mark_type=np.array([kind for _, kind in marks], np.uint8),
+    )
+
+
+def polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
+    """Lines [P, 2 or 3] relative to an origin [2 or 3]."""
+    return Polylines.of([to_float32(line - origin[: line.shape[1]]) for line in lines])
+
+
+def lights(found: Mapping[int, tuple[Doubles, Any]], steps: int, origin: Doubles) -> dict[str, Any]:
+    """The fields of a run segment for lights: lane -> (stop point [2 or 3], states [T])."""
+    points = np.array([point - origin for point, _ in found.values()]).reshape(-1, len(origin))
+    return {
+        "signal_lane": np.array(list(found), np.int32),
+        "signal_point": to_float32(np.pad(points, ((0, 0), (0, 3 - len(origin))))),
+        "signal_state": np.array([states for _, states in found.values()], np.uint8).reshape(-1, steps),
+    }
+
+
+def painted(bounds: Iterable[Doubles]) -> list[Doubles]:
+    """Painted bounds of lanes; one that two lanes share, in either direction, counts once."""
+    found: dict[bytes, Doubles] = {}
+    for bound in bounds:
+        if len(bound) and bound[::-1].tobytes() not in found:
+            found.setdefault(bound.tobytes(), bound)
+    return list(found.values())
 
 
 def evenly(line: Doubles, count: int) -> Doubles:
@@ -32,25 +142,34 @@ def evenly(line: Doubles, count: int) -> Doubles:
     return np.stack([np.interp(where, along, line[:, k]) for k in range(2)], axis=-1)
 
 
+def matched(left: Doubles, right: Doubles, field: str) -> tuple[Doubles, Doubles]:
+    """Both bounds of a lane with as many points, evenly and at most :data:`SPACING` apart."""
+    longest = max(np.hypot(*np.diff(line, axis=0).T).sum() for line in (left, right))
+    if not longest <= MAX_BOUND:
+        raise DataError(f"a lane of {longest:.4g} m, at most {MAX_BOUND:g}", field=field)
+    count = max(int(np.ceil(longest / SPACING)) + 1, 2)
+    return evenly(left, count), evenly(right, count)
+
+
+def median_width(left: Doubles, right: Doubles) -> float:
+    """Metres between two bounds with as many points."""
+    return float(np.median(np.hypot(*(left - right).T)))
+
+
 def drivable_rings(
     outlines: Sequence[Doubles | shapely.Polygon], field: str = "lanelet"
 ) -> tuple[Doubles, ...]:
     """Closed rings [P, 2] around the union of outlines or polygons, inside on the left; holes run the other way.
 
-    Slits and holes up to 2 * :data:`SLIT` wide are closed.
-
-    Raises:
-        DataError: the union can't be formed, or would be beyond all measure; ``field`` says where the outlines
-            come from.
+    Slits and holes up to 2 * :data:`SLIT` wide are closed. A :class:`DataError` says of which ``field`` the union
+    can't be formed, or would be beyond all measure.
     """
     _check_effort([ring for outline in outlines for ring in _rings_of(outline)], field)
     try:
         # Shapely takes NaN and infinity on its way through outlines of no width for something to warn of.
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            polygons = shapely.make_valid(
-                np.array([shapely.Polygon(outline) for outline in outlines], object)
-            )
-            union = shapely.union_all(polygons)
+            polygons = np.array([shapely.Polygon(outline) for outline in outlines], object)
+            union = shapely.union_all(shapely.make_valid(polygons))
             wider = union.buffer(SLIT, join_style="mitre")
             closed = wider.buffer(-SLIT, join_style="mitre").simplify(0.01)
     except (shapely.errors.ShapelyError, ValueError) as error:
@@ -73,10 +192,10 @@ def _rings_of(outline: Doubles | shapely.Polygon) -> list[Doubles]:
 def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
     """Refuse outlines that are too many, or cross each other or themselves without end."""
     count = sum(map(len, outlines))
-    if count == 0:
-        return
     if count > MAX_EDGES:
         raise DataError(f"outlines of {count} points, at most {MAX_EDGES}", field=field)
+    if count == 0:
+        return
     owner = np.repeat(np.arange(len(outlines)), [len(outline) for outline in outlines])
     first = np.concatenate(outlines)
     second = np.concatenate([np.roll(outline, -1, axis=0) for outline in outlines])
@@ -88,10 +207,9 @@ def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
         raise DataError(f"outlines whose edges meet about {near:.2g} times", field=field)
     one, other = tree.query(edges, predicate="crosses")
     crossings, knots = len(one) // 2, int((owner[one] == owner[other]).sum()) // 2
-    if crossings > MAX_CROSSINGS:
-        raise DataError(f"outlines that cross {crossings} times, at most {MAX_CROSSINGS}", field=field)
-    if knots > MAX_KNOTS:
-        raise DataError(f"outlines that cross themselves {knots} times, at most {MAX_KNOTS}", field=field)
+    if crossings > MAX_CROSSINGS or knots > MAX_KNOTS:
+        message = f"outlines that cross {crossings} times, themselves {knots} times"
+        raise DataError(f"{message}, at most {MAX_CROSSINGS} and {MAX_KNOTS}", field=field)
 
 
 def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
@@ -109,21 +227,10 @@ def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
     return [points[a : b + 1] for a, b in zip(first, last, strict=True)]
 
 
-def polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
-    """Lines [P, 2 or 3] relative to an origin [2 or 3]; z is 0 where they have none."""
-    return Polylines.of([to_float32(line - origin) for line in lines])
-
-
-CUT = 0.3
-"""Metres by which a ring may miss the cut it was closed along."""
-
-
-def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: NDArray[np.int32]) -> Doubles:
+def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: Links) -> Doubles:
     """[N, 2, 2] the line across each lane's end or start where no other lane goes on: there a map was cut.
 
-    Args:
-        bounds: left and right bound [P, 2] of each lane, in the direction of travel.
-        links: [E, 2] successors, lane indices (from, to).
+    Of each lane left and right bound [P, 2], in the direction of travel; of all the successors.
     """
     goes, comes = set(links[:, 0].tolist()), set(links[:, 1].tolist())
     found = [(left[-1], right[-1]) for k, (left, right) in enumerate(bounds) if k not in goes]

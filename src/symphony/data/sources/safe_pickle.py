@@ -22,35 +22,25 @@ from numpy.typing import NDArray
 from symphony.errors import DataError
 
 MAX_BYTES = 1 << 28
-"""Of a file; scenarios have a few million."""
+"""Bytes of a file; scenarios have a few million."""
 MAX_OPCODES = 20_000_000
-"""Instructions of a file, likewise."""
+"""Instructions of a file; scenarios have a few million."""
 
 _PLAIN = (
-    "PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT LONG LONG1 LONG4 BININT BININT1 BININT2 FLOAT "
-    "BINFLOAT STRING BINSTRING SHORT_BINSTRING BINBYTES BINBYTES8 SHORT_BINBYTES BYTEARRAY8 UNICODE BINUNICODE "
-    "BINUNICODE8 SHORT_BINUNICODE EMPTY_LIST LIST APPEND APPENDS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_DICT "
-    "DICT SETITEM SETITEMS EMPTY_SET ADDITEMS FROZENSET MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET GLOBAL "
-    "STACK_GLOBAL REDUCE BUILD"
+    "PROTO FRAME STOP MARK POP POP_MARK NONE NEWTRUE NEWFALSE LONG1 LONG4 BININT BININT1 BININT2 BINFLOAT BINBYTES "
+    "BINBYTES8 SHORT_BINBYTES BYTEARRAY8 BINUNICODE BINUNICODE8 SHORT_BINUNICODE EMPTY_LIST APPEND APPENDS "
+    "EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_DICT SETITEM SETITEMS EMPTY_SET ADDITEMS FROZENSET MEMOIZE BINGET "
+    "LONG_BINGET STACK_GLOBAL REDUCE BUILD"
 )
 _OPCODES = frozenset(_PLAIN.split())
-_PUTS = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
+"""Instructions of protocols 4 and 5 that plain data needs."""
 _KINDS = "biufSU"
 MAX_ITEM = 4096
 """Bytes of one element of an array: texts of up to 1024 characters."""
 
 
-class _Refusing:
-    """Nothing can be set on it from a pickle."""
-
-    __slots__ = ()
-
-    def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError("sets the state of what has none")
-
-
-class _Named(_Refusing):
-    """What a name in a pickle stands for."""
+class _Named:
+    """What a name in a pickle stands for; nothing can be set on it from there."""
 
     __slots__ = ("_function",)
 
@@ -59,6 +49,9 @@ class _Named(_Refusing):
 
     def __call__(self, *arguments: Any) -> Any:
         return self._function(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("sets the state of what has none")
 
 
 class _Type:
@@ -107,10 +100,6 @@ def _array(data: Any, dtype: Any, shape: Any, order: str) -> NDArray[Any]:
     return np.frombuffer(data, dtype.found).reshape(shape, order="F" if order == "F" else "C")
 
 
-def _reconstruct(*_: Any) -> Array:
-    return Array()
-
-
 def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> Array:
     found = Array()
     found.value = _array(data, dtype, shape, order)
@@ -121,33 +110,16 @@ def _scalar(dtype: Any, data: Any) -> Any:
     return _array(data, dtype, (1,), "C")[0].item()
 
 
-def _encode(text: Any, encoding: Any) -> bytes:
-    """How protocols before 3 write bytes."""
-    if not isinstance(text, str) or encoding != "latin1":
-        raise pickle.UnpicklingError("encodes something")
-    return text.encode("latin1")
-
-
-def _no_bytes(*arguments: Any) -> bytes:
-    if arguments:
-        raise pickle.UnpicklingError("makes bytes of something")
-    return b""
-
-
 def _never(*_: Any) -> Any:
     raise pickle.UnpicklingError("makes an array by itself")
 
 
-_NUMPY = {"_reconstruct": _reconstruct, "scalar": _scalar}
+_NUMPY = {"_reconstruct": lambda *_: Array(), "scalar": _scalar}
 _NAMES: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _Named(_never),
     ("numpy", "dtype"): _Named(_Type),
     **{(f"numpy.{core}.multiarray", n): _Named(f) for core in ("core", "_core") for n, f in _NUMPY.items()},
     **{(f"numpy.{core}.numeric", "_frombuffer"): _Named(_from_buffer) for core in ("core", "_core")},
-    ("_codecs", "encode"): _Named(_encode),
-    # How early protocols write sets and empty bytes.
-    **{(module, "set"): _Named(set) for module in ("builtins", "__builtin__")},
-    **{(module, "bytes"): _Named(_no_bytes) for module in ("builtins", "__builtin__")},
 }
 
 
@@ -163,9 +135,7 @@ class _Plain(pickle.Unpickler):
 def load_plain(path: Path) -> Any:
     """Read a pickle of plain data; its arrays are :class:`Array`.
 
-    Raises:
-        DataError: too large, empty, cut short, damaged, or it holds or refers to anything else, which is named.
-        OSError: the file can't be read.
+    A :class:`DataError` names what is too large, empty, cut short, damaged, or anything else that it refers to.
     """
     size = path.stat().st_size
     if size > MAX_BYTES:
@@ -175,7 +145,7 @@ def load_plain(path: Path) -> Any:
         raise DataError("the file is empty", file=path)
     try:
         _check(data)
-        return _Plain(io.BytesIO(data), encoding="ASCII").load()
+        return _Plain(io.BytesIO(data)).load()
     # Damaged bytes make it do anything to anything.
     except Exception as error:
         raise DataError(f"not a pickle of plain data: {str(error)[:200]}", file=path) from error
@@ -184,13 +154,11 @@ def load_plain(path: Path) -> Any:
 def _check(data: bytes) -> None:
     count = 0
     for count, (opcode, argument, place) in enumerate(pickletools.genops(data), start=1):
+        if opcode.name == "PROTO" and (argument or 0) < 4:
+            raise pickle.UnpicklingError(f"protocol {argument}; 4 and 5 are read")
         if opcode.name not in _OPCODES:
-            raise pickle.UnpicklingError(
-                f"instruction {opcode.name} at byte {place}, which no plain data needs"
-            )
-        # Room is made for as many entries as a number says.
-        if opcode.name in _PUTS and not 0 <= (argument or 0) <= count:
-            raise pickle.UnpicklingError(f"entry {argument} after {count} instructions")
+            message = f"instruction {opcode.name} at byte {place}, which no plain data needs"
+            raise pickle.UnpicklingError(message)
         if count > MAX_OPCODES:
             raise pickle.UnpicklingError(f"more than {MAX_OPCODES} instructions")
     if count == 0:

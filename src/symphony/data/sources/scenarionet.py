@@ -26,7 +26,7 @@ How the format maps onto :class:`~symphony.data.segment.RunSegment`:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +37,9 @@ from symphony.data.bounds import MAX_STEPS, check_counts
 from symphony.data.resample import evened
 from symphony.data.segment import AgentType, Bools, RunSegment, SignalState
 from symphony.data.sources.base import Item, Reader, time_step, to_float32
-from symphony.data.sources.lines import Doubles
+from symphony.data.sources.lines import Doubles, Lane, lights
 from symphony.data.sources.safe_pickle import Array, load_plain
-from symphony.data.sources.scenarionet_map import Features, mapping, points, read_features, road_map
+from symphony.data.sources.scenarionet_map import mapping, points, read_map
 from symphony.errors import DataError
 
 _TYPES = {
@@ -78,8 +78,11 @@ class ScenarioNetReader(Reader):
 
 def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     metadata = mapping(scenario.get("metadata"), "metadata")
-    dt, times = _time_step(scenario, metadata)
+    times = _numbers(metadata.get("ts"), "metadata: ts", 1)[:, 0]
     steps = len(times)
+    if scenario.get("length") != steps or not 2 <= steps <= MAX_STEPS:
+        raise DataError(f"{steps} for {str(scenario.get('length'))[:20]} steps", field="metadata: ts")
+    dt = time_step(times, "metadata: ts")
     names, kinds, states, valid = _tracks(mapping(scenario.get("tracks"), "tracks"), steps)
     ego = metadata.get("sdc_id")
     if not isinstance(ego, str) or ego not in names:
@@ -88,27 +91,25 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     origin = np.round(states[row, np.argmax(valid[row]), :3])
     origin[2] = 0
     dataset = str(metadata.get("dataset", ""))
-    features = read_features(mapping(scenario.get("map_features"), "map_features"), dataset)
-    lane, point, state = _signals(scenario.get("dynamic_map_states") or {}, features, steps, dataset)
+    road, lanes = read_map(mapping(scenario.get("map_features"), "map_features"), dataset, origin)
+    found = _signals(scenario.get("dynamic_map_states") or {}, lanes, steps, dataset)
     if dataset == "nuscenes":
         _carry_velocity(states[..., 4:6], valid)
-    numbers = all(each.isdecimal() and len(each) < 18 for each in names)
+    numeric = all(each.isdecimal() and len(each) < 18 for each in names)
     segment = RunSegment(
         segment_id=name.replace("/", "_"),
         source=ScenarioNetReader.name,
         dt=dt,
         ego=row,
-        agent_id=np.array([int(each) for each in names] if numbers else range(len(names)), np.int64),
+        agent_id=np.array([int(each) for each in names] if numeric else range(len(names)), np.int64),
         agent_type=np.array(kinds, np.uint8),
         size=_sizes(states[..., 6:], valid, row),
         position=to_float32(np.where(valid[..., None], states[..., :3] - origin, 0.0)),
         heading=to_float32(states[..., 3]),
         velocity=to_float32(states[..., 4:6]),
         valid=valid,
-        road=road_map(features, origin),
-        signal_lane=lane,
-        signal_point=to_float32(point - origin),
-        signal_state=state,
+        road=road,
+        **lights(found, steps, origin),
         origin=origin,
         file=file,
         group=_group(metadata, dataset),
@@ -119,15 +120,6 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
 def _group(metadata: Mapping[Any, Any], dataset: str) -> str:
     place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
     return f"{dataset} {place} {date}" if isinstance(place, str) and isinstance(date, str) else ""
-
-
-def _time_step(scenario: Mapping[Any, Any], metadata: Mapping[Any, Any]) -> tuple[float, Doubles]:
-    """(seconds per step, time of each)."""
-    times = numbers(metadata.get("ts"), "metadata: ts", 1)[:, 0]
-    steps = scenario.get("length")
-    if steps != len(times) or not 2 <= len(times) <= MAX_STEPS:
-        raise DataError(f"{len(times)} for {str(steps)[:20]} steps", field="metadata: ts")
-    return time_step(times, "metadata: ts"), times
 
 
 _STATE = (("position", 3), ("heading", 1), ("velocity", 2), ("length", 1), ("width", 1), ("height", 1))
@@ -144,8 +136,8 @@ def _tracks(tracks: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int]
         field = f"tracks {str(key)[:60]}"
         track = mapping(value, field)
         state = mapping(track.get("state"), f"{field}: state")
-        valid = numbers(state.get("valid"), f"{field}: valid", 1)[:, 0] > 0
-        parts = [numbers(state.get(name), f"{field}: {name}", width) for name, width in _STATE]
+        valid = _numbers(state.get("valid"), f"{field}: valid", 1)[:, 0] > 0
+        parts = [_numbers(state.get(name), f"{field}: {name}", width) for name, width in _STATE]
         for (name, _), part in zip((("valid", 1), *_STATE), (valid, *parts), strict=True):
             if len(part) != steps:
                 raise DataError(f"{len(part)} states for {steps} steps", field=f"{field}: {name}")
@@ -159,12 +151,8 @@ def _tracks(tracks: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int]
     return names, kinds, np.stack(states), np.stack(masks)
 
 
-def numbers(value: Any, field: str, width: int) -> Doubles:
-    """[N, width] an array of numbers, [N] or [N, more than width].
-
-    Raises:
-        DataError: it is none.
-    """
+def _numbers(value: Any, field: str, width: int) -> Doubles:
+    """[N, width] of an array of numbers, [N] or [N, width or more]; a :class:`DataError` if it is none."""
     found = value.value if isinstance(value, Array) else value
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "bfiu" or found.ndim not in {1, 2}:
         raise DataError(f"expected an array of numbers, is {type(found).__name__}", field=field)
@@ -188,10 +176,10 @@ def _carry_velocity(velocity: Doubles, valid: Bools) -> None:
 
 
 def _signals(
-    states: Any, features: Features, steps: int, dataset: str
-) -> tuple[NDArray[np.int32], Doubles, NDArray[np.uint8]]:
-    """(lane [Q], stop point [Q, 3], state [Q, T]); one row per lane that is there."""
-    index = {lane.name: k for k, lane in enumerate(features.lanes)}
+    states: Any, lanes: Sequence[Lane], steps: int, dataset: str
+) -> dict[int, tuple[Doubles, list[int]]]:
+    """Lane -> (stop point [3], state [T])."""
+    index = {lane.name: k for k, lane in enumerate(lanes)}
     found: dict[int, tuple[Doubles, list[int]]] = {}
     for key, value in mapping(states, "dynamic_map_states").items():
         field = f"dynamic_map_states {str(key)[:60]}"
@@ -210,11 +198,6 @@ def _signals(
         place = np.zeros((0, 3)) if stop is None else points([stop], f"{field}: stop_point")
         # Zeros are what ScenarioNet begins with, for a point that is never named.
         if not place.any() or dataset == "nuplan":
-            place = features.lanes[lane].line[:1]
-        place = np.pad(place, ((0, 0), (0, 3 - place.shape[1])))
-        found[lane] = place[0], [_LIGHTS[str(state)] for state in logged]
-    return (
-        np.array(list(found), np.int32),
-        np.array([place for place, _ in found.values()]).reshape(-1, 3),
-        np.array([states for _, states in found.values()], np.uint8).reshape(-1, steps),
-    )
+            place = lanes[lane].line[:1]
+        found[lane] = np.pad(place[0], (0, 3 - place.shape[1])), [_LIGHTS[str(state)] for state in logged]
+    return found

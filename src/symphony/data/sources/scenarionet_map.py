@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from symphony.data.resample import wrap
 from symphony.data.segment import LaneType, MarkType, RoadMap
-from symphony.data.sources.base import pairs, to_float32
-from symphony.data.sources.lines import Doubles, cut_ends, drivable_rings, opened, polylines
+from symphony.data.sources.base import pairs
+from symphony.data.sources.lines import (
+    Doubles,
+    Lane,
+    Links,
+    cut_ends,
+    drivable_rings,
+    named,
+    opened,
+    road_map,
+)
 from symphony.data.sources.safe_pickle import Array
 from symphony.errors import DataError
 
@@ -46,48 +53,21 @@ _NO_LIMITS = frozenset({"nuscenes", "av2"})
 """Datasets without speed limits: ScenarioNet writes 100 km/h for connectors, and 85 mph for all lanes."""
 
 
-@dataclass(frozen=True)
-class Lane:
-    """One lane; its line [P, 2 or 3], its outline [P, 2] where there is one, what the source says about it."""
+def read_map(features: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[RoadMap, list[Lane]]:
+    """The map relative to an origin [3], and its lanes in the source's coordinates.
 
-    name: str
-    line: Doubles
-    area: Doubles | None
-    kind: LaneType
-    speed_limit: float
-    exits: tuple[str, ...] | None
-    left: tuple[str, ...]
-    right: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Features:
-    """The map in the source's coordinates.
-
-    Attributes:
-        lanes: those with a line; a road's lane k is ``lanes[k]``.
-        edges: road edges, drivable side on the left.
-        outlines: closed rings around the drivable areas, in any direction.
-        marks: lines and their types.
-    """
-
-    lanes: tuple[Lane, ...]
-    edges: tuple[Doubles, ...]
-    outlines: tuple[Doubles, ...]
-    marks: tuple[tuple[Doubles, MarkType], ...]
-
-
-def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
-    """Sort the features of a scenario; those of unknown types are left out.
+    Features of unknown types are left out.
 
     Raises:
         DataError: there are no lanes, or a feature can't be read; names it.
     """
     lanes: list[Lane] = []
+    areas: list[Doubles | None] = []
     edges: list[Doubles] = []
     outlines: list[Doubles] = []
     pieces: list[Doubles] = []
     marks: list[tuple[Doubles, MarkType]] = []
+    told = False
     for key, value in features.items():
         field = f"map_features {str(key)[:60]}"
         node = mapping(value, field)
@@ -97,7 +77,9 @@ def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
             line = line[:, :2]  # the third number is a heading
         area = points(node.get("polygon", ()), f"{field}: polygon")
         if kind in _LANES and len(line):
-            lanes.append(_lane(str(key), node, line, area, dataset))
+            told |= node.get("exit_lanes") is not None
+            areas.append(area[:, :2] if len(area) > 2 else None)
+            lanes.append(_lane(str(key), node, line, areas[-1], dataset))
         elif kind.startswith("ROAD_EDGE") and len(line) > 1:
             edges.append(line)
         elif kind in _AREAS and len(area if len(area) else line) > 2:
@@ -117,24 +99,29 @@ def read_features(features: Mapping[Any, Any], dataset: str) -> Features:
         # Long rings were cut up (Argoverse 2): without them, the islands that are whole would be all the road.
         marks += [(line, MarkType.ROAD_LINE) for line in outlines + pieces]
         outlines = []
-    return Features(tuple(lanes), tuple(edges), tuple(outlines), tuple(marks))
+    links = pairs([(a, b) for a, b in named(lanes, "successors") if a != b]) if told else successors(lanes)
+    # As the source says or, where it says nothing, lanes that lie side by side.
+    given = any(lane.left or lane.right for lane in lanes)
+    beside = (pairs(named(lanes, "left")), pairs(named(lanes, "right"))) if given else neighbors(lanes, areas)
+    edges = edges or list(opened(_rings(lanes, areas, outlines), _cuts(lanes, links)))
+    numbers = range(len(lanes))
+    return road_map(lanes, origin, edges, marks, links=links, beside=beside, ids=numbers), lanes
 
 
-def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles, dataset: str) -> Lane:
+def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles | None, dataset: str) -> Lane:
     limit = node.get("speed_limit_kmh")
     known = isinstance(limit, int | float) and 0 < limit < 300 and dataset not in _NO_LIMITS
-    exits = node.get("exit_lanes")
     # Of nuPlan, ScenarioNet names all lanes of a road, in an order that need not be theirs.
-    beside = dataset != "nuplan"
+    left, right = (_references(node.get(f"{s}_neighbor", ())) for s in ("left", "right"))
     return Lane(
         name=name,
         line=line,
-        area=area[:, :2] if len(area) > 2 else None,
         kind=_LANES[str(node["type"])],
+        width=_width(line, area),
         speed_limit=float(limit) / 3.6 if known and limit is not None else np.nan,
-        exits=None if exits is None else _references(exits),
-        left=_references(node.get("left_neighbor", ())) if beside else (),
-        right=_references(node.get("right_neighbor", ())) if beside else (),
+        successors=_references(node.get("exit_lanes")),
+        left=left if dataset != "nuplan" else (),
+        right=right if dataset != "nuplan" else (),
     )
 
 
@@ -146,41 +133,9 @@ def _references(values: Any) -> tuple[str, ...]:
     return tuple(str(v.get("feature_id")) if isinstance(v, dict) else str(v) for v in values)
 
 
-def road_map(features: Features, origin: Doubles) -> RoadMap:
-    """The map relative to an origin [3].
-
-    Raises:
-        DataError: no area can be formed.
-    """
-    lanes = features.lanes
-    index = {lane.name: k for k, lane in enumerate(lanes)}
-    links = successors(lanes, index)
-    left, right = neighbors(lanes, index)
-    widths = np.array([_width(lane) for lane in lanes])
-    edges = features.edges or opened(_rings(features), _cuts(lanes, links))
-    return RoadMap(
-        lanes=polylines([lane.line - origin[: lane.line.shape[1]] for lane in lanes], np.zeros(1)),
-        lane_id=np.arange(len(lanes), dtype=np.int64),
-        lane_type=np.array([lane.kind for lane in lanes], np.uint8),
-        speed_limit=to_float32(np.array([lane.speed_limit for lane in lanes])),
-        lane_width=to_float32(np.where(widths > 0, widths, np.nan)),
-        successors=links,
-        left_neighbors=left,
-        right_neighbors=right,
-        boundary=polylines([edge - origin[: edge.shape[1]] for edge in edges], np.zeros(1)),
-        marks=polylines([line - origin[: line.shape[1]] for line, _ in features.marks], np.zeros(1)),
-        mark_type=np.array([kind for _, kind in features.marks], np.uint8),
-    )
-
-
-def successors(lanes: tuple[Lane, ...], index: Mapping[str, int]) -> NDArray[np.int32]:
-    """[E, 2] lane indices (from, to): as the source says or, where it says nothing, where an end meets a start.
-
-    A lane that begins within :data:`MEETS` of another's end, and turns off by less than :data:`TURN`, succeeds it.
-    """
-    if any(lane.exits is not None for lane in lanes):
-        found = [(k, index[ref]) for k, lane in enumerate(lanes) for ref in lane.exits or () if ref in index]
-        return pairs([(a, b) for a, b in found if a != b])
+def successors(lanes: Sequence[Lane]) -> Links:
+    """Which lanes go on where: one that begins within :data:`MEETS` of another's end, and turns off by less than
+    :data:`TURN`, succeeds it."""
     starts, ends = (shapely.points(np.array([lane.line[row, :2] for lane in lanes])) for row in (0, -1))
     before, after = shapely.STRtree(starts).query(ends, predicate="dwithin", distance=MEETS)
     out, into = (np.array([_course(lane.line, row) for lane in lanes]) for row in (-1, 0))
@@ -195,27 +150,20 @@ def _course(line: Doubles, row: int) -> float:
     return float(np.arctan2(*step[row][::-1])) if len(step) else np.nan
 
 
-def neighbors(
-    lanes: tuple[Lane, ...], index: Mapping[str, int]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Left and right neighbours [E, 2]: as the source says or, where it says nothing, lanes that lie side by side.
+def neighbors(lanes: Sequence[Lane], areas: Sequence[Doubles | None]) -> tuple[Links, Links]:
+    """Left and right neighbours: lanes that lie side by side.
 
     Of two such lanes the areas touch, and at the middle of the shorter one their lines are :data:`BESIDE` apart and
     run the same way.
     """
-    if any(lane.left or lane.right for lane in lanes):
-        left, right = (
-            [(k, index[ref]) for k, lane in enumerate(lanes) for ref in getattr(lane, side) if ref in index]
-            for side in ("left", "right")
-        )
-        return pairs(left), pairs(right)
-    with_area = [k for k, lane in enumerate(lanes) if lane.area is not None and len(lane.line) > 1]
-    areas = shapely.make_valid(np.array([shapely.Polygon(lanes[k].area) for k in with_area]))
-    one, two = shapely.STRtree(areas).query(areas, predicate="dwithin", distance=0.2)
+    flat = [k for k, area in enumerate(areas) if area is not None and len(lanes[k].line) > 1]
+    shapes = shapely.make_valid(np.array([shapely.Polygon(areas[k]) for k in flat]))
+    one, two = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=0.2)
     found: list[tuple[int, int]] = []
-    for a, b in zip(one.tolist(), two.tolist(), strict=True):
-        if a < b and (side := _side(lanes[with_area[a]].line, lanes[with_area[b]].line)):
-            found.append((with_area[a], with_area[b]) if side > 0 else (with_area[b], with_area[a]))
+    for a, b in ((flat[i], flat[j]) for i, j in zip(one.tolist(), two.tolist(), strict=True) if i < j):
+        side = _side(lanes[a].line, lanes[b].line)
+        if side:
+            found.append((a, b) if side > 0 else (b, a))
     return pairs(found), pairs([(b, a) for a, b in found])
 
 
@@ -242,51 +190,49 @@ def _side(one: Doubles, two: Doubles) -> int:
     return turn if short is lines[0] else -turn
 
 
-def _width(lane: Lane) -> float:
-    """Of the area across the middle of the line; NaN where there is no area there."""
-    if lane.area is None or len(lane.line) < 2:
+def _width(line: Doubles, outline: Doubles | None) -> float:
+    """Metres of the area across the middle of the line; NaN where there is no area there."""
+    if outline is None or len(line) < 2:
         return np.nan
-    line = shapely.LineString(lane.line[:, :2])
-    half = line.length / 2
+    shape = shapely.LineString(line[:, :2])
+    half = shape.length / 2
     if half < 0.1:
         return np.nan
-    before, middle, after = (np.array(line.interpolate(half + d).coords[0]) for d in (-0.1, 0, 0.1))
+    before, middle, after = (np.array(shape.interpolate(half + d).coords[0]) for d in (-0.1, 0, 0.1))
     along = (after - before) / np.hypot(*(after - before))
     aside = MAX_WIDTH * np.array([-along[1], along[0]])
-    area = shapely.make_valid(shapely.Polygon(lane.area))
+    area = shapely.make_valid(shapely.Polygon(outline))
     parts = shapely.get_parts(area.intersection(shapely.LineString([middle - aside, middle + aside])))
     here = [part.length for part in parts if part.distance(shapely.Point(middle)) < 0.1]
     return float(max(here, default=np.nan))
 
 
-def _rings(features: Features) -> tuple[Doubles, ...]:
+def _rings(
+    lanes: Sequence[Lane], areas: Sequence[Doubles | None], outlines: Sequence[Doubles]
+) -> tuple[Doubles, ...]:
     """Around the outlined areas, where one inside another is a hole, and those of lanes.
 
     Without outlines, lanes that have no area are :data:`HALF_WIDTH` wide on either side.
     """
-    shapes = [lane.area for lane in features.lanes if lane.area is not None]
     try:
         area = shapely.Polygon()
-        for outline in features.outlines:
+        for outline in outlines:
             area = area.symmetric_difference(shapely.make_valid(shapely.Polygon(outline)))
-        if not features.outlines:
-            bare = [lane.line[:, :2] for lane in features.lanes if lane.area is None and len(lane.line) > 1]
-            area = shapely.union_all([shapely.LineString(line).buffer(HALF_WIDTH) for line in bare])
+        if not outlines:
+            bare = [lane.line[:, :2] for lane, own in zip(lanes, areas, strict=True) if own is None]
+            strips = [shapely.LineString(line).buffer(HALF_WIDTH) for line in bare if len(line) > 1]
+            area = shapely.union_all(strips)
     except shapely.errors.ShapelyError as error:
         raise DataError(f"the union of the areas can't be formed: {error}", field="map_features") from error
-    return drivable_rings([*shapes, *_holes_apart(area)], field="map_features")
+    parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
+    return drivable_rings([*(own for own in areas if own is not None), *parts], field="map_features")
 
 
-def _holes_apart(area: Any) -> Iterable[Any]:
-    """Parts of an area, holes kept."""
-    return [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
-
-
-def _cuts(lanes: tuple[Lane, ...], links: NDArray[np.int32]) -> Doubles:
+def _cuts(lanes: Sequence[Lane], links: Links) -> Doubles:
     """Across the ends where no lane goes on, as wide as the lane and a little more."""
     bounds = []
     for lane in lanes:
-        half = _width(lane) / 2 if _width(lane) > 0 else HALF_WIDTH
+        half = lane.width / 2 if lane.width > 0 else HALF_WIDTH
         sides = []
         for row in (0, -1):
             course = _course(lane.line, row)
@@ -298,22 +244,14 @@ def _cuts(lanes: tuple[Lane, ...], links: NDArray[np.int32]) -> Doubles:
 
 
 def mapping(value: Any, field: str) -> Mapping[Any, Any]:
-    """A dictionary.
-
-    Raises:
-        DataError: it is none.
-    """
+    """A dictionary; a :class:`DataError` if it is none."""
     if not isinstance(value, dict):
         raise DataError(f"expected a dictionary, is {type(value).__name__}", field=field)
     return value
 
 
 def points(value: Any, field: str) -> Doubles:
-    """[P, 2 or 3] points, however they are written.
-
-    Raises:
-        DataError: they are no points, or not finite.
-    """
+    """[P, 2 or 3] points, however they are written; a :class:`DataError` if they are none, or not finite."""
     if isinstance(value, Array):
         value = value.value
     elif isinstance(value, list | tuple):

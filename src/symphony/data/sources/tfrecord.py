@@ -48,36 +48,29 @@ def read_records(path: Path) -> Iterator[bytes | DataError]:
             where = f"record {index}"
             header = file.read(_HEADER.size)
             if len(header) < _HEADER.size:
-                raise DataError(
-                    f"cut short: {len(header)} of {_HEADER.size} header bytes", file=path, field=where
-                )
+                message = f"cut short: {len(header)} of {_HEADER.size} header bytes"
+                raise DataError(message, file=path, field=where)
             length, check = _HEADER.unpack(header)
             if masked_crc32c(header[:8]) != check:
                 kind = "not a TFRecord file, or damaged" if index == 0 else "damaged"
-                raise DataError(
-                    f"{kind}: the checksum of the record's length is wrong", file=path, field=where
-                )
-            left -= _HEADER.size
-            if length + _CHECK.size > left:
-                raise DataError(
-                    f"cut short: {left} of {length + _CHECK.size} payload bytes", file=path, field=where
-                )
+                message = f"{kind}: the checksum of the record's length is wrong"
+                raise DataError(message, file=path, field=where)
+            size = length + _CHECK.size
+            left -= _HEADER.size + size
+            if left < 0:
+                message = f"cut short: {left + size} of {size} payload bytes"
+                raise DataError(message, file=path, field=where)
+            index += 1
             if length > MAX_RECORD:
-                file.seek(length + _CHECK.size, os.SEEK_CUR)
-                left -= length + _CHECK.size
+                file.seek(size, os.SEEK_CUR)
                 yield DataError(f"{length} bytes, at most {MAX_RECORD} are read", file=path, field=where)
-                index += 1
                 continue
             payload = file.read(length)
             tail = file.read(_CHECK.size)
-            left -= length + _CHECK.size
-            if len(payload) + len(tail) < length + _CHECK.size:
-                raise DataError("cut short while being read", file=path, field=where)
-            if masked_crc32c(payload) == _CHECK.unpack(tail)[0]:
+            if masked_crc32c(payload) == int.from_bytes(tail, "little"):
                 yield payload
             else:
                 yield DataError("damaged: the checksum of the payload is wrong", file=path, field=where)
-            index += 1
 
 
 def write_records(path: Path, payloads: Iterable[bytes]) -> None:

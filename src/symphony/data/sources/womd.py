@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_AGENTS, check_counts, check_signals
 from symphony.data.resample import evened
-from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
+from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, SignalState
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.base import Item, Reader, codes, pairs, time_step, to_float32, unexpected
+from symphony.data.sources.base import Item, Reader, codes, time_step, to_float32, unexpected
+from symphony.data.sources.lines import Doubles, Lane, lights, road_map
 from symphony.data.sources.tfrecord import read_records
 from symphony.errors import DataError
 
@@ -40,16 +41,8 @@ MAX_FEATURES, MAX_LINKS = 100_000, 1_000_000
 MPS_PER_MPH = 0.44704
 
 _STATE = attrgetter(
-    "center_x",
-    "center_y",
-    "center_z",
-    "length",
-    "width",
-    "height",
-    "heading",
-    "velocity_x",
-    "velocity_y",
-    "valid",
+    *("center_x", "center_y", "center_z", "length", "width", "height"),
+    *("heading", "velocity_x", "velocity_y", "valid"),
 )
 _POINT = attrgetter("x", "y", "z")
 _MARKS = {
@@ -58,8 +51,6 @@ _MARKS = {
     "speed_bump": ("polygon", MarkType.SPEED_BUMP),
     "driveway": ("polygon", MarkType.DRIVEWAY),
 }
-
-Doubles = NDArray[np.float64]
 
 
 class WomdReader(Reader):
@@ -70,9 +61,10 @@ class WomdReader(Reader):
 
     def _read(self, path: Path) -> Iterator[Item]:
         for index, payload in enumerate(read_records(path)):
-            yield (
-                payload if isinstance(payload, DataError) else self._convert(payload, path, f"record {index}")
-            )
+            if isinstance(payload, DataError):
+                yield payload
+            else:
+                yield self._convert(payload, path, f"record {index}")
 
     def _convert(self, payload: bytes, path: Path, record: str) -> Item:
         name = None
@@ -92,22 +84,20 @@ class WomdReader(Reader):
 
 
 def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
-    """Convert one decoded record; the result is not validated yet.
-
-    Raises:
-        DataError: naming the field of the format.
-    """
+    """Convert one decoded record; the result is not validated yet. A :class:`DataError` names the format's field."""
     name = _name(scenario)
-    dt, times = _time_step(scenario)
+    times = np.array(scenario.timestamps_seconds, np.float64)
     steps = len(times)
+    if steps < 2 or not np.isfinite(times).all():
+        raise DataError(f"{steps} steps, needs at least 2 finite ones", field="timestamps_seconds")
+    dt = time_step(times, "timestamps_seconds")
     states, kept, renumber = _tracks(scenario, steps)
     ego = _index(scenario.sdc_track_index, renumber, "sdc_track_index")
     if ego < 0:
         raise DataError("the recording vehicle is valid at no step", field="sdc_track_index")
     valid = states[..., 9] != 0
     origin = np.round(states[ego, np.argmax(valid[ego]), :3])
-    road, lane_index = _road(scenario.map_features, origin)
-    signal_lane, signal_point, signal_state = _signals(scenario, steps, lane_index, road, origin)
+    lanes, boundary, marks = _features(scenario.map_features)
     for field in ("tracks_to_predict", "objects_of_interest"):
         _check_count(len(getattr(scenario, field)), MAX_AGENTS, field)
     tracks = [scenario.tracks[i] for i in kept]
@@ -129,10 +119,8 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
         heading=to_float32(masked[..., 6]),
         velocity=to_float32(masked[..., 7:9]),
         valid=valid,
-        road=road,
-        signal_lane=signal_lane,
-        signal_point=signal_point,
-        signal_state=signal_state,
+        road=road_map(lanes, origin, boundary, marks),
+        **lights(_signals(scenario, steps, lanes), steps, origin),
         origin=origin,
         current_step=scenario.current_time_index,
         interest=np.array(interest, np.int32),
@@ -155,16 +143,6 @@ def _name(scenario: pb.Scenario) -> str:
     if isinstance(name, bytes):
         raise DataError(f"{name!r} is not UTF-8", field="scenario_id")
     return name
-
-
-def _time_step(scenario: pb.Scenario) -> tuple[float, Doubles]:
-    """(seconds per step, time of each)."""
-    times = np.array(scenario.timestamps_seconds, np.float64)
-    if len(times) < 2:
-        raise DataError(f"{len(times)} steps, needs at least 2", field="timestamps_seconds")
-    if not np.isfinite(times).all():
-        raise DataError("not finite", field="timestamps_seconds")
-    return time_step(times, "timestamps_seconds"), times
 
 
 def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict[int, int]]:
@@ -206,91 +184,71 @@ def _points(points: Iterable[pb.MapPoint]) -> Doubles:
     return np.fromiter(chain.from_iterable(map(_POINT, points)), np.float64).reshape(-1, 3)
 
 
-def _polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
-    return Polylines.of([to_float32(line - origin) for line in lines])
-
-
-def _road(features: Sequence[pb.MapFeature], origin: Doubles) -> tuple[RoadMap, dict[int, int]]:
-    """(the map, lane id -> lane index)."""
+def _features(
+    features: Sequence[pb.MapFeature],
+) -> tuple[list[Lane], list[Doubles], list[tuple[Doubles, MarkType]]]:
+    """Lanes, road edges, and marks with their types."""
     _check_count(len(features), MAX_FEATURES, "map_features")
-    lanes: list[tuple[int, Any]] = []
-    lines: list[Doubles] = []
+    found: list[tuple[int, Any]] = []
     edges: list[Doubles] = []
-    marks: list[Doubles] = []
-    kinds: list[int] = []
+    marks: list[tuple[Doubles, MarkType]] = []
     for feature in features:
         kind = feature.WhichOneof("feature_data")
         if kind == "lane" and len(feature.lane.polyline) >= 1:
-            lanes.append((feature.id, feature.lane))
-            lines.append(_points(feature.lane.polyline))
+            found.append((feature.id, feature.lane))
         elif kind == "road_edge" and len(feature.road_edge.polyline) >= 2:
             edges.append(_points(feature.road_edge.polyline))
         elif kind == "stop_sign" and feature.stop_sign.HasField("position"):
-            marks.append(_points([feature.stop_sign.position]))
-            kinds.append(MarkType.STOP_SIGN)
+            marks.append((_points([feature.stop_sign.position]), MarkType.STOP_SIGN))
         elif kind in _MARKS:
             attribute, mark = _MARKS[kind]
             points = _points(getattr(getattr(feature, kind), attribute))
             if len(points):
-                marks.append(np.concatenate([points, points[:1]]) if attribute == "polygon" else points)
-                kinds.append(mark)
-    index = {lane_id: k for k, (lane_id, _) in enumerate(lanes)}
-
-    def links(references: attrgetter[Any]) -> NDArray[np.int32]:
-        _check_count(sum(len(references(lane)) for _, lane in lanes), MAX_LINKS, "map_features.lane")
-        found = ((k, references(lane)) for k, (_, lane) in enumerate(lanes))
-        return pairs([(k, index[other]) for k, others in found for other in _ids(others) if other in index])
-
-    speed = np.array([lane.speed_limit_mph for _, lane in lanes], np.float64) * MPS_PER_MPH
-    types = np.array([lane.type for _, lane in lanes], np.int64)
-    road = RoadMap(
-        lanes=_polylines(lines, origin),
-        lane_id=np.array([lane_id for lane_id, _ in lanes], np.int64),
-        lane_type=codes(types, len(LaneType), "map_features.lane.type"),
-        speed_limit=to_float32(np.where(speed == 0, np.nan, speed)),
-        lane_width=np.full(len(lanes), np.nan, np.float32),
-        successors=links(attrgetter("exit_lanes")),
-        left_neighbors=links(attrgetter("left_neighbors")),
-        right_neighbors=links(attrgetter("right_neighbors")),
-        boundary=_polylines(edges, origin),
-        marks=_polylines(marks, origin),
-        mark_type=np.array(kinds, np.uint8),
+                ring = np.concatenate([points, points[:1]])
+                marks.append((ring if attribute == "polygon" else points, mark))
+    for name in ("exit_lanes", "left_neighbors", "right_neighbors"):
+        _check_count(sum(len(getattr(lane, name)) for _, lane in found), MAX_LINKS, "map_features.lane")
+    types = codes(
+        np.array([lane.type for _, lane in found], np.int64), len(LaneType), "map_features.lane.type"
     )
-    return road, index
-
-
-def _ids(references: Iterable[Any]) -> Iterator[int]:
-    for reference in references:
-        yield reference if isinstance(reference, int) else reference.feature_id
+    lanes = [
+        Lane(
+            name=lane_id,
+            line=_points(lane.polyline),
+            kind=kind,
+            speed_limit=lane.speed_limit_mph * MPS_PER_MPH or np.nan,
+            successors=lane.exit_lanes,
+            left=[neighbor.feature_id for neighbor in lane.left_neighbors],
+            right=[neighbor.feature_id for neighbor in lane.right_neighbors],
+        )
+        for (lane_id, lane), kind in zip(found, types.tolist(), strict=True)
+    ]
+    return lanes, edges, marks
 
 
 def _signals(
-    scenario: pb.Scenario, steps: int, lane_index: dict[int, int], road: RoadMap, origin: Doubles
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.uint8]]:
-    """(lane [Q], stop point [Q, 3], state [Q, T]); a lane is listed once."""
+    scenario: pb.Scenario, steps: int, lanes: Sequence[Lane]
+) -> dict[int, tuple[Doubles, NDArray[np.uint8]]]:
+    """Lane -> (stop point [3], state [T])."""
     logged = scenario.dynamic_map_states
     if logged and len(logged) != steps:
         raise DataError(f"{len(logged)} entries for {steps} steps", field="dynamic_map_states")
     _check_count(sum(len(now.lane_states) for now in logged), MAX_LINKS, "dynamic_map_states")
-    rows: dict[int, int] = {}
-    points: list[NDArray[np.float32]] = []
+    index = {lane.name: k for k, lane in enumerate(lanes)}
+    stops: dict[int, Doubles] = {}
     entries: list[tuple[int, int, int]] = []
     for step, now in enumerate(logged):
         for light in now.lane_states:
-            lane = lane_index.get(light.lane)
-            if lane is None:
-                continue
-            if lane not in rows:
-                rows[lane] = len(rows)
-                stop = _points([light.stop_point])[0] - origin if light.HasField("stop_point") else None
-                points.append(road.lanes[lane][0] if stop is None else to_float32(stop))
-            entries.append((rows[lane], step, light.state))
-    check_signals(len(rows), steps, "dynamic_map_states")
+            lane = index.get(light.lane)
+            if lane is not None:
+                if lane not in stops:
+                    given = light.HasField("stop_point")
+                    stops[lane] = _points([light.stop_point])[0] if given else lanes[lane].line[0]
+                entries.append((lane, step, light.state))
+    check_signals(len(stops), steps, "dynamic_map_states")
     table = np.array(entries, np.int64).reshape(-1, 3)
-    state = np.full((len(rows), steps), SignalState.UNKNOWN, np.uint8)
-    state[table[:, 0], table[:, 1]] = codes(table[:, 2], len(SignalState), "dynamic_map_states.state")
-    return (
-        np.array(list(rows), np.int32),
-        np.array(points, np.float32).reshape(-1, 3),
-        state,
-    )
+    states = codes(table[:, 2], len(SignalState), "dynamic_map_states.state")
+    found = {lane: np.full(steps, SignalState.UNKNOWN, np.uint8) for lane in stops}
+    for (lane, step, _), state in zip(entries, states.tolist(), strict=True):
+        found[lane][step] = state
+    return {lane: (stops[lane], found[lane]) for lane in stops}

@@ -9,7 +9,6 @@ differences along the last axis (``delta``).
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import math
 import zlib
@@ -22,12 +21,13 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, Polylines, RunSegment
 from symphony.errors import DataError
-from symphony.render.roads import BIKE_WIDTH, DEFAULT_WIDTH
 
 if TYPE_CHECKING:
     from symphony.saved.rollouts import SavedRollouts, SavedTrees
 
 _TYPES = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
+DEFAULT_WIDTH, BIKE_WIDTH = 3.6, 1.6
+"""Metres, for lanes whose width the source does not give."""
 MILLIMETRE = 1e-3
 ANGLE = 1e-4
 """Radians that headings are rounded to."""
@@ -180,27 +180,3 @@ def _pack_trees(packer: _Packer, trees: SavedTrees) -> dict[str, Any]:
     _, periods, branches = trees.parents.shape
     leaves = trees.slots.shape[-1]
     return {"periods": periods, "branches": branches, "leaves": leaves, "prune_every": trees.prune_every}
-
-
-def unpacked(text: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Facts and arrays of a packed segment, as the page reads them.
-
-    Raises:
-        ValueError: the text is damaged.
-    """
-    try:
-        block = zlib.decompress(base64.b64decode(text, validate=True))
-        length = int.from_bytes(block[:4], "little")
-        header = json.loads(block[4 : 4 + length])
-    except (binascii.Error, zlib.error, ValueError) as error:
-        raise ValueError(f"not a packed segment ({error})") from error
-    found = {}
-    for item in header["arrays"]:
-        count = math.prod(item["shape"])
-        raw = np.frombuffer(block, _TYPES[item["type"]], count, 4 + length + item["offset"]).reshape(
-            item["shape"]
-        )
-        if item.get("delta"):
-            raw = raw.cumsum(-1)
-        found[item["name"]] = raw * item["scale"] if item.get("scale") else raw
-    return header["facts"], found

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.demand import write_demand
 from symphony.data.sources.sumo.extract import DT, STATES, CropRule, crop_rule, cut_segments
-from symphony.data.sources.sumo.freeways import RAMP_RADIUS, ramp
-from symphony.data.sources.sumo.networks import NETWORKS
+from symphony.data.sources.sumo.networks import NETWORKS, RAMP_RADIUS, freeway, is_own, kind_name, own_network
 from symphony.data.sources.sumo.process import scratch, sumo_home, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.simulate import simulate_traffic
@@ -27,16 +27,21 @@ __all__ = [
     "CropRule",
     "Generated",
     "crop_rule",
-    "generate",
     "generate_run",
+    "is_own",
+    "kind_name",
     "sumo_home",
     "sumo_version",
 ]
 
 KINDS = tuple(NETWORKS)
-"""Kinds of network that :func:`generate` knows."""
+"""Kinds of network that :func:`generate_run` knows."""
 WARM_UP = 30.0
 """Simulated seconds before the first segment starts, at least."""
+_OWN = 4
+"""Number of roads of one's own among the kinds; 3 was one that is gone."""
+_OWN_FILLS = 3
+"""Times as long a warm-up for roads of one's own, which may be larger."""
 SUBLANE_SHARE = 1 / 3
 _SLOW = 10.0
 """m/s at which a longer freeway fills during a longer warm-up."""
@@ -55,31 +60,6 @@ class Generated:
     reasons: Counter[str] = field(default_factory=Counter)
 
 
-def generate(
-    kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None
-) -> list[RunSegment]:
-    """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
-
-    The light of a movement is attached to the connector lane inside the junction, which only that movement
-    takes; its stop point is the end of the lane before. Equal arguments give equal segments.
-
-    Args:
-        kind: one of :data:`KINDS`.
-        seed: of every random choice; another seed is another network.
-        duration: recorded seconds, after a warm-up.
-        rule: how maps and egos are chosen, and how long segments are (:func:`crop_rule`); the kind's own for
-            10 s where not given.
-
-    Returns:
-        Validated segments; those of one focus share one map object.
-
-    Raises:
-        ConfigError: unknown kind, a bad duration or seed.
-        DataError: SUMO is not installed or failed (with its message).
-    """
-    return generate_run(kind, seed, duration, rule=rule).segments
-
-
 def generate_run(
     kind: str,
     seed: int,
@@ -88,11 +68,26 @@ def generate_run(
     rule: CropRule | None = None,
     straight: float = 1.0,
 ) -> Generated:
-    """As :func:`generate`, with the reasons for which windows were left out.
+    """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
 
-    Routes go straight on at a junction ``straight`` times as likely as they take one of the turns.
+    The light of a movement is attached to the connector lane inside the junction, which only that movement
+    takes; its stop point is the end of the lane before. Equal arguments give equal segments. Segments of one focus
+    share one map object.
+
+    Args:
+        kind: one of :data:`KINDS`, or a file of roads of one's own (:data:`.networks.OWN_ROADS`).
+        seed: of every random choice; another seed is another network.
+        duration: recorded seconds, after a warm-up.
+        rule: how maps and egos are chosen, and how long segments are (:func:`crop_rule`); the kind's own for
+            10 s where not given.
+        straight: how many times likelier a route goes straight on at a junction than it takes one of the turns.
+
+    Raises:
+        ConfigError: unknown kind, a bad duration or seed.
+        DataError: SUMO is not installed or failed (with its message).
     """
-    if kind not in NETWORKS:
+    own = is_own(kind)
+    if kind not in NETWORKS and not own:
         raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
     rule = rule or crop_rule(kind)
     if not duration >= rule.steps * DT:
@@ -100,19 +95,25 @@ def generate_run(
     if seed < 0:
         raise ConfigError(f"seed must not be negative, is {seed}")
     roads_rng, demand_rng, drive_rng, cut_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence([seed, KINDS.index(kind)]).spawn(4)
+        np.random.default_rng(s)
+        for s in np.random.SeedSequence([seed, _OWN if own else KINDS.index(kind)]).spawn(4)
     )
     with scratch() as folder:
         # A freeway must be longer than the map: what its ends do to traffic is not for a segment to show.
         longer = max(0.0, rule.radius - RAMP_RADIUS) if kind == "ramp" else 0.0
-        file = ramp(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
+        if own:
+            file = own_network(Path(kind), folder)
+        else:
+            file = freeway(roads_rng, folder, longer) if kind == "ramp" else NETWORKS[kind](roads_rng, folder)
         network = read_network(file)
+        # Where streets end at the edge of the map, traffic comes from there; else it circulates.
+        through = kind == "ramp" or (own and bool(network.sources()))
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
-        warm_up = WARM_UP + longer / _SLOW
+        warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration
-        demand = write_demand(
-            network, demand_rng, folder, end, through=kind == "ramp", sublane=sublane, straight=straight
+        routes, size = write_demand(
+            network, demand_rng, folder, end, through=through, sublane=sublane, straight=straight
         )
-        traffic = simulate_traffic(file, network, demand, drive_rng, end, warm_up, sublane=sublane)
-    segments, reasons = cut_segments(f"sumo-{kind}-{seed:06d}", network, traffic, cut_rng, rule)
+        traffic = simulate_traffic(file, network, routes, size, drive_rng, end, warm_up, sublane=sublane)
+    segments, reasons = cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)
     return Generated(segments, reasons)

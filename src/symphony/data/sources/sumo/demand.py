@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.sources.sumo.roads import Network
+
+Doubles = NDArray[np.float64]
+Chances = list[Doubles] | None
 
 # Share, (least, most) length, width and height in metres, SUMO's vehicle class.
 _BODIES = (
@@ -25,17 +27,7 @@ DEPART_WITHIN = 15.0
 """Seconds in which the vehicles of a closed network enter it."""
 
 
-@dataclass(frozen=True)
-class Demand:
-    """What was asked of SUMO: vehicle k (its id in SUMO) has the box ``size[k]`` (length, width, height)."""
-
-    file: Path
-    size: NDArray[np.float32]
-
-
-def _types(
-    rng: np.random.Generator, sublane: bool
-) -> tuple[list[str], NDArray[np.float32], NDArray[np.float64]]:
+def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], NDArray[np.float32], Doubles]:
     """XML, boxes [TYPES, 3] and shares [TYPES] of the vehicle types."""
     # At least one type per body, so that a run's mix has all of them.
     bodies = np.concatenate([np.arange(len(_BODIES)), rng.choice([0, 0, 0, 0, 1, 2], TYPES - len(_BODIES))])
@@ -62,14 +54,11 @@ def _walk(
     rng: np.random.Generator,
     start: int,
     following: list[list[int]],
-    chance: list[NDArray[np.float64]] | None,
-    length: NDArray[np.float64],
+    chance: Chances,
+    length: Doubles,
     reach: float,
 ) -> list[int]:
-    """Edges of a random walk until it is ``reach`` metres long or ends.
-
-    Of the edges that follow each has its ``chance``, the same one where none are given.
-    """
+    """Edges of a random walk until it is ``reach`` metres long or ends; next edges are as likely without a chance."""
     route, total = [start], float(length[start])
     while total < reach and following[route[-1]]:
         at = route[-1]
@@ -81,7 +70,7 @@ def _walk(
     return route
 
 
-def _chances(network: Network, following: list[list[int]], straight: float) -> list[NDArray[np.float64]]:
+def _chances(network: Network, following: list[list[int]], straight: float) -> list[Doubles]:
     """Per edge, the chances of the edges that follow: ``straight`` for the one straight on, to 1 for a turn."""
     first, last = network.edge_headings()
     chances = []
@@ -101,29 +90,21 @@ def write_demand(
     through: bool,
     sublane: bool,
     straight: float = 1.0,
-) -> Demand:
-    """Write vehicle types and vehicles with their routes.
+) -> tuple[Path, NDArray[np.float32]]:
+    """Write vehicle types and vehicles, with routes that last for so many seconds, into ``traffic.rou.xml``.
 
-    Args:
-        network: the roads.
-        rng: source of every random choice.
-        folder: where ``traffic.rou.xml`` is written.
-        duration: simulated seconds that the routes must last.
-        through: traffic enters at the sources of the network during the whole run and leaves it at the end;
-            else a fixed number of vehicles starts everywhere and circulates.
-        sublane: the run uses the sublane model.
-        straight: how many times likelier a route goes straight on at a junction than it takes one of the turns.
+    If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; else a
+    fixed number of vehicles starts everywhere and circulates. A route goes straight on at a junction so many times
+    likelier than it takes one of the turns. Gives the file, and of vehicle k (its id in SUMO) the box ``size[k]``.
     """
     types, sizes, shares = _types(rng, sublane)
     following, length, lanes = network.edge_graph()
     speed = network.edge_speed()
     chance = None if straight == 1.0 else _chances(network, following, straight)
     if through:
-        # Sources are edges nothing leads into; each lane carries 600-1 300 vehicles per hour.
-        entered = {edge for edges in following for edge in edges}
-        sources = [edge for edge in range(len(length)) if lanes[edge] > 0 and edge not in entered]
+        # Each lane carries 600-1 300 vehicles per hour.
         departs, starts = [], []
-        for edge in sources:
+        for edge in network.sources():
             flow = lanes[edge] * rng.uniform(600, 1300) / 3600
             times = np.cumsum(rng.exponential(1 / flow, int(flow * duration * 1.5) + 5))
             departs += times[times < duration].tolist()
@@ -148,4 +129,4 @@ def write_demand(
         )
     file = folder / "traffic.rou.xml"
     file.write_text("\n".join([*lines, "</routes>"]))
-    return Demand(file, sizes[kinds])
+    return file, sizes[kinds]

@@ -9,10 +9,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from symphony.data.segment import AgentType, RunSegment, validate
+from symphony.data.overlaps import box_depth
+from symphony.data.segment import AgentType, Bools, RunSegment, validate
 from symphony.data.selection import MOVING
 from symphony.data.sources.sumo.roads import Crop, Network, crop_network
 from symphony.data.sources.sumo.simulate import STEP, Traffic
+
+Doubles = NDArray[np.float64]
 
 DT = 0.2
 STATES = 51
@@ -59,7 +62,6 @@ RULES = {
     "town": CropRule(),
     "grid": CropRule(),
     "ramp": CropRule(radius=190, ego_radius=165, agent_radius=180, focuses=4),
-    "random": CropRule(),
 }
 """Defaults per kind of network: freeways need longer maps for the same ten seconds."""
 _GROWTH = {"ramp": 13.5}
@@ -73,50 +75,21 @@ def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRul
     Longer segments get larger maps, so that a vehicle which drives on has road ahead of it to the end, and from
     fewer points of the network, as those maps overlap more.
     """
-    rule = RULES[kind]
+    rule = RULES.get(kind, CropRule())
     more = max(0.0, seconds - 10.0)
     grown = more * _GROWTH.get(kind, _TOWN_GROWTH)
-    return replace(
-        rule,
-        radius=rule.radius + grown,
-        ego_radius=rule.ego_radius + grown,
-        agent_radius=rule.agent_radius + grown,
-        steps=round(seconds / DT) + 1,
-        interactive=interactive,
-    )
-
-
-@dataclass(frozen=True)
-class _Tracks:
-    """Traffic at the steps of segments, shapes as in :class:`Traffic`; ``unphysical`` is [V, N]."""
-
-    position: NDArray[np.float64]
-    heading: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    present: NDArray[np.bool_]
-    unphysical: NDArray[np.bool_]
-    size: NDArray[np.float32]
-    lights: dict[str, NDArray[np.uint8]]
+    radii = {name: getattr(rule, name) + grown for name in ("radius", "ego_radius", "agent_radius")}
+    return replace(rule, **radii, steps=round(seconds / DT) + 1, interactive=interactive)
 
 
 def cut_segments(
     name: str, network: Network, traffic: Traffic, rng: np.random.Generator, rule: CropRule
 ) -> tuple[list[RunSegment], Counter[str]]:
-    """Cut segments, one ego each, from windows that do not overlap at each focus.
+    """Cut segments, one ego each, from windows that do not overlap at each focus; also says why windows gave none.
 
     Segments of one focus share one :class:`RoadMap` object and one origin.
-
-    Args:
-        name: start of the segments' names.
-        network: the roads.
-        traffic: the simulation.
-        rng: source of every random choice.
-        rule: how maps and egos are chosen.
-
-    Returns:
-        The segments, and why windows gave none.
     """
-    tracks = _at_steps(traffic)
+    tracks, wild = _at_steps(traffic)
     segments: list[RunSegment] = []
     reasons: Counter[str] = Counter()
     for focus, center in enumerate(_focuses(network, rng, rule)):
@@ -128,7 +101,7 @@ def cut_segments(
         for window, start in enumerate(range(offset, last + 1, rule.steps)):
             if found == rule.per_focus:
                 break
-            result = _cut(f"{name}-f{focus}-w{window:02d}", crop, tracks, start, rng, rule)
+            result = _cut(f"{name}-f{focus}-w{window:02d}", crop, tracks, wild, start, rng, rule)
             if isinstance(result, str):
                 reasons[result] += 1
             else:
@@ -137,9 +110,9 @@ def cut_segments(
     return segments, reasons
 
 
-def _focuses(network: Network, rng: np.random.Generator, rule: CropRule) -> list[NDArray[np.float64]]:
+def _focuses(network: Network, rng: np.random.Generator, rule: CropRule) -> list[Doubles]:
     """Junctions, rounded to metres, at least half a radius apart."""
-    chosen: list[NDArray[np.float64]] = []
+    chosen: list[Doubles] = []
     for center in np.round(rng.permutation(network.centers)):
         near = [float(np.linalg.norm(center - other)) < rule.radius / 2 for other in chosen]
         if len(chosen) < rule.focuses and not any(near):
@@ -147,7 +120,8 @@ def _focuses(network: Network, rng: np.random.Generator, rule: CropRule) -> list
     return chosen
 
 
-def _at_steps(traffic: Traffic) -> _Tracks:
+def _at_steps(traffic: Traffic) -> tuple[Traffic, Bools]:
+    """Traffic at the steps of segments, and which of these states [V, N] are not physical."""
     velocity, heading = traffic.velocity, traffic.heading
     with np.errstate(invalid="ignore"):
         # Over 0.2 s, as the limits were measured.
@@ -157,20 +131,20 @@ def _at_steps(traffic: Traffic) -> _Tracks:
         wild = np.atleast_2d(np.abs(sideways) > MAX_LATERAL_SPEED)
         wild[:, EVERY:] |= np.linalg.norm(acceleration, axis=-1) > MAX_ACCELERATION
         wild[:, EVERY:] |= np.abs(yaw_rate) > MAX_YAW_RATE
-    pick = slice(None, None, EVERY)
-    return _Tracks(
-        traffic.position[:, pick],
-        heading[:, pick],
-        velocity[:, pick],
-        traffic.present[:, pick],
-        wild[:, pick],
-        traffic.size,
-        {light: states[:, pick] for light, states in traffic.lights.items()},
-    )
+    names = ("position", "heading", "velocity", "present")
+    picked = {name: getattr(traffic, name)[:, ::EVERY] for name in names}
+    lights = {light: states[:, ::EVERY] for light, states in traffic.lights.items()}
+    return replace(traffic, time=traffic.time[::EVERY], lights=lights, **picked), wild[:, ::EVERY]
 
 
 def _cut(
-    name: str, crop: Crop, tracks: _Tracks, start: int, rng: np.random.Generator, rule: CropRule
+    name: str,
+    crop: Crop,
+    tracks: Traffic,
+    unphysical: Bools,
+    start: int,
+    rng: np.random.Generator,
+    rule: CropRule,
 ) -> RunSegment | str:
     """One segment, or why there is none."""
     window = slice(start, start + rule.steps)
@@ -191,7 +165,7 @@ def _cut(
         return "no moving ego with a moving partner"
     if (valid[:, 0] & (travel > MOVING)).sum() < rule.interactive:
         return "too few moving vehicles at the first step"
-    wild = bool((tracks.unphysical[agents, window] & valid).any())
+    wild = bool((unphysical[agents, window] & valid).any())
     if wild or _overlap(position, heading, size, valid):
         return "unphysical motion" if wild else "overlap"
     if not shapely.contains_xy(crop.drivable, *position[valid].T).all():
@@ -224,7 +198,7 @@ def _cut(
     )
 
 
-def _travel(position: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _travel(position: Doubles, valid: Bools) -> Doubles:
     """[A] the farthest each vehicle gets from where it is first seen."""
     first = position[np.arange(len(position)), valid.argmax(1)]
     away = np.linalg.norm(position - first[:, None], axis=-1)
@@ -232,18 +206,13 @@ def _travel(position: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[
 
 
 def _interest(
-    position: NDArray[np.float64],
-    heading: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    valid: NDArray[np.bool_],
-    travel: NDArray[np.float64],
-    rule: CropRule,
-) -> NDArray[np.float64]:
+    position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools, travel: Doubles, rule: CropRule
+) -> Doubles:
     """[A] chance of being the ego: turning, closeness to others and changes of speed count; 0 without partner."""
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     distance = np.where(valid[:, None] & valid[None], distance, np.inf)
     distance[np.arange(len(position)), np.arange(len(position))] = np.inf
-    whole: NDArray[np.bool_] = np.all(valid, axis=1)
+    whole: Bools = np.all(valid, axis=1)
     partner = np.flatnonzero(whole & (travel > MOVING))
     has_partner = np.any(distance[:, partner, 0] < rule.partner_distance, axis=1)
     speed = np.where(whole[:, None], np.linalg.norm(velocity, axis=-1), 0)
@@ -253,33 +222,15 @@ def _interest(
     return has_partner * (0.3 + rule.turn_interest * turns + 0.5 * near + 0.5 * changes)
 
 
-def _overlap(
-    position: NDArray[np.float64],
-    heading: NDArray[np.float64],
-    size: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-) -> bool:
+def _overlap(position: Doubles, heading: Doubles, size: NDArray[np.float32], valid: Bools) -> bool:
     """Whether the boxes of two vehicles ever share more than :data:`MAX_OVERLAP` metres."""
     first, second = np.triu_indices(len(position), 1)
-    half = size[:, :2].astype(np.float64) / 2
-    reach = np.linalg.norm(half, axis=-1)
+    sides = size[:, :2].astype(np.float64)
+    reach = np.linalg.norm(sides / 2, axis=-1)
     gap = np.linalg.norm(position[first] - position[second], axis=-1)
-    close = (
-        valid[first]
-        & valid[second]
-        & (np.nan_to_num(gap, nan=np.inf) < (reach[first] + reach[second])[:, None])
-    )
-    pair, step = np.nonzero(close)
+    close = np.nan_to_num(gap, nan=np.inf) < (reach[first] + reach[second])[:, None]
+    pair, step = np.nonzero(valid[first] & valid[second] & close)
     a, b = first[pair], second[pair]
-    between = position[b, step] - position[a, step]
-    depth = np.full(len(pair), np.inf)
-    for owner in (a, b):
-        for turn in (0.0, np.pi / 2):
-            angle = heading[owner, step] + turn
-            axis = np.stack([np.cos(angle), np.sin(angle)], -1)
-            extent = np.zeros(len(pair))
-            for box in (a, b):
-                relative = heading[box, step] - angle
-                extent += half[box, 0] * np.abs(np.cos(relative)) + half[box, 1] * np.abs(np.sin(relative))
-            depth = np.minimum(depth, extent - np.abs((between * axis).sum(-1)))
+    way = position[b, step] - position[a, step]
+    depth = box_depth(way, heading[a, step], sides[a], heading[b, step], sides[b])
     return bool((depth > MAX_OVERLAP).any())

@@ -5,27 +5,90 @@ All networks are for driving on the right. Every random choice comes from the ge
 
 from __future__ import annotations
 
+import re
+import shutil
 import xml.etree.ElementTree as ET  # files are our own
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.sources.sumo.freeways import ramp
-from symphony.data.sources.sumo.plain import COMMON, PlainNetwork, Point
 from symphony.data.sources.sumo.process import run_program
 from symphony.errors import DataError
 
+Point = NDArray[np.float64]
+"""Points [..., 2] in metres."""
+COMMON = (
+    "--no-turnarounds true --junctions.corner-detail 8 --junctions.internal-link-detail 20 "
+    "--junctions.limit-turn-speed 3.5 --default.connection.cont-pos 0 --tls.yellow.time 3 --tls.allred.time 2 "
+    "--no-warnings true"
+)
+"""Options of every network."""
+_THROUGH = 0.75
+"""Cosine of the sharpest bend of an arterial at a junction."""
+_FEWEST_STREETS = 8
 SHARPEST_ANGLE = 1.05
 """Radians between two streets at a junction, at least where one of them is bent."""
 LATERAL_ACCELERATION = 3.0
 """m/s² that the speed limits of curved streets allow for; drivers exceed limits by up to 30 %."""
-_THROUGH = 0.75
-"""Cosine of the sharpest bend of an arterial at a junction."""
-_FEWEST_STREETS = 8
+RAMP_RADIUS = 190.0
+"""Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
+
+
+@dataclass
+class PlainNetwork:
+    """Nodes, edges and explicit connections, as lines of SUMO's plain XML."""
+
+    nodes: list[str] = field(default_factory=list)
+    edges: list[str] = field(default_factory=list)
+    connections: list[str] = field(default_factory=list)
+
+    def node(self, name: str, point: Point, control: str, radius: float | None = None) -> None:
+        """Add a junction."""
+        size = "" if radius is None else f' radius="{radius:.2f}"'
+        self.nodes.append(f'<node id="{name}" x="{point[0]:.2f}" y="{point[1]:.2f}" type="{control}"{size}/>')
+
+    def edge(
+        self,
+        start: str,
+        end: str,
+        *,
+        lanes: int,
+        speed: float,
+        width: float,
+        priority: int,
+        shape: Point,
+        spread: str = "right",
+    ) -> str:
+        """Add a one-way edge and return its id."""
+        name = f"{start}_{end}"
+        points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
+        self.edges.append(
+            f'<edge id="{name}" from="{start}" to="{end}" numLanes="{lanes}" speed="{speed:.2f}" '
+            f'width="{width:.2f}" priority="{priority}" spreadType="{spread}" shape="{points}"/>'
+        )
+        return name
+
+    def connect(self, start: str, end: str, pairs: list[tuple[int, int]]) -> None:
+        """Allow exactly these lane-to-lane connections between two edges."""
+        self.connections += [
+            f'<connection from="{start}" to="{end}" fromLane="{i}" toLane="{j}"/>' for i, j in pairs
+        ]
+
+    def compile(self, folder: Path, options: str) -> Path:
+        """Write the XML and run ``netconvert``; returns the network file."""
+        arguments = f"--output-file net.net.xml {COMMON} {options}"
+        for kind, lines in (("node", self.nodes), ("edge", self.edges), ("connection", self.connections)):
+            if lines:
+                text = "\n".join([f"<{kind}s>", *lines, f"</{kind}s>"])
+                (folder / f"net.{kind[:3]}.xml").write_text(text)
+                arguments += f" --{kind}-files net.{kind[:3]}.xml"
+        run_program("netconvert", arguments, folder)
+        return folder / "net.net.xml"
 
 
 def _signal_layout(rng: np.random.Generator) -> str:
@@ -143,12 +206,11 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
         main = is_main(a, b)
         lanes, speed = arterial if main else collector
         links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
-
     return _build(rng, folder, nodes, links, width)
 
 
 def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Link], width: float) -> Path:
-    """Compile two-way streets with junctions of mixed control and roundabouts where they meet."""
+    """The network of some two-way streets, with lights, roundabouts and other junctions at its nodes."""
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
     for link in links:
@@ -158,13 +220,13 @@ def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Li
         if link.b in rings:
             end, line = rings[link.b].enter(end, line[::-1])
             line = line[::-1]
+        priority = 5 if link.arterial else 3
         for ends, shape in (((start, end), line), ((end, start), line[::-1])):
-            priority = 5 if link.arterial else 3
             net.edge(*ends, lanes=link.lanes, speed=link.speed, width=width, priority=priority, shape=shape)
     for ring in rings.values():
         ring.write(net, width + 0.8)
-    options = ["--tls.layout", _signal_layout(rng), "--default.junctions.radius", f"{rng.uniform(5, 10):.2f}"]
-    return net.compile(folder, options)
+    layout = _signal_layout(rng)
+    return net.compile(folder, f"--tls.layout {layout} --default.junctions.radius {rng.uniform(5, 10):.2f}")
 
 
 @dataclass
@@ -237,28 +299,95 @@ def grid(rng: np.random.Generator, folder: Path) -> Path:
     controls = ["traffic_light", "priority", "allway_stop", "right_before_left"]
     control = str(rng.choice(controls, p=[0.4, 0.2, 0.2, 0.2]))
     length, spread = rng.uniform(100, 140), rng.uniform(4, 12)
-    arguments = [
-        "--grid",
-        "--grid.x-number",
-        str(rng.integers(3, 5)),
-        "--grid.y-number",
-        str(rng.integers(3, 5)),
-    ]
-    arguments += [
-        "--grid.x-length",
-        f"{length:.2f}",
-        "--grid.y-length",
-        f"{length * rng.uniform(0.85, 1.2):.2f}",
-    ]
-    arguments += ["--turn-lanes", "1", "--turn-lanes.length", f"{rng.uniform(30, 45):.1f}"]
-    arguments += ["--perturb-x", f"norm(0,{spread:.2f})", "--perturb-y", f"norm(0,{spread:.2f})"]
-    arguments += ["--default-junction-type", control, "--default.lanenumber", str(rng.integers(1, 3))]
-    arguments += ["--default.lanewidth", f"{rng.uniform(3.2, 3.7):.2f}"]
-    arguments += ["--default.speed", f"{rng.choice([11.18, 13.89]):.2f}"]
-    arguments += ["--default.junctions.radius", f"{rng.uniform(5, 10):.2f}"]
-    arguments += ["--tls.layout", _signal_layout(rng), "--seed", str(rng.integers(1, 2**30))]
-    run_program("netgenerate", [*arguments, "--output-file", "net.net.xml", *COMMON], folder)
+    x, y = rng.integers(3, 5), rng.integers(3, 5)
+    arguments = f"--grid --grid.x-number {x} --grid.y-number {y} --grid.x-length {length:.2f}"
+    arguments += f" --grid.y-length {length * rng.uniform(0.85, 1.2):.2f}"
+    arguments += f" --turn-lanes 1 --turn-lanes.length {rng.uniform(30, 45):.1f}"
+    arguments += f" --perturb-x norm(0,{spread:.2f}) --perturb-y norm(0,{spread:.2f})"
+    arguments += f" --default-junction-type {control} --default.lanenumber {rng.integers(1, 3)}"
+    arguments += (
+        f" --default.lanewidth {rng.uniform(3.2, 3.7):.2f} --default.speed {rng.choice([11.18, 13.89]):.2f}"
+    )
+    arguments += f" --default.junctions.radius {rng.uniform(5, 10):.2f} --tls.layout {_signal_layout(rng)}"
+    arguments += f" --seed {rng.integers(1, 2**30)} --output-file net.net.xml {COMMON}"
+    run_program("netgenerate", arguments, folder)
     return folder / "net.net.xml"
+
+
+def freeway(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path:
+    """Two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
+
+    All ends, those of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
+    """
+    net = PlainNetwork()
+    width = rng.uniform(3.5, 3.75)
+    speed = float(rng.choice([24.6, 26.8, 29.1]))
+    direction = rng.uniform(0, 2 * np.pi)
+    # A longer road turns as much, not more.
+    curvature = rng.uniform(-1, 1) / 1500 * (600 / (600 + longer))
+    for side in range(2):
+        lanes = int(rng.integers(2, 4))
+        road, bend = (lanes, speed, width), curvature * (1 - 2 * side)
+        _carriageway(net, rng, side, road, direction + side * np.pi, bend, longer)
+    return net.compile(folder, "--default.junctions.radius 4 --junctions.scurve-stretch 1.5")
+
+
+def _carriageway(
+    net: PlainNetwork,
+    rng: np.random.Generator,
+    side: int,
+    road: tuple[int, float, float],
+    direction: float,
+    curvature: float,
+    longer: float,
+) -> None:
+    """One direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
+    lanes, speed, width = road
+    weaving = rng.random() < 0.4
+    stations = np.cumsum([0, 300 + longer, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
+    stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
+    stations = np.append(stations, stations[-1] + 300 + longer)
+    shift = stations[-1] / 2
+    median = 5.0
+
+    def along(s: NDArray[np.float64], right: float | NDArray[np.float64]) -> Point:
+        """Points at stations s, so far to the right of the edge of the median."""
+        u = s - shift
+        x, y = u, curvature * u**2 / 2
+        normal = np.stack([curvature * u, -np.ones_like(u)], -1)
+        out = np.stack([x, y], -1) + normal * (median + np.asarray(right))[..., None]
+        spin = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
+        return out @ spin.T
+
+    marks = stations[[0, 1, 2, 5] if weaving else [0, 1, 2, 3, 4, 5]].tolist()
+    extra = [0, 1, 0] if weaving else [0, 1, 0, 1, 0]
+    names = [f"c{side}m{k}" for k in range(len(marks))]
+    for name, mark in zip(names, marks, strict=True):
+        net.node(name, along(np.array([mark]), 0.0)[0], "priority")
+    ids = []
+    for k, more in enumerate(extra):
+        # The line given to SUMO is the left edge of the carriageway (spread to the right).
+        line = along(np.linspace(marks[k], marks[k + 1], 12), 0.0)
+        ends, total = (names[k], names[k + 1]), lanes + more
+        ids.append(net.edge(*ends, lanes=total, speed=speed, width=width, priority=9, shape=line))
+    for k in range(len(extra) - 1):
+        pairs = [(i + extra[k], i + extra[k + 1]) for i in range(lanes)]
+        net.connect(ids[k], ids[k + 1], pairs)
+
+    ramp_speed, edge = rng.uniform(15.5, 20), lanes * width
+    on, off = 1, len(extra) - 1
+    # Ramps are longer than a crop's radius, so that their ends are never on a map.
+    reach = np.linspace(1.7, 0, 20)
+    far = 150 + longer
+    gap = (3 * reach + 30 * reach**2) * (far / 150)
+    start = along(marks[on] - far * reach, edge + gap)
+    end = along(marks[off] + far * reach[::-1], edge + gap[::-1])
+    net.node(f"c{side}on", start[0], "priority")
+    net.node(f"c{side}off", end[-1], "priority")
+    ramp = partial(net.edge, lanes=1, speed=ramp_speed, width=width, priority=4)
+    first, last = ramp(f"c{side}on", names[on], shape=start), ramp(names[off], f"c{side}off", shape=end)
+    net.connect(first, ids[on], [(0, 0)])
+    net.connect(ids[off - 1], last, [(0, 0)])
 
 
 def random(rng: np.random.Generator, folder: Path) -> Path:
@@ -279,13 +408,13 @@ def random(rng: np.random.Generator, folder: Path) -> Path:
 def _grown(rng: np.random.Generator, folder: Path) -> tuple[Point, list[tuple[int, int]]]:
     """Nodes [N, 2] and the two-way streets between them, from a random network; no street ends nowhere."""
     nearest = rng.uniform(65, 85)
-    arguments = ["--rand", "--rand.iterations", str(rng.integers(25, 50)), "--rand.num-tries", "60"]
-    arguments += ["--rand.min-distance", f"{nearest:.2f}", "--rand.max-distance", f"{nearest * 1.8:.2f}"]
-    arguments += ["--rand.min-angle", "65", "--rand.connectivity", "0.98"]
+    arguments = f"--rand --rand.iterations {rng.integers(25, 50)} --rand.num-tries 60 "
+    arguments += f"--rand.min-distance {nearest:.2f} --rand.max-distance {nearest * 1.8:.2f} "
+    arguments += "--rand.min-angle 65 --rand.connectivity 0.98 "
     for arms, chance in enumerate((0, 0, 5, 10, 1, 0), start=1):
-        arguments += [f"--rand.neighbor-dist{arms}", str(chance)]
-    arguments += ["--seed", str(rng.integers(1, 2**30)), "--output-file", "grown.net.xml"]
-    run_program("netgenerate", [*arguments, "--plain-output-prefix", "grown"], folder)
+        arguments += f"--rand.neighbor-dist{arms} {chance} "
+    arguments += f"--seed {rng.integers(1, 2**30)} --output-file grown.net.xml --plain-output-prefix grown"
+    run_program("netgenerate", arguments, folder)
     places = {
         node.attrib["id"]: np.array([float(node.attrib["x"]), float(node.attrib["y"])])
         for node in ET.parse(folder / "grown.nod.xml").getroot().iter("node")  # noqa: S314
@@ -330,10 +459,44 @@ def _through_road(
     return road
 
 
+OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
+"""Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
+
+
+def is_own(kind: str) -> bool:
+    """Whether a kind of network is a file of the user's."""
+    return kind.endswith(tuple(OWN_ROADS))
+
+
+def kind_name(kind: str) -> str:
+    """A kind as part of a segment's name: of a file its own name, without folder and ending."""
+    if not is_own(kind):
+        return kind
+    ending = next(ending for ending in OWN_ROADS if kind.endswith(ending))
+    return re.sub(r"[^A-Za-z0-9_]+", "_", Path(kind).name.removesuffix(ending))
+
+
+def own_network(file: Path, folder: Path) -> Path:
+    """Roads of the user's as a SUMO network, with the lanes for cars; a :class:`DataError` names the file."""
+    if not file.is_file():
+        raise DataError("no such file", file=file)
+    ending, option = next(entry for entry in OWN_ROADS.items() if file.name.endswith(entry[0]))
+    shutil.copyfile(file, folder / f"own{ending}")
+    arguments = f"{option} own{ending} --output-file net.net.xml {COMMON}"
+    arguments += " --keep-edges.by-vclass passenger --remove-edges.isolated true"
+    if ending == ".osm":
+        arguments += " --geometry.remove true --junctions.join true --tls.guess-signals true"
+    try:
+        run_program("netconvert", arguments, folder)
+    except DataError as error:
+        raise error.at(file=file) from error
+    return folder / "net.net.xml"
+
+
 NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
     "town": town,
     "grid": grid,
-    "ramp": ramp,
+    "ramp": freeway,
     "random": random,
 }
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

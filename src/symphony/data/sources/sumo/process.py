@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from symphony import files
 from symphony.data import store_format
@@ -48,11 +49,7 @@ def _remove_left(folder: Path) -> None:
 
 @cache
 def sumo_home() -> Path:
-    """Folder of the installed SUMO.
-
-    Raises:
-        DataError: the optional dependency is not installed.
-    """
+    """Folder of the installed SUMO; a :class:`DataError` where it is not installed."""
     spec = importlib.util.find_spec("sumo")
     folders = [Path(p) for p in (spec.submodule_search_locations or [])] if spec is not None else []
     for folder in folders:
@@ -63,39 +60,23 @@ def sumo_home() -> Path:
 
 @cache
 def sumo_version() -> str:
-    """Version of the installed SUMO, such as "1.28.0".
-
-    Raises:
-        DataError: the optional dependency is not installed.
-    """
+    """Version of the installed SUMO, such as "1.28.0"."""
     sumo_home()
     return importlib.metadata.version("eclipse-sumo")
 
 
-def run_program(name: str, arguments: list[str], folder: Path) -> str:
-    """Run one of SUMO's programs in a folder and return its standard error.
-
-    Raises:
-        DataError: the program failed or ran out of time; the message ends with its standard error.
-    """
+def run_program(name: str, arguments: str, folder: Path) -> None:
+    """Run one of SUMO's programs in a folder; a :class:`DataError` ends with what it said where it failed."""
     home = sumo_home()
+    command = [str(home / "bin" / name), *arguments.split(), "--xml-validation", "never"]
     environment = {**os.environ, "SUMO_HOME": str(home)}
-    command = [str(home / "bin" / name), *arguments, "--xml-validation", "never"]
+    options: Any = {"capture_output": True, "text": True, "timeout": TIMEOUT_SECONDS}
     try:
         # The program comes from the installed wheel and the arguments are ours.
-        done = subprocess.run(  # noqa: S603
-            command,
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=TIMEOUT_SECONDS,
-        )
+        done = subprocess.run(command, cwd=folder, env=environment, check=False, **options)  # noqa: S603
     except subprocess.TimeoutExpired as error:
         raise DataError(f"{name} did not finish within {TIMEOUT_SECONDS:.0f} s") from error
     except OSError as error:
         raise DataError(f"{name} could not be started: {error}") from error
     if done.returncode != 0:
         raise DataError(f"{name} failed with exit status {done.returncode}:\n{done.stderr[-4000:].strip()}")
-    return done.stderr

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.polygon import orient
 
+from symphony.data.levels import shares
 from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap
-from symphony.geometry.spans import spans
 
 Line = NDArray[np.float64]
 _DEFAULT_WIDTH = 3.2
@@ -56,6 +56,12 @@ class Network:
     junction_shapes: list[Line]
     centers: Line
 
+    def sources(self) -> list[int]:
+        """Edges for traffic that nothing leads into."""
+        following, _, lanes = self.edge_graph()
+        entered = {edge for edges in following for edge in edges}
+        return [edge for edge in range(len(lanes)) if lanes[edge] > 0 and edge not in entered]
+
     def edge_graph(self) -> tuple[list[list[int]], NDArray[np.float64], NDArray[np.int64]]:
         """Of the edges outside junctions: those that follow each, its length and its number of lanes.
 
@@ -73,7 +79,7 @@ class Network:
             following[self.edge[a]].add(int(self.edge[target]))
         length, lanes = np.zeros(count), np.zeros(count, np.int64)
         for k in np.flatnonzero(~self.internal):
-            length[self.edge[k]] = _length(self.lanes[k])
+            length[self.edge[k]] = np.linalg.norm(np.diff(self.lanes[k], axis=0), axis=-1).sum()
             lanes[self.edge[k]] += 1
         return [sorted(f) for f in following], length, lanes
 
@@ -93,10 +99,6 @@ class Network:
         speed = np.zeros(len(self.edge_names))
         np.maximum.at(speed, self.edge, self.speed)
         return speed
-
-
-def _length(line: Line) -> float:
-    return float(np.linalg.norm(np.diff(line, axis=0), axis=-1).sum())
 
 
 def _shape(text: str) -> Line:
@@ -176,7 +178,6 @@ class Crop:
     Attributes:
         road: the map, with ``center`` as its origin.
         center: [2] in the network's frame.
-        radius: metres; lanes outside junctions are cut there.
         signals: per light on the map, (traffic light, link index).
         signal_lane: [Q] the connector it controls.
         signal_point: [Q, 3] the stop point: end of the lane that leads to the connector.
@@ -185,7 +186,6 @@ class Crop:
 
     road: RoadMap
     center: Line
-    radius: float
     signals: list[tuple[str, int]]
     signal_lane: NDArray[np.int32]
     signal_point: NDArray[np.float32]
@@ -246,7 +246,6 @@ def crop_network(network: Network, center: Line, radius: float) -> Crop:
     return Crop(
         road,
         center,
-        radius,
         [(light, number) for light, number, _, _ in controlled],
         np.array([lane for _, _, lane, _ in controlled], np.int32),
         np.array([[*point, 0] for *_, point in controlled], np.float32).reshape(-1, 3),
@@ -311,19 +310,14 @@ def _subdivide(line: Line, spacing: float) -> Line:
     step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
     count = np.maximum(1, np.ceil(step / spacing)).astype(int)
     start = np.repeat(np.arange(len(step)), count)
-    share = spans(0, count) / count[start]
-    return np.concatenate([line[start] + share[:, None] * np.diff(line, axis=0)[start], line[-1:]])
+    return np.concatenate([line[start] + shares(count)[:, None] * np.diff(line, axis=0)[start], line[-1:]])
 
 
 def _runs(ring: Line, inside: NDArray[np.bool_]) -> list[Line]:
-    """Stretches of a closed ring that are inside."""
+    """Stretches of a closed ring of at least two points that are inside."""
     if inside.all():
         return [ring]
-    if not inside.any():
-        return []
-    ring, inside = ring[:-1], inside[:-1]
     shift = int(np.argmin(inside))
-    ring, inside = np.roll(ring, -shift, axis=0), np.roll(inside, -shift)
-    starts = np.flatnonzero(~inside[:-1] & inside[1:]) + 1
-    ends = np.append(np.flatnonzero(inside[:-1] & ~inside[1:]) + 1, len(ring) if inside[-1] else [])
-    return [ring[a:b] for a, b in zip(starts, ends.astype(int), strict=True) if b - a >= 2]
+    ring, inside = np.roll(ring[:-1], -shift, axis=0), np.roll(inside[:-1], -shift)
+    change = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    return [ring[a:b] for a, b in zip(change[::2], change[1::2], strict=True) if b - a >= 2]

@@ -1,0 +1,115 @@
+"""Simulate the included agent by each way to search, and print what each gives and costs as a table.
+
+    python benchmarks/search_table.py --data DIR --out FOLDER      # FOLDER keeps a record of every evaluation
+
+``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are taken) and ``ngsim-test``; the
+included test segments are taken, too. Evaluations whose records are there are not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from symphony import EvaluateConfig, SegmentStore, builtin_store, evaluate, load_agent
+from symphony.envs.scene import SceneBatch
+from symphony.files import write_json
+from symphony.learning.logged import logged
+from symphony.rollouts.unroll import Rollouts
+
+AGENT, ROLLOUTS, NEAR, MOVES = "pretrained:bc_ts_h", 16, 3.0, 5.0
+STORES = {
+    "built-in": (builtin_store("test"), None),
+    "towns": ("town-small/test", 130),
+    "roads": ("ngsim-test", None),
+}
+WAYS: dict[str, dict[str, Any]] = {
+    "no search": {"search": "none"},
+    "tree, by the discriminator": {"search": "tree"},
+    "tree, by flags": {"search": "tree", "score": "flags"},
+    "tree, by the rule": {"search": "tree", "score": "rule"},
+    "back, by the discriminator": {"search": "backtrack"},
+    "back, by the rule": {"search": "backtrack", "score": "rule"},
+}
+FIGURES = {
+    "collisions %": ("collision_rate_at_states", 1),
+    "off-road %": ("offroad_time", 2),
+    "minSADE m": ("min_sade", 2),
+}
+
+
+def along_log(scenes: SceneBatch, rollouts: Rollouts) -> Float[Tensor, "B K"]:
+    """[B, K] 1 where every agent that the log moves by 5 m stays within 3 m of its logged path or straight on from
+    it; NaN where there is none.
+    """
+    log, there = logged(scenes)
+    found = torch.full(rollouts.state.shape[:2], torch.nan)
+    for b, last in enumerate(scenes.last_step.tolist()):
+        for n in scenes.interactive_valid[b].nonzero().flatten().tolist():
+            path = log[b, : last + 1, n][there[b, : last + 1, n]]
+            if len(path) < 2 or (path[-1, :2] - path[0, :2]).norm() < MOVES:
+                continue
+            way = torch.stack([path[-1, 2].cos(), path[-1, 2].sin()])
+            line = torch.cat([path[:, :2], path[-1, :2] + way * torch.arange(1, 61)[:, None]]).double()
+            away = torch.cdist(rollouts.state[b, :, : last + 1, n, :2].double(), line).amin(-1).amax(-1)
+            found[b] = torch.minimum(found[b].nan_to_num(1.0), (away < NEAR).float())
+    return found
+
+
+def some_along_log(scenes: SceneBatch, rollouts: Rollouts) -> Float[Tensor, "B K"]:
+    """[B, K] 1 where :func:`along_log` holds for any of the rollouts of the scene."""
+    each = along_log(scenes, rollouts)
+    return each.amax(1, keepdim=True).expand(each.shape)
+
+
+METRICS = tuple(f"{Path(__file__)}:{metric.__name__}" for metric in (along_log, some_along_log))
+
+
+def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
+    """The numbers of an evaluation, and what it cost."""
+    file = out / f"{store} {way}.json".replace(" ", "-").replace(",", "")
+    if not file.exists():
+        place, count = STORES[store]
+        segments = SegmentStore(data / place)
+        config = EvaluateConfig(rollouts=ROLLOUTS, metric=METRICS, **WAYS[way])
+        found = evaluate(load_agent(AGENT), segments, config, items=None if count is None else range(count))
+        numbers = found.numbers()
+        route = {"along": ROLLOUTS * numbers[METRICS[0]], "any": 100 * numbers[METRICS[1]]}
+        numbers = {name: value for name, value in numbers.items() if not name.startswith(METRICS)}
+        write_json(file, {**numbers, **route, "steps": found.steps, "seconds": found.seconds})
+        print(file, flush=True)
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def main() -> None:
+    """Make what is not there, then the table, a row for each way and store."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    columns = ["", *FIGURES, "steps", "CPU s a segment", f"of {ROLLOUTS} on the log's route", "any %"]
+    lines = [columns, ["---"] * len(columns)]
+    for store in STORES:
+        found = {way: record(given.data, given.out, store, way) for way in WAYS}
+        for way, one in found.items():
+            cells = [
+                f"{one[name]:.{digits}f} ± {one[f'{name}_se']:.{digits}f}"
+                for name, digits in FIGURES.values()
+            ]
+            costs = [one["steps"] / found["no search"]["steps"], one["seconds"] / one["segments"]]
+            cells += [*(f"{cost:.2f}" for cost in costs), f"{one['along']:.1f}", f"{one['any']:.0f}"]
+            lines.append([f"{store}: {way}", *cells])
+    print("\n".join(f"| {' | '.join(line)} |" for line in lines))
+
+
+if __name__ == "__main__":
+    main()

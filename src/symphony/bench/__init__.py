@@ -1,0 +1,1 @@
+"""The test bench for planners: suites of thresholds, what decides them, and what is written of them."""

@@ -1,0 +1,151 @@
+"""How critical logged driving is for the ego: which run segments are the hard ones.
+
+Sources: least time to collision (Hayward 1972), post-encroachment time (Allen, Shin and Cooper 1978).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import torch
+from numpy.typing import NDArray
+
+from symphony.data.levels import agent_heights
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+from symphony.evaluation.contacts import time_to_collision
+from symphony.geometry import levels_apart
+from symphony.saved.world import World
+
+LONGEST = 3.0
+"""Seconds, of time to collision and of encroachment, above which nothing is critical."""
+GENTLE, HARD = 2.0, 6.0
+"""m/s² of braking at which it begins to be critical, and at which it is as critical as a collision."""
+CROSSING = 0.35
+"""Radians between two headings from which one way crosses another."""
+NEAR_EDGE = 0.5
+"""Metres to the road's boundary below which it is critical."""
+
+
+@dataclass(frozen=True)
+class Criticality:
+    """Of the ego's log.
+
+    Attributes:
+        segment: id.
+        time_to_collision: least, seconds; infinite if there is none within 5 s.
+        encroachment: least seconds between the ego's leaving a place and another's arriving there, or the other way
+            around; infinite if they share none within :data:`LONGEST`.
+        braking: most, m/s²; 0 without any.
+        margin: least metres from the ego's box to the road's boundary; infinite without one.
+    """
+
+    segment: str
+    time_to_collision: float
+    encroachment: float
+    braking: float
+    margin: float
+
+    @property
+    def score(self) -> float:
+        """From 0, nothing is critical, to 4, as critical as can be: up to 1 for each of the four."""
+        parts = (
+            1 - self.time_to_collision / LONGEST,
+            1 - self.encroachment / LONGEST,
+            (self.braking - GENTLE) / (HARD - GENTLE),
+            1 - self.margin / NEAR_EDGE,
+        )
+        return sum(max(0.0, min(1.0, part)) for part in parts)
+
+
+def criticality(segment: RunSegment) -> Criticality:
+    """How critical a run segment is for its ego; others on another level do not count."""
+    heights = agent_heights(segment)
+    world = World(
+        segment.position[..., :2].astype(np.float64),
+        segment.heading.astype(np.float64),
+        segment.velocity.astype(np.float64),
+        segment.valid,
+        segment.size[:, :2].astype(np.float64),
+        heights.swapaxes(0, 1) if len(heights) else None,
+    )
+    seen = np.flatnonzero(segment.valid[segment.ego])
+    speed = world.speed[segment.ego, seen]
+    slower = np.diff(speed) / (np.diff(seen) * segment.dt)
+    ego = _boxes(world, segment.ego, seen)
+    edges = [shapely.LineString(line) for line in _lines(segment)]
+    margin = float(shapely.distance(shapely.union_all(edges), ego).min()) if edges and len(ego) else math.inf
+    ttc = time_to_collision(world, np.array([segment.ego]))
+    return Criticality(
+        segment.segment_id,
+        # Boxes that overlap in a log are wrongly measured ones.
+        float(ttc[ttc > 0].min(initial=math.inf)),
+        _encroachment(world, segment, seen, ego),
+        float(-slower.min(initial=0.0)) + 0.0,
+        margin,
+    )
+
+
+def _encroachment(
+    world: World, segment: RunSegment, seen: NDArray[np.int64], ego: NDArray[np.object_]
+) -> float:
+    """Least seconds between the boxes of the ego and of one who crosses its way, at the same place at two steps."""
+    who, step = segment.valid.nonzero()
+    other = who != segment.ego
+    who, step = who[other], step[other]
+    mine, theirs = shapely.STRtree(_boxes(world, who, step)).query(ego, predicate="intersects")
+    apart = np.abs(seen[mine] - step[theirs]) * segment.dt
+    # Who follows in a lane comes to each place soon after: that is a headway.
+    turn = world.heading[segment.ego, seen[mine]] - world.heading[who, step][theirs]
+    crosses = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) > CROSSING
+    if world.height is not None:
+        one, two = world.height[segment.ego, seen[mine]], world.height[who[theirs], step[theirs]]
+        crosses &= ~levels_apart(torch.from_numpy(one), torch.from_numpy(two)).numpy()
+    apart = apart[crosses & (apart > 0)]
+    least = float(apart.min(initial=math.inf))
+    return least if least <= LONGEST else math.inf
+
+
+def _boxes(world: World, row: NDArray[np.int64] | int, step: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Boxes of agents at steps, as polygons."""
+    half = 0.5 * np.broadcast_to(world.size[row], (len(step), 2))
+    corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half[:, None]
+    heading = world.heading[row, step]
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    turned = np.stack(
+        [corner[..., 0] * cos - corner[..., 1] * sin, corner[..., 0] * sin + corner[..., 1] * cos], -1
+    )
+    polygons: NDArray[np.object_] = shapely.polygons(world.position[row, step][:, None] + turned)
+    return polygons
+
+
+def _lines(segment: RunSegment) -> list[NDArray[np.float64]]:
+    boundary = segment.road.boundary
+    return [boundary[k][:, :2].astype(np.float64) for k in range(len(boundary)) if len(boundary[k]) > 1]
+
+
+def hardest(
+    store: SegmentStore,
+    count: int,
+    items: Sequence[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[tuple[int, Criticality]]:
+    """The most critical run segments of a store, the hardest first; equal ones in their order.
+
+    Args:
+        store: the run segments.
+        count: how many, at most.
+        items: rows of the store to choose from; all by default.
+        progress: called with the segments looked at and their total.
+    """
+    rows = range(len(store)) if items is None else items
+    found = []
+    for number, row in enumerate(rows):
+        found.append((row, criticality(store[row])))
+        if progress is not None:
+            progress(number + 1, len(rows))
+    return sorted(found, key=lambda one: -one[1].score)[:count]

@@ -1,0 +1,263 @@
+"""The test bench: suites are checked before they run, verdicts are those of the full sample, files can be read."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers_segments import straight_road
+from helpers_store import fill
+from symphony.bench import run as bench
+from symphony.bench.criticality import hardest
+from symphony.bench.measures import estimate, needed_groups
+from symphony.bench.run import run_suite
+from symphony.bench.suite import read_suite
+from symphony.cli import main
+from symphony.errors import ConfigError, DataError
+from symphony.metrics.intervals import binomial_interval, t_quantile
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SUITE = """
+[suite]
+data = "store"
+rollouts = 2
+confidence = 0.9
+
+[[planner]]
+planner = "log"
+
+[[planner]]
+name = "fast"
+planner = "planners.py:fast"
+
+[[crowd]]
+agent = "playback"
+
+[[threshold]]
+metric = "failed_rate"
+at_most = 80
+
+[[threshold]]
+metric = "log_distance"
+at_most = 0.5
+confidence = false
+planners = ["log"]
+"""
+PLANNERS = """
+def fast(seen):
+    return 4.0, 0.3
+
+def broken(seen):
+    raise RuntimeError("no idea")
+"""
+
+
+@pytest.fixture
+def suite(tmp_path: Path) -> Path:
+    """A suite of six segments, each a group of its own."""
+    roads = [straight_road(2, steps=8, seed=k, segment_id=f"road-{k}") for k in range(6)]
+    fill(tmp_path / "store", roads)
+    (tmp_path / "planners.py").write_text(PLANNERS)
+    (tmp_path / "suite.toml").write_text(SUITE)
+    return tmp_path / "suite.toml"
+
+
+@given(st.lists(st.booleans(), min_size=3, max_size=40), st.sampled_from([0.8, 0.95]))
+def test_rates_of_independent_runs_are_binomial(hits: list[bool], confidence: float) -> None:
+    """One run a group: the bounds are Clopper's and Pearson's, or a little wider."""
+    found = estimate([100.0 * hit for hit in hits], [str(k) for k in range(len(hits))], confidence, "rate")
+    assert None not in (found.low, found.mean, found.high)
+    assert found.low <= found.mean <= found.high
+    n, k = len(hits), sum(hits)
+    two_sided = confidence if k in (0, n) else 2 * confidence - 1
+    low, high = binomial_interval(k, n, two_sided)
+    assert found.low <= 100 * low + 1e-9
+    assert found.high >= 100 * high - 1e-9
+    if k in (0, n):
+        assert (found.low, found.high) == pytest.approx((100 * low, 100 * high))
+
+
+@pytest.mark.parametrize(("rate", "alike"), [(0.05, 0.0), (0.05, 0.6), (0.2, 0.0), (0.2, 0.6), (0.5, 0.9)])
+def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float) -> None:
+    """Also where the runs of a group share their fate; as runs of their own they would not."""
+    rng = np.random.default_rng(0)
+    groups = np.repeat(np.arange(20), 5)
+    held = 0
+    for _ in range(300):
+        shared = rng.random(20)[groups] < rate
+        own = rng.random(100) < rate
+        hit = np.where(rng.random(20)[groups] < alike, shared, own)
+        found = estimate((100.0 * hit).tolist(), groups.astype(str).tolist(), 0.95, "rate")
+        assert found.high is not None
+        held += found.high >= 100 * rate
+    assert held / 300 >= 0.93
+
+
+@given(st.integers(2, 30), st.sampled_from([0.9, 0.95]))
+def test_means_have_students_bounds(count: int, confidence: float) -> None:
+    values = np.random.default_rng(count).normal(size=count)
+    found = estimate(values.tolist(), [str(k) for k in range(count)], confidence)
+    spread = t_quantile(confidence, count - 1) * values.std(ddof=1) / np.sqrt(count)
+    assert found.high == pytest.approx(values.mean() + spread)
+    assert found.low == pytest.approx(values.mean() - spread)
+
+
+@given(st.floats(0.1, 60), st.sampled_from([0.8, 0.95, 0.99]))
+def test_as_many_groups_as_needed_and_no_more(limit: float, confidence: float) -> None:
+    def high(count: int) -> float:
+        found = estimate([0.0] * count, [str(k) for k in range(count)], confidence, "rate").high
+        assert found is not None
+        return found
+
+    needed = needed_groups(limit, confidence)
+    assert high(needed) <= limit * (1 + 1e-9)
+    assert needed == 1 or high(needed - 1) > limit * (1 - 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field", "why"),
+    [
+        ('data = "store"', 'data = "nowhere"', 3, "data", "nowhere"),
+        ('data = "store"', 'data = "builtin:all"', 3, "data", "builtin:train"),
+        ("rollouts = 2", "rollouts = 0", 4, "rollouts", "at least 1"),
+        ("rollouts = 2", "rollout = 2", 4, "rollout", "unknown"),
+        ("confidence = 0.9", "confidence = 95", 5, "confidence", "95"),
+        ("confidence = 0.9", "segments = 7", 5, "segments", "6 segments"),
+        ("confidence = 0.9", 'segments = ["x"]', 5, "segments", "'x'"),
+        ("confidence = 0.9", "hardest = 9", 5, "hardest", "6 segments"),
+        ("confidence = 0.9", 'baseline = "other"', 5, "baseline", "no planner"),
+        ('planner = "log"', 'planner = "logs"', 8, "planner", "logs"),
+        ("planners.py:fast", "planners.py:slow", 12, "planner", "slow"),
+        ('name = "fast"', 'name = "log"', 11, "name", "twice"),
+        ('name = "fast"', 'name = "../fast"', 11, "name", "no name"),
+        ('planner = "planners.py:fast"', "", 10, "planner", "missing"),
+        ('agent = "playback"', 'agent = "nobody"', 15, "agent", "nobody"),
+        ('agent = "playback"', 'agent = "playback"\nsearch = "deep"', 16, "search", "deep"),
+        ('agent = "playback"', 'agent = "playback"\nseeds = 3', 16, "seeds", "unknown"),
+        ('metric = "failed_rate"', 'metric = "fails"', 18, "metric", "failed_rate"),
+        ("at_most = 80", "at_most = 1", 19, "at_most", "at least 230 independent groups"),
+        ("at_most = 80", "at_most = 0", 19, "at_most", "confidence = false"),
+        ("at_most = 80", "at_most = 80\nat_least = 1", 18, "metric", "one of"),
+        ("at_most = 80", "at_most = true", 19, "at_most", "True"),
+        ("at_most = 80", "at_most = 80\ncompared = true", 20, "compared", "no baseline"),
+        ('planners = ["log"]', 'planners = ["logs"]', 25, "planners", "logs"),
+        ("[[crowd]]", "[[crowds]]", 14, "", "unknown table"),
+    ],
+)
+def test_what_is_wrong_is_refused_before_anything_runs(
+    suite: Path, tmp_path: Path, capsys: Any, old: str, new: str, line: int, field: str, why: str
+) -> None:
+    suite.write_text(SUITE.replace(old, new, 1))
+    assert main(["test", str(suite), "--out", str(tmp_path / "out")]) == 2
+    said = re.sub(r"\s+", " ", capsys.readouterr().err)
+    assert f"suite.toml, line {line}" in said
+    assert f", {field}:" in said or not field
+    assert why in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[suite]\n", "[[planner]]\n", "[suite\n", "suite = 3\n", "\0"])
+def test_what_is_no_suite_is_refused(suite: Path, text: str) -> None:
+    suite.write_text(text)
+    with pytest.raises(ConfigError, match=r"suite\.toml"):
+        read_suite(suite)
+
+
+def test_log_playback_passes_and_a_wild_planner_is_judged(suite: Path, tmp_path: Path, capsys: Any) -> None:
+    out, junit = tmp_path / "out", tmp_path / "found.xml"
+    assert main(["test", str(suite), "--out", str(out), "--junit", str(junit)]) == 0
+    found = json.loads((out / "result.json").read_text())
+    assert found["passed"]
+    log, fast = found["pairs"]
+    assert log["numbers"]["log_distance"] == pytest.approx(0, abs=1e-3)
+    assert fast["numbers"]["log_distance"] > 1
+    assert log["numbers"]["pdm_score"] == 100
+    assert fast["numbers"]["pdm_score"] == 0  # it leaves the road
+    assert len(log["per_run"]) == log["planned"] == 12
+    assert "passes" in capsys.readouterr().out
+    tree = ET.fromstring(junit.read_text())  # noqa: S314 - ours
+    assert [case.find("failure") for case in tree.iter("testcase")] == [None] * 3
+    page = (out / "index.html").read_text()
+    assert "http" not in page.replace("https://", "")
+    # Once more: what was simulated is there, and nothing else is found.
+    assert main(["test", str(suite), "--out", str(out)]) == 0
+    again = json.loads((out / "result.json").read_text())
+    assert again["verdicts"] == found["verdicts"]
+
+
+def test_a_suite_of_the_hardest_segments(suite: Path) -> None:
+    suite.write_text(SUITE.replace("rollouts = 2", "rollouts = 2\nhardest = 4"))
+    chosen = read_suite(suite)
+    assert list(chosen.items) == [row for row, _ in hardest(chosen.store, 4)]
+
+
+def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:
+    suite.write_text(SUITE.replace('planners = ["log"]', ""))
+    assert main(["test", str(suite), "--out", str(tmp_path / "out"), "--no-view"]) == 1
+    tree = ET.parse(tmp_path / "out" / "junit.xml")  # noqa: S314 - ours
+    failures = [case.get("classname") for case in tree.iter("testcase") if case.find("failure") is not None]
+    assert failures == ["fast among playback"]
+    assert not (tmp_path / "out" / "log" / "playback" / "view.html").exists()
+
+
+def test_stopping_early_changes_no_verdict(
+    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite.write_text(
+        SUITE.replace("planners.py:fast", "planners.py:broken").replace("80", "20\nconfidence = false")
+    )
+    stopped = run_suite(read_suite(suite), tmp_path / "stopped")
+    monkeypatch.setattr(bench, "ROUNDS", 1)
+    whole = run_suite(read_suite(suite), tmp_path / "whole")
+    broken, all_of_it = stopped.pairs[1], whole.pairs[1]
+    assert len(broken.runs) < len(all_of_it.runs) == all_of_it.planned
+    assert [one.status for one in stopped.verdicts] == [one.status for one in whole.verdicts]
+    assert not stopped.passed
+
+
+def test_a_suite_that_was_interrupted_goes_on(suite: Path, tmp_path: Path) -> None:
+    def stop(name: str, done: int, total: int) -> None:
+        if name.startswith("fast") and done >= 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_suite(read_suite(suite), tmp_path / "out", stop)
+    went_on = run_suite(read_suite(suite), tmp_path / "out").plain()
+    straight = run_suite(read_suite(suite), tmp_path / "other").plain()
+    assert [one["per_run"] for one in went_on["pairs"]] == [one["per_run"] for one in straight["pairs"]]
+
+
+def test_every_run_that_fails_is_no_result(suite: Path, tmp_path: Path) -> None:
+    text = SUITE.replace('planner = "log"', 'name = "log"\nplanner = "planners.py:broken"')
+    suite.write_text(text.replace("planners.py:fast", "planners.py:broken"))
+    assert main(["test", str(suite), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_regressions_are_named_against_a_planner_and_an_earlier_result(suite: Path, tmp_path: Path) -> None:
+    suite.write_text(SUITE.replace("rollouts = 2", 'rollouts = 2\nbaseline = "log"'))
+    found = run_suite(read_suite(suite), tmp_path / "out")
+    assert {one["planner"] for one in found.regressions} == {"fast"}
+    assert all(one["segment"] in found.suite.store.ids and one["what"] for one in found.regressions)
+    suite.write_text(SUITE.replace("rollouts = 2", 'rollouts = 2\nbaseline = "out/result.json"'))
+    again = run_suite(read_suite(suite), tmp_path / "again")
+    assert again.regressions == []  # nothing changed
+    earlier = tmp_path / "out" / "result.json"
+    earlier.write_text(earlier.read_text().replace(found.suite.store.checksum(), "0" * 64))
+    with pytest.raises(DataError, match="other run segments"):
+        run_suite(read_suite(suite), tmp_path / "third")
+
+
+@pytest.mark.parametrize(("name", "status"), [("suite.toml", 0), ("suite_fails.toml", 1)])
+def test_examples_end_as_they_say(tmp_path: Path, name: str, status: int) -> None:
+    text = (EXAMPLES / name).read_text().replace("rollouts = 2", "segments = 9\nrollouts = 1")
+    (tmp_path / name).write_text(re.sub(r"at_most = [1-9]\d", "at_most = 90", text))
+    (tmp_path / "coast.py").write_bytes((EXAMPLES / "coast.py").read_bytes())
+    assert main(["test", str(tmp_path / name), "--out", str(tmp_path / "out"), "--no-view"]) == status

@@ -1,0 +1,141 @@
+"""The PDM score against values worked out by hand, and which segments are critical."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from helpers_segments import crossing, make_segment, straight_road
+from helpers_store import fill
+from symphony.bench.criticality import GENTLE, HARD, LONGEST, criticality, hardest
+from symphony.bench.published import PDM, comfortable, derivative
+from symphony.cli import main
+from symphony.data.segment import RunSegment
+from symphony.data.store import SegmentStore
+
+Reals = NDArray[np.float64]
+
+
+@given(st.sampled_from([0.1, 0.2]), st.integers(4, 60), st.sampled_from([1, 2]))
+def test_derivatives_of_polynomials_are_exact(dt: float, count: int, order: int) -> None:
+    time = np.arange(count) * dt
+    values = 3 - 2 * time + 0.5 * time**2
+    right = -2 + time if order == 1 else np.ones(count)
+    assert derivative(values, dt, order) == pytest.approx(right, abs=1e-6)
+
+
+def drive(dt: float, speed: float, gain: Any = None, turn: Any = None) -> tuple[Reals, Reals]:
+    """Heading and speed of 4 s, of functions of time."""
+    time = np.arange(0, 4 + dt / 2, dt)
+    return (turn(time) if turn else 0 * time), speed + (gain(time) if gain else 0 * time)
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.2])
+@pytest.mark.parametrize(
+    ("kept", "broken"),
+    [
+        ((20, lambda t: 2.35 * t), (20, lambda t: 2.45 * t)),
+        ((20, lambda t: -4.0 * t), (20, lambda t: -4.1 * t)),
+        ((10, None, lambda t: 0.485 * t), (10, None, lambda t: 0.495 * t)),  # 4.85 and 4.95 m/s² across
+        ((2, None, lambda t: 0.94 * t), (2, None, lambda t: 0.96 * t)),
+        # Sines, of which the rate is below its limit.
+        ((0, None, lambda t: 0.3 * np.sin(2 * t)), (0, None, lambda t: 0.3 * np.sin(3 * t))),
+        ((20, lambda t: 1.1 * np.sin(1.5 * t)), (20, lambda t: 0.9 * np.sin(2.6 * t))),
+    ],
+    ids=["speeds up", "brakes", "sideways", "turns", "turn changes", "jerk"],
+)
+def test_comfort_has_the_published_limits(dt: float, kept: Any, broken: Any) -> None:
+    """Every limit by itself, kept and broken."""
+    assert comfortable(*drive(dt, *kept), dt)
+    assert not comfortable(*drive(dt, *broken), dt)
+
+
+@pytest.mark.parametrize(
+    ("terms", "score"),
+    [
+        (PDM(1, 1, 1, 1, 1), 100.0),
+        (PDM(0, 1, 1, 1, 1), 0.0),
+        (PDM(0.5, 1, 1, 1, 1), 50.0),
+        (PDM(1, 0, 1, 1, 1), 0.0),
+        (PDM(1, 1, 0, 1, 1), 100 * 7 / 12),
+        (PDM(1, 1, 1, 0, 1), 100 * 10 / 12),
+        (PDM(1, 1, 1, 1, 0.5), 100 * 9.5 / 12),
+        (PDM(1, 1, 0, 0, 0), 0.0),
+    ],
+)
+def test_the_score_weighs_its_terms_as_published(terms: PDM, score: float) -> None:
+    assert terms.score == pytest.approx(score)
+
+
+def two(ego: Any, other: Any, *, dt: float = 0.2, steps: int = 21) -> RunSegment:
+    """Two cars of 4.5 by 2 m: functions of time to x, y, heading, speed."""
+    time = np.arange(steps) * dt
+    parts = [np.stack(np.broadcast_arrays(time, *one(time))[1:], -1) for one in (ego, other)]
+    state = np.stack(parts)
+    heading, speed = state[..., 2], state[..., 3]
+    road = straight_road(2, steps=2).road
+    velocity = speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    size = np.array([[4.5, 2.0, 1.5]] * 2, np.float32)
+    # Away from the road's edge, so that it plays no part.
+    return make_segment(road, state[..., :2] + [0.0, 1000.0], heading, velocity, dt, size=size)
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.2])
+def test_another_that_crosses_behind_the_ego_comes_close_in_time(dt: float) -> None:
+    """The ego leaves the crossing at 4.5 / 2 + 1 m past it, the other comes there 2.25 m before it: 1 s later."""
+    ego = lambda t: (-10 + 10 * t, 0.0, 0.0, 10.0)  # noqa: E731
+    clears = (10 + 1 + 2.25) / 10
+    other = lambda t: (0.0, -(clears + 1) * 10 - 1 - 2.25 + 10 * t, np.pi / 2, 10.0)  # noqa: E731
+    found = criticality(two(ego, other, dt=dt, steps=round(4 / dt) + 1))
+    assert found.encroachment == pytest.approx(1.0, abs=dt + 1e-6)
+    assert found.score >= 1 - (1.0 + dt) / LONGEST - 1e-6
+    assert found.score <= 4
+
+
+def test_who_follows_in_a_lane_does_not_cross() -> None:
+    found = criticality(two(lambda t: (10 * t, 0.0, 0.0, 10.0), lambda t: (-12 + 10 * t, 0.0, 0.0, 10.0)))
+    assert found.encroachment == math.inf
+    assert found.time_to_collision == math.inf
+
+
+def test_time_to_collision_is_that_of_the_gap() -> None:
+    """15 m between bumpers at first, closing at 5 m/s: after 2 s 5 m are left, 1 s."""
+    found = criticality(
+        two(lambda t: (10 * t, 0.0, 0.0, 10.0), lambda t: (19.5 + 5 * t, 0.0, 0.0, 5.0), steps=11)
+    )
+    assert found.time_to_collision == pytest.approx(1.0, abs=0.01)
+
+
+@given(st.floats(0.0, 8.0))
+def test_braking_counts_from_gentle_to_hard(braking: float) -> None:
+    found = criticality(
+        two(
+            lambda t: (20 * t - braking * t * t / 2, 0.0, 0.0, 20 - braking * t),
+            lambda t: (0.0, 500.0, 0.0, 0.0),
+            steps=6,
+        )
+    )
+    assert found.braking == pytest.approx(braking, abs=0.01)
+    assert found.score == pytest.approx(min(1, max(0, (braking - GENTLE) / (HARD - GENTLE))), abs=0.01)
+
+
+def test_the_hardest_come_first_and_are_listed(tmp_path: Path, capsys: Any) -> None:
+    fill(
+        tmp_path / "store",
+        [straight_road(3, steps=8), crossing(4, steps=30), straight_road(3, steps=8, seed=2)],
+    )
+    store = SegmentStore(tmp_path / "store")
+    found = hardest(store, 2)
+    assert len(found) == 2
+    assert found[0][1].score >= found[1][1].score
+    assert main(["data", "hardest", str(tmp_path / "store"), "--count", "2", "--ids"]) == 0
+    assert capsys.readouterr().out.split() == [one.segment for _, one in found]
+    assert main(["data", "hardest", str(tmp_path / "store"), "--json", "-"]) == 0
+    assert "time_to_collision" in capsys.readouterr().out

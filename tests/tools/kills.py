@@ -1,0 +1,192 @@
+"""Kill generate, convert, train, evaluate and simulate at random moments, go on, and compare with undisturbed work.
+
+What is left must be the same to the last bit, but for what is a matter of the clock. Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # a child does not survive the fork of a process with more
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+TICKS = os.sysconf("SC_CLK_TCK")
+PATIENCE = 600
+"""Seconds without progress after which a life is given up."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that is killed.
+
+    Attributes:
+        work: begins, or goes on with, work in a folder; in a process of its own, which may start others.
+        left: what it leaves in the end, by name; equal work leaves equal bytes.
+    """
+
+    work: Callable[[Path], None]
+    left: Callable[[Path], dict[str, bytes]]
+
+
+@dataclass
+class Counts:
+    """What came of a target.
+
+    Attributes:
+        kills: how often it was killed.
+        finished: times that it came to its end, after kills or without any.
+        failed: how it ended in other ways, or what it left that undisturbed work does not.
+        seconds: CPU time of undisturbed work.
+    """
+
+    kills: int = 0
+    finished: int = 0
+    failed: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def torment(target: Target, folder: Path, kills: int, seed: int) -> Counts:
+    """Kill work so often, each time at a random moment of what it takes undisturbed, and compare what is left.
+
+    When it comes to its end before it is killed, it begins anew in another folder; so the last one does in the end.
+    """
+    rng, counts = np.random.default_rng(seed), Counts()
+    status, counts.seconds = live(target, folder / "whole")
+    if status:
+        counts.failed.append(f"undisturbed: status {status}")
+        return counts
+    whole, place = target.left(folder / "whole"), folder / "killed"
+    while counts.kills < kills or place.exists():
+        limit = float(rng.uniform(0, counts.seconds)) if counts.kills < kills else np.inf
+        status, _ = live(target, place, limit)
+        if status == -signal.SIGKILL:
+            counts.kills += 1
+            continue
+        if status:
+            counts.failed.append(f"after {counts.kills} kills: status {status}")
+        else:
+            counts.finished += 1
+            counts.failed += compared(whole, target.left(place))
+        shutil.rmtree(place)
+    return counts
+
+
+def compared(whole: dict[str, bytes], other: dict[str, bytes]) -> list[str]:
+    """Names of what differs."""
+    names = sorted(whole.keys() | other.keys())
+    return [f"{name} differs" for name in names if whole.get(name) != other.get(name)]
+
+
+def live(target: Target, place: Path, limit: float = np.inf) -> tuple[int, float]:
+    """Work in a process until it ends or has taken so much CPU time; how it ended and the seconds it had."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.setpgid(0, 0)
+            os.fsync = lambda descriptor: None  # the kernel outlives us
+            target.work(place)
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    used, until = 0.0, time.monotonic() + PATIENCE
+    while os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+        used = max(used, spent(child))
+        if used >= limit or time.monotonic() > until:
+            break
+        time.sleep(0.01)  # as often as the clock of processes moves on
+    if used >= limit:
+        end(child)
+        return -signal.SIGKILL, used
+    if time.monotonic() > until:
+        end(child)
+        return signal.SIGALRM, used
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    end_group(child)
+    return code, used
+
+
+def end(child: int) -> None:
+    """Kill a process and all that it has started."""
+    end_group(child)
+    os.kill(child, signal.SIGKILL)  # it may not have had a group yet
+    os.waitpid(child, 0)
+
+
+def end_group(group: int) -> None:
+    """Kill those of a group that are left."""
+    try:
+        os.killpg(group, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+
+
+def spent_alone(process: int) -> float:
+    """CPU seconds of a process."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / TICKS
+
+
+def spent(group: int) -> float:
+    """CPU seconds of the processes of a group, those that have ended included."""
+    total = 0
+    for place in Path("/proc").iterdir():
+        if not place.name.isdecimal():
+            continue
+        try:
+            fields = (place / "stat").read_text().rpartition(")")[2].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields[2]) == group:
+            total += sum(map(int, fields[11:15]))
+    return total / TICKS
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run and report; status 1 if anything was lost, came twice, or differs."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--kills", type=int, default=30, help="of each target")
+    parser.add_argument("--targets", nargs="+", metavar="NAME", help="beginnings of names; all by default")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/kills.json"), help="where the counts are kept")
+    given = parser.parse_args(args)
+    import kills_targets
+
+    found = {}
+    with tempfile.TemporaryDirectory(prefix="symphony-kills-") as place:
+        for name, target in kills_targets.targets(Path(place)).items():
+            if given.targets and not name.startswith(tuple(given.targets)):
+                continue
+            counts = torment(target, Path(place) / name, given.kills, given.seed)
+            found[name] = asdict(counts)
+            print(
+                f"{name:16}{counts.kills:4} kills{counts.finished:4} finished, {counts.seconds:.2f} s undisturbed"
+            )
+            for text in counts.failed:
+                print(f"    {text}")
+            given.out.parent.mkdir(parents=True, exist_ok=True)
+            given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return 1 if any(each["failed"] for each in found.values()) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

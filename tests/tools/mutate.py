@@ -1,0 +1,209 @@
+"""Change single operators, numbers and names in functions, and tell which changes no test notices. POSIX only.
+
+Each change is made in a process of its own, forked from one that has imported everything, and the tests of that
+module are run there until the first that fails. Changes outside of functions (constants, decorators) are not made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import inspect
+import io
+import json
+import os
+import random
+import re
+import resource
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+PACKAGE = ROOT / "src" / "symphony"
+ROOMS = (
+    "geometry",
+    "roadgraph",
+    "envs",
+    "modules",
+    "collectors",
+    "objectives",
+    "learning",
+    "rollouts",
+    "metrics",
+)
+"""Where changes are made unless others are asked for: rooms that compute."""
+SECONDS = 300
+"""CPU time that the tests may take with a change: one that makes them go on for ever is noticed, too."""
+QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+OPERATORS: dict[type, type] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
+    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+NAMES = {"amax": "amin", "max": "min", "any": "all", "sin": "cos", "maximum": "minimum", "sum": "mean"}
+NAMES |= {other: name for name, other in NAMES.items()}
+
+
+def changes(tree: ast.Module) -> Iterator[tuple[str, int, Any]]:
+    """Every possible change inside functions: what, in which line, and a function that makes it."""
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for node in (inner for statement in function.body for inner in ast.walk(statement)):
+            line = getattr(node, "lineno", function.lineno)
+            if isinstance(node, ast.Compare) and type(node.ops[0]) in OPERATORS:
+                new = OPERATORS[type(node.ops[0])]()
+                yield (
+                    f"comparison becomes {type(new).__name__}",
+                    line,
+                    lambda n=node, o=new: n.ops.__setitem__(0, o),
+                )
+            elif isinstance(node, ast.BinOp | ast.BoolOp) and type(node.op) in OPERATORS:
+                new = OPERATORS[type(node.op)]()
+                yield (
+                    f"operator becomes {type(new).__name__}",
+                    line,
+                    lambda n=node, o=new: setattr(n, "op", o),
+                )
+            elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                yield (
+                    f"{node.value} becomes {node.value + 1}",
+                    line,
+                    lambda n=node: setattr(n, "value", n.value + 1),
+                )
+            elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not | ast.Invert):
+                yield "sign or negation gone", line, lambda n=node: setattr(n, "op", ast.UAdd())
+            elif isinstance(node, ast.Attribute) and node.attr in NAMES:
+                yield (
+                    f"{node.attr} becomes {NAMES[node.attr]}",
+                    line,
+                    lambda n=node: setattr(n, "attr", NAMES[n.attr]),
+                )
+
+
+def replace_code(module: ModuleType, source: ast.Module) -> None:
+    """Give the functions of a module the code of those of a changed one, wherever they are known by now."""
+    other = ModuleType(module.__name__)
+    other.__file__, other.__package__ = module.__file__, module.__package__
+    sys.modules["mutated"] = other
+    exec(compile(ast.fix_missing_locations(source), str(module.__file__), "exec"), other.__dict__)  # noqa: S102
+    places = [(module.__dict__, other.__dict__)]
+    places += [
+        (kind.__dict__, other.__dict__[name].__dict__)
+        for name, kind in module.__dict__.items()
+        if inspect.isclass(kind) and kind.__module__ == module.__name__
+    ]
+    for mine, new in places:
+        for name in list(mine):
+            if hasattr(mine[name], "cache_clear"):  # of what the tests have asked for before
+                mine[name].cache_clear()
+            plain, fresh = (_function(each.get(name)) for each in (mine, new))
+            if plain is not None and fresh is not None and plain.__module__ == module.__name__:
+                plain.__code__ = fresh.__code__
+
+
+def _function(value: Any) -> FunctionType | None:
+    value = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
+    value = inspect.unwrap(value) if callable(value) else value
+    return value if isinstance(value, FunctionType) else None
+
+
+def noticed(module: ModuleType, number: int | None, files: Sequence[str]) -> bool:
+    """Whether the tests fail with a change, or as it is; not here, where they could leave threads that forks lack."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+        try:
+            if number is not None:
+                tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+                list(changes(tree))[number][2]()
+                replace_code(module, tree)
+            status = tests(files)
+        finally:
+            os._exit(int(status != 0))
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+
+
+def modules(names: Sequence[str]) -> list[str]:
+    """The modules of rooms, such as ``envs``, and those that are named themselves, such as ``envs.road``."""
+    found = []
+    for name in names:
+        place = PACKAGE / name.replace(".", "/")
+        files = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+        found += [
+            ".".join(file.relative_to(PACKAGE).with_suffix("").parts)
+            for file in files
+            if file.stem != "__init__"
+        ]
+    return found
+
+
+def tests_of(module: str) -> list[str]:
+    """The files of tests that are to notice: those that name the module or, where none does, its room.
+
+    Those that have its name come first, as the first test that fails is enough.
+    """
+    texts = {
+        str(file): file.read_text(encoding="utf-8") for file in sorted((ROOT / "tests").rglob("test_*.py"))
+    }
+    for name in (module, module.partition(".")[0]):
+        found = [file for file, text in texts.items() if re.search(rf"\bsymphony\.{re.escape(name)}\b", text)]
+        if found:
+            return sorted(found, key=lambda file: module.rpartition(".")[2] not in file)
+    return []
+
+
+def tests(files: Sequence[str]) -> int:
+    """Run files of tests quietly."""
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        return int(pytest.main([*files, "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Make changes in turns over the modules; status 1 if one was not noticed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--changes", type=int, default=10, help="of each module")
+    parser.add_argument("--modules", nargs="+", default=ROOMS, help="such as envs, or envs.road")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--again", type=Path, help="earlier counts: make only the changes that were not noticed"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/mutate.json"), help="where the counts are kept")
+    given = parser.parse_args(args)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    found: dict[str, dict[str, Any]] = {} if given.again is None else json.loads(given.again.read_text())
+    for name in list(found) or modules(given.modules):
+        module, files = importlib.import_module(f"symphony.{name}"), tests_of(name)
+        if noticed(module, None, files):
+            raise SystemExit(f"{' '.join(files)}: fails as it is")
+        tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+        possible = [f"line {line}: {what}" for what, line, _ in changes(tree)]
+        if name in found:
+            chosen = [k for k, text in enumerate(possible) if text in found[name]["missed"]]
+        else:
+            number = min(given.changes, len(possible))
+            chosen = random.Random(given.seed).sample(range(len(possible)), number)
+            found[name] = {"possible": len(possible), "made": number}
+        missed = [possible[k] for k in sorted(chosen) if not noticed(module, k, files)]
+        for text in missed:
+            print(f"not noticed: {name}, {text}", flush=True)
+        print(f"{name}: {len(chosen)} of {len(possible)} changes made", flush=True)
+        found[name]["missed"] = missed
+        given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    made = sum(each["made"] for each in found.values())
+    lost = sum(len(each["missed"]) for each in found.values())
+    print(f"{made} changes, {made - lost} noticed")
+    return int(lost > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
