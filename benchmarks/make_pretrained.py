@@ -37,9 +37,9 @@ from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, t
 from symphony.data.plans import PRESETS
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, SymphonyError
-from symphony.evaluation.entries import choose_evaluation, method_name
 from symphony.evaluation.records import FOLDER as EVALUATIONS
-from symphony.evaluation.records import evaluation_name, kept_evaluations, read_evaluation
+from symphony.evaluation.records import choose_evaluation, evaluation_name, kept_evaluations, read_evaluation
+from symphony.evaluation.table import method_name
 from symphony.files import write_json
 
 SPLITS = ("train", "validation", "test")

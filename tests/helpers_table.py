@@ -9,10 +9,9 @@ from typing import Any, get_args
 import numpy as np
 
 from symphony.config import Method
-from symphony.evaluation.comparison import Comparison
-from symphony.evaluation.entries import Entry
 from symphony.evaluation.paper import METRICS
 from symphony.evaluation.records import evaluation_name, keep_evaluation
+from symphony.evaluation.table import Comparison, Entry
 
 METHODS = get_args(Method)
 

@@ -1,4 +1,4 @@
-"""What sampling alone adds to a divergence, who stands at the end, and what a search makes of goals."""
+"""What sampling alone adds to a divergence, and what a search makes of goals."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ from hypothesis import strategies as st
 from symphony.geometry import rotate
 from symphony.metrics import (
     Choice,
-    RolloutMetrics,
     choices,
     jensen_shannon,
     route_turns,
     sampled_divergence,
     sampling_floor,
-    standing_at_end,
 )
 from symphony.metrics.choices import choice_numbers
 
@@ -106,46 +104,6 @@ def test_the_floor_is_what_a_log_scores_against_what_it_was_drawn_from(segments:
     trials = [perfect(segments, 1600, rng) for _ in range(20)]
     scored = np.mean([sampled_divergence(policy, log).value for policy, log in trials])
     assert scored < np.mean([sampling_floor(log) for _, log in trials])
-
-
-# --- standing ---
-
-
-@given(st.integers(0, 2**31))
-@settings(max_examples=20)
-def test_who_stands_is_said_of_agents_whose_log_lasts(seed: int) -> None:
-    torch.manual_seed(seed)
-    state, log = torch.rand(3, 2, 5, 2, 4), torch.rand(3, 5, 2, 4)
-    logged, last = torch.rand(3, 5, 2) < 0.6, torch.tensor([4, 2, 1])
-    there = torch.rand(3, 2, 4, 2) < 0.7
-    found = standing_at_end(state, log, logged, last, there)
-    for b, step in enumerate(last.tolist()):
-        assert torch.equal(found.rollouts[b], state[b, :, step, :, 3] < 0.5)
-        assert torch.equal(found.log[b], log[b, step, :, 3] < 0.5)
-        assert torch.equal(found.counted[b], logged[b, step] & there[b, :, step - 1])
-    metrics, shape = RolloutMetrics(), (3, 2, 2, 4)
-    nothing = torch.zeros(shape, dtype=torch.bool)
-    metrics.update(
-        ["a", "b", "c"],
-        collided=nothing,
-        offroad=nothing,
-        displacement=torch.zeros(shape),
-        simulated=~nothing,
-        logged=torch.ones(3, 2, 4, dtype=torch.bool),
-        curvature=[np.zeros(1)] * 3,
-        curvature_log=[np.zeros(1)] * 3,
-        standing=found,
-    )
-    numbers, there = metrics.compute(), found.counted
-    if there.any():
-        log = found.log[:, None].expand(there.shape)
-        assert numbers["standing"] == pytest.approx(100 * found.rollouts[there].float().mean().item())
-        assert numbers["standing_log"] == pytest.approx(100 * log[there].float().mean().item())
-    else:
-        assert math.isnan(numbers["standing"])
-    for row, mine, slow in zip(metrics.rows(), there, found.rollouts, strict=True):
-        expected = 100 * slow[mine].float().mean().item() if mine.any() else math.nan
-        assert row["standing"] == pytest.approx(expected, nan_ok=True)
 
 
 # --- goals ---

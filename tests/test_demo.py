@@ -43,7 +43,7 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert rows[0]["ade"] == rows[0]["collision_rate"] == 0
     assert rows[1]["ade"] > 1
     # Whatever two updates make of BC+H, an agent that has learned to drive stays on the road.
-    assert rows[2]["search"] == "tree"
+    assert rows[2]["search"] == "backtrack"
     assert rows[2]["offroad_time"] < rows[1]["offroad_time"]
     sizes = [(tmp_path / "demo" / name).stat().st_size for name in ("included.png", "rollouts.png")]
     assert 50_000 < sizes[0] < sizes[1]

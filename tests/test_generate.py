@@ -221,7 +221,9 @@ def test_segments_are_spread_over_the_maps(segments: list[RunSegment]) -> None:
 
 
 @needs_sumo
-@pytest.mark.parametrize(("kind", "seconds", "seed"), [("town", 30, 10), ("ramp", 20, 10)])
+@pytest.mark.parametrize(
+    ("kind", "seconds", "seed"), [("town", 30, 10), ("ramp", 20, 10), ("random", 10, 10)]
+)
 def test_ego_is_on_the_map_throughout(kind: str, seconds: int, seed: int) -> None:
     rule = dataclasses.replace(sumo.crop_rule(kind, seconds), focuses=4, per_focus=1)
     run = sumo.generate_run(kind, seed, 2.0 * seconds, rule=rule, straight=generation.STRAIGHT)

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from symphony.geometry import box_corners, rotate
-from symphony.metrics import CollisionKind, CollisionKinds, RolloutMetrics, collision_kinds, collisions
-from symphony.metrics.kinds import _Poses, _separations
+from symphony.metrics import CollisionKind, CollisionKinds, collision_kinds, collisions
+from symphony.metrics.kinds import _separations
 
 KIND = CollisionKind
 STEPS, DT = 10, 0.2
@@ -48,6 +48,7 @@ def scene(log, speed, size, subject):
         "log_state": log,
         "log_valid": valid,
         "size": size,
+        "agent_type": torch.ones(size.shape[:-1], dtype=torch.int64),
     }
 
 
@@ -192,7 +193,7 @@ def test_padding_order_and_batch_change_nothing():
     changed = {
         name: torch.cat([value[:, :, order], value[:, :, :2]], 2)
         for name, value in inputs.items()
-        if name in ("log_state", "log_valid", "size")
+        if name in ("log_state", "log_valid", "size", "agent_type")
     }
     changed["log_valid"][:, :, 6:] = False
     changed["log_state"][:, :, 6:] = torch.nan
@@ -248,17 +249,6 @@ def test_flags_that_are_not_those_of_the_states_are_refused():
     flags[0, 3] = True
     with pytest.raises(ValueError, match=r"28\.\d+ m away from all others"):
         collision_kinds(**{**inputs, "collided": flags})
-    with pytest.raises(ValueError, match="stands for no agent"):
-        collision_kinds(**{**inputs, "collided": flags.flip(0)})
-
-
-def test_of_several_that_do_not_touch_the_farthest_is_named():
-    far, near = stage(EGO, (12, 30, 0, 2), subjects=(0, -1)), stage(EGO, (12, 20, 0, 2), subjects=(0, -1))
-    both = {key: torch.stack((near[key], far[key])) for key in near}
-    both["collided"] = torch.zeros(2, 2, STEPS, dtype=torch.bool)
-    both["collided"][:, 0, 3] = True
-    with pytest.raises(ValueError, match=r"28\.\d+ m away from all others"):
-        collision_kinds(**both)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -267,9 +257,7 @@ def test_gaps_along_and_across_are_those_of_the_corners(seed):
     generator = torch.Generator().manual_seed(seed)
     position, size = (torch.rand(2, 50, 2, generator=generator, dtype=torch.float64) * k for k in (20, 6))
     heading = torch.rand(2, 50, generator=generator, dtype=torch.float64) * 1.5
-    poses = [
-        _Poses(position[k], heading[k], torch.zeros(50, 2), torch.ones(50, dtype=torch.bool)) for k in (0, 1)
-    ]
+    poses = torch.cat([position, heading[..., None]], -1)
     found = torch.stack(_separations(*poses, *size))
     mean = heading.mean(0)
     corners = [rotate(box_corners(position[k], heading[k], size[k]), -mean[:, None]) for k in (0, 1)]
@@ -279,68 +267,6 @@ def test_gaps_along_and_across_are_those_of_the_corners(seed):
         away = middle[1, :, axis] - middle[0, :, axis]
         torch.testing.assert_close(found[1 + axis], away.abs() - reach)
     torch.testing.assert_close(found[0], middle[1, :, 0] - middle[0, :, 0])
-
-
-@pytest.mark.parametrize("name", ["state", "exists", "subject", "log_state", "log_valid", "size"])
-def test_wrong_shapes_are_refused(name):
-    inputs = stage(EGO, (12, 0, 0, 2))
-    inputs[name] = inputs[name][..., :0]
-    with pytest.raises(ValueError, match=f"{name} is .* expected"):
-        collision_kinds(**inputs)
-
-
-def update(metrics, name, inputs, kinds):
-    shape = inputs["collided"].shape
-    metrics.update(
-        [f"{name}{k}" for k in range(shape[0])],
-        collided=inputs["collided"],
-        offroad=torch.zeros(shape, dtype=torch.bool),
-        displacement=torch.zeros(shape),
-        simulated=torch.ones(shape, dtype=torch.bool),
-        logged=torch.ones(shape[0], *shape[2:], dtype=torch.bool),
-        curvature=[np.zeros(1)] * shape[0],
-        curvature_log=[np.zeros(1)] * shape[0],
-        kinds=kinds,
-    )
-
-
-def test_in_the_table_kinds_sum_to_the_collision_rate():
-    whole, one, two = RolloutMetrics(), RolloutMetrics(), RolloutMetrics()
-    found = []
-    for number, part in ((3, one), (4, two)):
-        inputs = crowd(number)
-        kinds = collision_kinds(**inputs)
-        update(whole, f"s{number}", inputs, kinds)
-        update(part, f"s{number}", inputs, kinds)
-        found.append(kinds.first())
-    one.merge(two)
-    numbers = whole.compute()
-    assert one.compute() == numbers
-    assert 0 < numbers["collision_rate"] < 100
-    rates = {kind: numbers[f"collision_{kind.name.lower()}"] for kind in CollisionKind}
-    assert sum(rates.values()) == pytest.approx(numbers["collision_rate"])
-    kind, playback = (torch.cat([pair[k].flatten() for pair in found]) for k in (0, 1))
-    assert len(kind) == 24
-    for k in CollisionKind:
-        assert rates[k] == pytest.approx(100 * float((kind == k).double().mean()))
-    assert numbers["collision_with_playback"] == pytest.approx(100 * float(playback.double().mean()))
-    rear = (kind == KIND.REAR_ENDED) & playback
-    assert numbers["collision_rear_ended_by_playback"] == pytest.approx(100 * float(rear.double().mean()))
-    assert numbers["collision_crossing_se"] > 0
-    rows = whole.rows()
-    shares = [pair[1].double().mean() for pair in found]
-    assert np.mean([row["collision_with_playback"] for row in rows]) == pytest.approx(
-        100 * float(sum(shares) / len(shares))
-    )
-
-
-def test_the_first_kind_is_counted_like_the_others():
-    inputs = stage(EGO, (12, 0, 0, 2))
-    found = collision_kinds(**inputs)
-    kinds = CollisionKinds(*(value[None, None] for value in found))
-    metrics = RolloutMetrics()
-    update(metrics, "a", {"collided": inputs["collided"][None, None]}, kinds)
-    assert metrics.compute()["collision_into_leader"] == 100
 
 
 def test_nobody_meets_whom_is_on_another_level():
@@ -361,21 +287,6 @@ def test_nobody_meets_whom_is_on_another_level():
         assert collision_kinds(**inputs, height=(mixed[:1], mixed)).other.tolist() == [1]
 
 
-def test_the_table_refuses_kinds_of_other_collisions_or_for_a_part():
-    inputs, metrics = crowd(3), RolloutMetrics()
-    kinds = collision_kinds(**inputs)
-    wrong = CollisionKinds(torch.full_like(kinds.kind, -1), *kinds[1:])
-    with pytest.raises(ValueError, match="segment a0: kinds are not those of its collisions"):
-        update(metrics, "a", inputs, wrong)
-    with pytest.raises(ValueError, match="kinds are of"):
-        update(metrics, "a", inputs, CollisionKinds(*(value[:1] for value in kinds)))
-    update(metrics, "a", inputs, None)
-    assert not any("into_leader" in name for name in metrics.compute())
-    update(metrics, "b", inputs, kinds)
-    with pytest.raises(ValueError, match="for 3 of 6 segments"):
-        metrics.compute()
-
-
 VEHICLE, WALKER, RIDER, THING = 1, 2, 3, 4
 
 
@@ -388,22 +299,8 @@ def test_the_others_type_names_the_kind(name, other, expected):
     agents, kind, _ = CASES[name]
     types = torch.full((len(agents),), other)
     types[0] = VEHICLE
-    found = collision_kinds(**stage(*agents), agent_type=types)
+    found = collision_kinds(**stage(*agents) | {"agent_type": types})
     assert found.kind.tolist() == [int(kind if expected is None else expected)]
-
-
-def test_a_pedestrian_who_is_run_over_was_crossing_without_types():
-    walker = (12.0, -1.0, 90.0, 1.0)
-    inputs = stage(EGO, walker)
-    assert collision_kinds(**inputs).kind.tolist() == [KIND.CROSSING]
-    found = collision_kinds(**inputs, agent_type=torch.tensor([VEHICLE, WALKER]))
-    assert found.kind.tolist() == [KIND.PEDESTRIAN]
-    assert found.other.tolist() == [1]
-
-
-def test_types_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match="agent_type is"):
-        collision_kinds(**stage(EGO, (12, 0, 0, 2)), agent_type=torch.ones(3, dtype=torch.int64))
 
 
 def test_being_hit_from_behind_counts_last():
@@ -415,24 +312,3 @@ def test_being_hit_from_behind_counts_last():
             kinds = CollisionKinds(pair, zeros, zeros, torch.zeros(2, dtype=torch.bool))
             order = [*(k for k in KIND if k != KIND.REAR_ENDED), KIND.REAR_ENDED]
             assert kinds.first()[0] == min((one, two), key=order.index)
-
-
-def test_agents_are_counted_one_by_one_and_the_ego_apart():
-    metrics, found, there = RolloutMetrics(), [], []
-    for number in (3, 4):
-        inputs = crowd(number)
-        kinds = collision_kinds(**inputs)
-        update(metrics, f"s{number}", inputs, kinds)
-        found.append(kinds.kind)
-        there.append(inputs["collided"].shape)
-    numbers = metrics.compute()
-    kind = torch.cat([each.flatten(0, -2) for each in found])
-    for who, part in (("ego", kind[:, :1]), ("others", kind[:, 1:])):
-        rate = numbers[f"{who}_collision_rate"]
-        assert rate == pytest.approx(100 * float((part >= 0).double().mean()))
-        rates = [numbers[f"{who}_collision_{k.name.lower()}"] for k in KIND]
-        assert sum(rates) == pytest.approx(rate)
-        for k in KIND:
-            assert rates[k] == pytest.approx(100 * float((part == k).double().mean()))
-    assert 0 < numbers["ego_collision_rate"] < 100
-    assert numbers["others_collision_rate_se"] > 0

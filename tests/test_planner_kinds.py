@@ -406,15 +406,6 @@ def test_damaged_records_of_planners_are_named(tmp_path: Path) -> None:
             read_planner_record(file)
 
 
-def test_a_search_that_is_kept_says_whether_it_flatters_the_ego(store: Path, tmp_path: Path) -> None:
-    folder = run(store, tmp_path / "sim", "idm", search="tree", branches=4, rule="best", prune_every=4)
-    found = planner_record(folder)["search"]
-    assert found["simulated_steps"] + 0 <= 2 * 4 * 15
-    assert found["kept_steps"] <= 2 * 2 * 15
-    assert 0 <= found["simulated"] <= 100
-    assert planner_record(run(store, tmp_path / "none", "idm"))["search"] is None
-
-
 def test_a_folder_without_a_planner_is_refused(store: Path, tmp_path: Path) -> None:
     folder = run(store, tmp_path / "sim", "")
     with pytest.raises(DataError, match="no planner drove here"):

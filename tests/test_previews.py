@@ -275,17 +275,3 @@ def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
     (settings.out / "media").touch()
     with pytest.raises(DataError, match=r"rollout-000002\.gif"):
         train(settings)
-
-
-def test_networks_are_left_as_they_were(store: Path, tmp_path: Path) -> None:
-    trainer = build(config(store, tmp_path, 2, "bc_ts"))
-    previewer, policy = trainer.previewer, trainer.agent.modules["policy"]
-    assert previewer is not None
-    state = torch.get_rng_state()
-    before = [parameter.clone() for parameter in policy.parameters()]
-    first = previewer(2)
-    assert first.video.is_file()
-    assert all(map(torch.equal, before, policy.parameters()))
-    assert policy.training
-    assert torch.equal(state, torch.get_rng_state())
-    assert first.numbers().keys() == previewer(4).numbers().keys()

@@ -15,11 +15,18 @@ from helpers_table import make_entry, make_record, make_run, row_of
 from symphony.cli import main
 from symphony.config import Method, TableColumns
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.comparison import ASKED, compare
-from symphony.evaluation.entries import Entry, collect
-from symphony.evaluation.formats import FORMATS, as_json
+from symphony.evaluation.formats import FORMATS
 from symphony.evaluation.paper import paper_figures
-from symphony.evaluation.relations import RELATION_FORMATS, STATEMENTS, Relation, grid, relations
+from symphony.evaluation.relations import (
+    RELATION_FORMATS,
+    STATEMENTS,
+    Relation,
+    grid,
+    paired_lines,
+    relations,
+)
+from symphony.evaluation.table import ASKED, COLUMNS, Entry, collect, compare
+from symphony.metrics.intervals import clustered_mean
 
 METHODS = get_args(Method)
 RATES = ("collision_rate", "offroad_time", "ade", "min_sade")
@@ -137,10 +144,48 @@ def test_what_cannot_be_said_is_not_said() -> None:
         relations(old)
 
 
+def test_paired_differences_are_over_what_both_have_and_over_recordings() -> None:
+    rng, names = np.random.default_rng(0), [f"segment-{k}" for k in range(12)]
+
+    def shifted(method: str, seed: int, shift: float) -> Entry:
+        found = make_entry(method, seed)
+        found.record["per_segment"] = [  # type: ignore[index]
+            {"segment": name, "group": f"group-{k // 3}"}
+            | {column.key: base[k] + shift for column in COLUMNS[:4]}
+            for k, name in enumerate(names)
+        ]
+        return found
+
+    base = rng.normal(size=12)
+    (line,) = paired_lines([shifted("bc", 0, 0.0), shifted("bc", 1, 1.0), shifted("bc_h", 0, 2.5)], "bc")
+    # Seeds are averaged first, and a shift that is the same everywhere has no error.
+    numbers = "collision +2.00 ± 0.00 %, off-road +2.00 ± 0.00 %, ADE +2.00 ± 0.00 m, minSADE +2.00 ± 0.00 m"
+    assert line == f"BC+H less BC: {numbers} (12 segments of 4 groups)"
+    fewer = shifted("bc_h", 0, 2.5)
+    fewer.record["per_segment"].pop()
+    assert "11 segments" in paired_lines([shifted("bc", 0, 0.0), fewer], "bc")[0]
+    wrong = shifted("bc_h", 1, 0.0)
+    wrong.record["per_segment"][3]["ade"] = "far"
+    with pytest.raises(DataError, match="ade"):
+        paired_lines([shifted("bc", 0, 0.0), wrong], "bc")
+    with pytest.raises(ConfigError, match="not among the methods"):
+        paired_lines([shifted("bc", 0, 0.0)], "mgail")
+
+
+@given(st.lists(st.floats(-5, 5), min_size=2, max_size=30))
+def test_errors_over_groups_of_one_are_the_usual_ones(values: list[float]) -> None:
+    numbers = np.array(values)
+    mean, error = clustered_mean(numbers, np.arange(len(numbers)))
+    assert mean == pytest.approx(numbers.mean())
+    assert error == pytest.approx(numbers.std(ddof=1) / np.sqrt(len(numbers)), abs=1e-12)
+    # Copies within a group tell nothing new.
+    twice = clustered_mean(np.repeat(numbers, 2), np.repeat(np.arange(len(numbers)), 2))
+    assert twice == pytest.approx((mean, error), abs=1e-9)
+
+
 def test_the_paper_s_own_figures_have_the_paper_s_relations() -> None:
     """Up to rounding: the paper's factors themselves are given to one digit."""
     figures = paper_figures("main", "proprietary")
-    assert figures is not None
     entries = []
     for method in METHODS:
         means = {key: mean for key, (mean, _) in figures[method].items()}
@@ -186,9 +231,9 @@ def test_each_way_has_a_row_and_its_cost(tmp_path: Path, capsys: pytest.CaptureF
     comparison = compare(entries, "main")
     cost = {row.way: row.cells["cost"].mean for row in comparison.rows if row.method == "bc_ts"}
     assert cost == {"tree-16x4-best": 2.0, "tree-1x16-best-goals=branch": 0.5}
-    assert [row["way"] for row in json.loads(as_json(comparison))["rows"] if row["method"] == "bc_ts"] == [
-        *cost
-    ]
+    assert [
+        row["way"] for row in json.loads(FORMATS["json"](comparison))["rows"] if row["method"] == "bc_ts"
+    ] == [*cost]
     for write in FORMATS.values():
         assert all(way in write(comparison) for way in cost)
     some, _ = collect([tmp_path], "main", ["*-16x4-*", "*-none-*"], each=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import re
@@ -14,21 +13,29 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 from helpers_segments import crossing, straight_road
-from helpers_table import METHODS, full_table, make_entry, row_of
+from helpers_table import METHODS, full_table, make_entry, make_record, row_of
 from symphony.cli import main
 from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.evaluation.comparison import COLUMNS, Comparison, compare
-from symphony.evaluation.entries import ROWS, SETTINGS, Entry, family, method_name
-from symphony.evaluation.formats import ABSENT, FORMATS, as_json, as_latex, as_markdown, as_text, print_text
+from symphony.evaluation.formats import FORMATS
 from symphony.evaluation.paper import METRICS, paper_figures
 from symphony.evaluation.records import evaluation_name, kept_evaluations
+from symphony.evaluation.table import (
+    ABSENT,
+    COLUMNS,
+    ROWS,
+    SETTINGS,
+    Comparison,
+    Entry,
+    compare,
+    family,
+    method_name,
+)
 from symphony.metrics import jensen_shannon
 from symphony.recipes import train
 from symphony.render import plot_curvature
@@ -49,7 +56,7 @@ def test_cells_are_mean_and_standard_error_over_seeds(values: list[float]) -> No
     assert cell.mean == pytest.approx(np.mean(values))
     if len(values) == 1:
         assert math.isnan(cell.error)
-        assert f"| BC | 1 | 1.00 | 1.00 | {values[0]:.2f} | 1.00 |" in as_markdown(comparison)
+        assert f"| BC | 1 | 1.00 | 1.00 | {values[0]:.2f} | 1.00 |" in FORMATS["markdown"](comparison)
     else:
         assert cell.error == pytest.approx(np.std(values, ddof=1) / np.sqrt(len(values)))
 
@@ -116,7 +123,7 @@ def test_a_mean_over_something_unknown_is_unknown_and_never_the_best() -> None:
     assert math.isnan(cell.mean)
     assert not cell.best
     assert row_of(comparison, "bc_h").cells["ade"].best
-    assert json.loads(as_json(comparison))["rows"][2]["ade"]["mean"] is None
+    assert json.loads(FORMATS["json"](comparison))["rows"][2]["ade"]["mean"] is None
 
 
 @pytest.mark.parametrize(
@@ -138,6 +145,37 @@ def test_whole_segments_stand_beside_their_first_seconds_only_where_these_are_al
     entries[1].record["constant_velocity"]["ade"] /= 3
     with pytest.raises(ConfigError, match=r"\(duration\)"):
         compare(entries, "main")
+
+
+def test_metrics_of_a_user_s_own_are_columns_where_all_evaluations_have_them() -> None:
+    path = "my.metrics:jerk"
+    entries = [make_entry(method, seed) for method in ("bc", "bc_h") for seed in (0, 1)]
+    for number, entry in enumerate(entries):
+        entry.record["config"]["metric"] = [path]  # type: ignore[index]
+        entry.record[path] = float(number)  # type: ignore[index]
+    comparison = compare(entries, "main")
+    assert [column.title for column in comparison.columns][-2:] == ["jerk", "CPU"]
+    assert row_of(comparison, "bc").cells[path].mean == 0.5
+    assert row_of(comparison, "bc_h").cells[path].mean == 2.5
+    assert not row_of(comparison, "bc").cells[path].best, "nobody said whether low is good"
+    assert math.isnan(row_of(comparison, "playback").cells[path].mean)
+    assert "jerk" in FORMATS["markdown"](comparison)
+    entries[0].record["config"]["metric"] = []  # type: ignore[index]
+    for entry in entries[1:2]:
+        entry.record["config"]["metric"] = []  # type: ignore[index]
+    assert path not in {column.key for column in compare(entries, "main").columns}
+
+
+def test_latex_has_no_bare_special_letters() -> None:
+    path = "my.metrics:time_gap"
+    record = make_record(search="tree", branches=16, rule="best", logged_goals=True, metric=[path]) | {
+        path: 1.0
+    }
+    entry = Entry(Path("run"), {"method": "bc"}, "name", record, "tree-16-logged_goals")
+    table = FORMATS["latex"](compare([entry], "main")).partition(r"\begin{tabular}")[2]
+    assert r"time\_gap" in table
+    assert r"logged\_goals" in table
+    assert not re.search(r"(?<!\\)[_%#$]", table.replace(r"$\times 10^{-3}$", ""))
 
 
 # --- the paper's own figures ---
@@ -164,7 +202,6 @@ def test_the_paper_s_bold_figures_are_what_we_call_best(setting: Any, dataset: A
 
 def test_the_paper_s_figures_are_in_our_units() -> None:
     figures = paper_figures("main", "womd")
-    assert figures is not None
     assert figures["bc"]["curvature_jsd"] == pytest.approx((0.00132, 0.00028))
     assert figures["playback"]["collision_rate"][0] == 3.04
     assert math.isnan(figures["playback"]["ade"][0])
@@ -199,17 +236,16 @@ def expected(comparison: Comparison) -> dict[str, list[tuple[bool, tuple[float, 
 def test_markdown_and_latex_read_back(seeds: int, dataset: Any) -> None:
     comparison = compare(full_table(seeds), "main", dataset)
     wanted = expected(comparison)
-    lines = [line.strip("| ").split(" | ") for line in as_markdown(comparison).splitlines() if "|" in line]
+    lines = [
+        line.strip("| ").split(" | ") for line in FORMATS["markdown"](comparison).splitlines() if "|" in line
+    ]
     assert len({len(line) for line in lines}) == 1
     assert {name: [("**" in c, numbers_of(c)) for c in cells] for name, _, *cells in lines[2:]} == wanted
     assert [line[1].strip() for line in lines[4:]] == [str(seeds)] * 8
-    latex = as_latex(comparison)
+    latex = FORMATS["latex"](comparison)
     body = [line[:-3].split(" & ") for line in latex.splitlines() if line.endswith(r"\\")]
-    rows = {line[0].replace(" ", ""): line[2:] for line in body[2 if dataset else 1 :]}
-    latex_wanted = {name.replace(" ", ""): cells for name, cells in wanted.items()}
-    assert {
-        name: [(r"\textbf" in c, numbers_of(c)) for c in cells] for name, cells in rows.items()
-    } == latex_wanted
+    rows = {name: [(r"\textbf" in c, numbers_of(c)) for c in cells] for name, _, *cells in body[1:]}
+    assert rows == wanted
     (columns,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", latex)
     assert len(columns) == len(body[-1])
     assert latex.count("{") == latex.count("}")
@@ -218,7 +254,7 @@ def test_markdown_and_latex_read_back(seeds: int, dataset: Any) -> None:
 
 def test_json_reads_back_whole() -> None:
     comparison = compare(full_table(3), "many", "proprietary")
-    read = json.loads(as_json(comparison))
+    read = json.loads(FORMATS["json"](comparison))
     assert (read["setting"], read["interactive"], read["duration"]) == ("many", *SETTINGS["many"])
     for row, found in zip(comparison.rows, read["rows"], strict=True):
         assert found["method"] == row.method
@@ -233,29 +269,14 @@ def test_json_reads_back_whole() -> None:
                     assert found["paper"][key]["mean"] == row.paper[key].mean
 
 
-def test_text_fits_a_terminal_and_shows_the_best_in_bold() -> None:
-    comparison = compare(full_table(3), "main", "proprietary")
-    file = io.StringIO()
-    print_text(comparison, Console(file=file, width=80, force_terminal=True, color_system="standard"))
-    bold = [numbers_of(found) for found in re.findall(r"\x1b\[1(?:;2)?m([\d.±]+)\x1b\[0m", file.getvalue())]
-    wanted = expected(comparison)
-    assert sorted(bold) == sorted(held for row in wanted.values() for best, held in row if best)
-    plain = as_text(comparison)
-    starred = [numbers_of(found) for found in re.findall(r"([\d.±]+)\*", plain)]
-    assert sorted(starred) == sorted(bold)
-    for cells in wanted.values():
-        for _, held in cells:
-            assert not held or "±".join(f"{number:.2f}" for number in held) in plain
-
-
-def test_many_columns_leave_names_whole() -> None:
-    comparison = compare(full_table(1), "main", "womd", ("split", "standing", "corrected", "goals"))
-    for width in (80, 200):
-        file = io.StringIO()
-        print_text(comparison, Console(file=file, width=width))
-        text = file.getvalue()
-        assert "MGAIL+TS+H" in text
-        assert "…" not in text
+def test_text_marks_the_best_and_leaves_names_whole() -> None:
+    comparison = compare(full_table(3), "main", "proprietary", ("split", "standing", "corrected", "goals"))
+    text, wanted = FORMATS["text"](comparison), expected(comparison)
+    starred = [numbers_of(found) for found in re.findall(r"([\d.±]+)\*", text)]
+    assert sorted(starred) == sorted(held for row in wanted.values() for best, held in row if best)
+    for name, cells in wanted.items():
+        assert name in text
+        assert all("±".join(f"{number:.2f}" for number in held) in text for _, held in cells if held)
 
 
 # --- the commands ---

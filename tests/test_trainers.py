@@ -32,9 +32,10 @@ from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
+from symphony.geometry import signed_distance
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import fit_experts
-from symphony.metrics import collisions, offroad
+from symphony.metrics import collisions
 from symphony.objectives import GoalLoss
 from symphony.recipes import train
 from symphony.rollouts import simulate
@@ -185,7 +186,8 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
         scenes.edge_previous,
         scenes.edge_following,
     )
-    off = offroad(done.state[:, :, 1:, :, :2], *edges)
+    places = done.state[:, :, 1:, :, :2]
+    off = signed_distance(places.flatten(1, -2), *edges).reshape(places.shape[:-1]) > 0
     assert torch.equal(off, done.offroad)
     assert 0 < off.float().mean() < 1
 

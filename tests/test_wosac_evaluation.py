@@ -20,9 +20,8 @@ from symphony.data.resample import resample
 from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.comparison import WOSAC, compare
-from symphony.evaluation.entries import Entry
-from symphony.evaluation.formats import as_markdown
+from symphony.evaluation.formats import FORMATS
+from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.roadgraph import LaneGraph
 from symphony.wosac.evaluate import THINNED, _thinned, evaluate_wosac, simulated_how
 from symphony.wosac.passing import order_of, passing_gaps, passing_pairs
@@ -224,7 +223,7 @@ def test_columns_of_the_table(record: dict[str, Any]) -> None:
     entries = [Entry(Path(m), {"method": m, "seed": 0}, m, kept) for m in ("bc", "bc_h")]
     table = compare(entries, "main")
     assert set(WOSAC) <= set(table.columns)
-    assert f"{record['wosac_metametric']:.3f}" in as_markdown(table)
+    assert f"{record['wosac_metametric']:.3f}" in FORMATS["markdown"](table)
     for row in table.rows:
         assert 0 < row.cells["wosac_metametric"].mean < 1
     mixed = compare([entries[0], replace(entries[1], record=other)], "main")

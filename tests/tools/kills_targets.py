@@ -113,7 +113,7 @@ def _evaluate(store: Path, out: Path) -> None:
         SegmentStore(store),
         EvaluateConfig(rollouts=2, branches=4, batch=1),
     )
-    keeper = RolloutKeeper(RolloutWriter(out / "rollouts", About.of(AGENT, segments, config)), AGENT)
+    keeper = RolloutKeeper(RolloutWriter(out / "rollouts", About.of(AGENT, segments, config)))
     found = evaluate(agent, segments, config, baselines=True, observe=keeper)
     write_json(out / "found.json", evaluation_record(agent, found, segments))
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
-from made import NORTH, OWN, RIGHT, Case, Track
+from made import NORTH, OWN, RED, RIGHT, Case, Track
 from scenes import car, ego, hit, stops
 
 
@@ -75,6 +77,68 @@ def bridges() -> list[Case]:
             (replace(waits, z=6.0),),
             {"blocking": True},
             log=ego(x=145, y=RIGHT),
+            bridge=6.0,
+        ),
+        *rules(),
+    ]
+
+
+def rules() -> list[Case]:
+    """Lanes and lights are those of the level that an agent is on: a road to the west, 6 m above the eastern lane."""
+    red = ((0.0, RED),)
+    deck: dict[str, Any] = {"deck": 6.0}
+    west = Track(250, OWN, 10.0, math.pi)
+    waits = replace(stops(west, 0.0, 5.0), x=165.0)
+    street = Track(165, -100.0, 10.0, NORTH)
+    stands = replace(stops(street, 0.0, 5.0), y=-60.0)
+    return [
+        Case("a red light below a deck", "its light", ego(x=100), (), {"red": 1}, light=red, **deck),
+        Case(
+            "over a red light on the deck",
+            "the light is below; the deck leads the other way",
+            ego(x=100, z=6.0),
+            (),
+            {"red": 0, "wrong": True},
+            light=red,
+            **deck,
+        ),
+        Case("westward on the deck", "its way", replace(west, z=6.0), (), {"wrong": False}, **deck),
+        Case("westward below the deck", "the lane above is another", west, (), {"wrong": True}, **deck),
+        Case("eastward below the deck", "its lane", ego(), (), {"wrong": False}, **deck),
+        Case(
+            "an oncoming one in the ego's lane below the deck",
+            "the other is where it must not be: the lane above is not its own",
+            ego(),
+            (car(120, OWN, 10.0, math.pi),),
+            hit("oncoming", False, (80 - 4.5) / 20),
+            **deck,
+        ),
+        Case(
+            "stands on the deck over a red light",
+            "no light is on its road",
+            replace(waits, z=6.0),
+            (),
+            {"blocking": True, "red": 0},
+            log=replace(west, z=6.0),
+            light=red,
+            **deck,
+        ),
+        Case(
+            "stands on the ground beneath a bridge",
+            "the lane is above",
+            stands,
+            (),
+            {"blocking": False},
+            log=street,
+            bridge=6.0,
+        ),
+        Case(
+            "stands on the bridge",
+            "it blocks it",
+            replace(stands, z=6.0),
+            (),
+            {"blocking": True},
+            log=replace(street, z=6.0),
             bridge=6.0,
         ),
     ]

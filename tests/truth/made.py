@@ -87,6 +87,7 @@ class Case:
         lanes: whether the map has lanes that cars drive in.
         boundary: whether it has a boundary.
         bridge: height of the road across over the other one.
+        deck: height of a road to the west above the own lane; 0 for none.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Case:
     lanes: bool = True
     boundary: bool = True
     bridge: float = 0.0
+    deck: float = 0.0
 
 
 def _line(*ends: tuple[float, float]) -> NDArray[Any]:
@@ -108,18 +110,21 @@ def _line(*ends: tuple[float, float]) -> NDArray[Any]:
 
 
 @cache
-def road(lanes: bool, boundary: bool, bridge: float) -> RoadMap:
+def road(lanes: bool, boundary: bool, bridge: float, deck: float) -> RoadMap:
     """The one of all scenes; its eastern lanes are cut at the lights."""
     paved = shapely.box(-100, -7, 500, 3.5), shapely.box(163.25, -120, 166.75, 120)
+    areas = [*zip(paved, (0.0, bridge), strict=True)] if bridge else [(shapely.union(*paved), 0.0)]
+    areas += [(shapely.box(-100, -3.5, 500, 0), deck)] if deck else []
     edges = [
         shapely.get_coordinates(
             shapely.force_3d(shapely.geometry.polygon.orient(area, 1.0), z), include_z=True
         )
-        for area, z in (zip(paved, (0.0, bridge), strict=True) if bridge else [(shapely.union(*paved), 0.0)])
+        for area, z in areas
     ]
     east = [_line((x0, y), (x1, y)) for y in (OWN, RIGHT) for x0, x1 in ((-100.0, STOP), (STOP, 500.0))]
     across = _line((165, -120), (165, 120))
     lines = [*east, _line((500, WEST), (-100, WEST)), np.insert(across, 2, bridge, axis=1)]
+    lines += [np.insert(_line((500, OWN), (-100, OWN)), 2, deck, axis=1)] if deck else []
     joined: dict[str, Any] = {
         "successors": [(0, 1), (2, 3)],
         "left": [(2, 0), (3, 1)],
@@ -156,7 +161,13 @@ def segment_of(case: Case, dt: float, phase: float) -> tuple[RunSegment, NDArray
     for part in (position, velocity, heading):
         part[~seen] = 0
     made = make_segment(
-        road(case.lanes, case.boundary, case.bridge), position, heading, velocity, dt, case.name, **changes
+        road(case.lanes, case.boundary, case.bridge, case.deck),
+        position,
+        heading,
+        velocity,
+        dt,
+        case.name,
+        **changes,
     )
     place, turn, moved = case.ego.at(time)
     speed = (moved * np.stack([np.cos(turn), np.sin(turn)], -1)).sum(-1)

@@ -64,7 +64,7 @@ class Generate:
     workers: int = 1
     """Processes that make networks."""
     engine: Literal["local", "ray"] = "local"
-    """Where these processes run: on this machine, or wherever Ray puts them."""
+    """Engine that runs these processes: `local`, on this machine, or `ray`, wherever Ray puts them."""
     json: ResultFile = None
     """File to write the measures to; - for standard output, the tables then go to standard error."""
 
@@ -234,8 +234,8 @@ class Convert:
     workers: int = 1
     """Processes that convert files; the store does not depend on their number."""
     engine: Literal["local", "ray"] = "local"
-    """Where these processes run: on this machine, or on the Ray cluster at RAY_ADDRESS (else a Ray on this machine),
-    whose machines must share the files and the folder of the store."""
+    """Engine that runs these processes: `local`, on this machine, or `ray`, on the Ray cluster at RAY_ADDRESS (else a
+    Ray on this machine), whose machines must share the files and the folder of the store."""
 
     def __post_init__(self) -> None:
         if not self.files:

@@ -75,7 +75,7 @@ class Demo:
             draw_clips(clips, picture, columns=len(items))
             say(f"picture: {picture}")
 
-        say("An included agent, on segments that it has not seen, with its tree search:")
+        say("An included agent, on segments that it has not seen, with its search:")
         show({**BASELINES, INCLUDED: PRETRAINED}, self.out / "included.png")
         say(
             f"\nNow one of your own: behavioural cloning with goals (BC+H), {self.steps} updates on far fewer "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -27,7 +26,8 @@ from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.evaluation import EvaluatedBatch
+    from symphony.evaluation.evaluator import Observer
+    from symphony.saved.rollouts import SavedRollouts
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Evaluate:
 
             # Complain now, not after the work.
             scorable(store, chosen or range(len(store)), WosacSettings.of(config).future)
-        keepers: list[Callable[[EvaluatedBatch], None]] = []
+        keepers: list[Observer] = []
         if self.figure is not None:
             from symphony.learning.demonstrations import evenly_spaced
 
@@ -119,12 +119,11 @@ class Evaluate:
 
             plain = plain_settings(config, agent.interactive, agent.duration) | identity_of(agent)
             about = About.of(agent.name, store, plain, seed=config.seed)
-            writer = RolloutWriter(self.save_rollouts, about)
-            keepers.append(pictures.RolloutKeeper(writer, agent.name, config.others))
+            keepers.append(pictures.RolloutKeeper(RolloutWriter(self.save_rollouts, about)))
 
-        def observe(batch: EvaluatedBatch) -> None:
+        def observe(item: int, saved: SavedRollouts) -> None:
             for keeper in keepers:
-                keeper(batch)
+                keeper(item, saved)
 
         watched: dict[str, Any] = {"observe": observe} if keepers else {}
         with progress(f"evaluating {agent.name}") as advance:

@@ -60,13 +60,10 @@ class Planners:
 
 def table_text(records: Sequence[dict[str, Any]], form: Literal["text", "markdown"] = "text") -> str:
     """The table of some records, and which planner is first in each crowd."""
+    from symphony.evaluation.formats import aligned, markdown
     from symphony.evaluation.planners import counted_at_states, planner_grid, winners, without_score
 
     grid = planner_grid(records)
     sentences = [*winners(records), *without_score(records), *counted_at_states(records)]
-    if form == "markdown":
-        lines = [f"| {' | '.join(line)} |" for line in grid]
-        return "\n".join([lines[0], "| --- " * len(grid[0]) + "|", *lines[1:], "", *sentences]) + "\n"
-    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
-    rows = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in grid]
-    return "\n".join([*(row.rstrip() for row in rows), "", *sentences]).rstrip() + "\n"
+    table = markdown(grid) if form == "markdown" else aligned(grid)
+    return "\n".join([table, *sentences]).rstrip() + "\n"

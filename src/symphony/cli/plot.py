@@ -45,8 +45,8 @@ class Curvature:
         import numpy as np
 
         from symphony.agents.included import run_folder
-        from symphony.evaluation.entries import choose_evaluation, method_name
-        from symphony.evaluation.records import kept_evaluations, read_run
+        from symphony.evaluation.records import choose_evaluation, kept_evaluations, read_run
+        from symphony.evaluation.table import method_name
         from symphony.metrics import jensen_shannon
         from symphony.render.curves import plot_curvature
         from symphony.render.style import picture_path

@@ -61,13 +61,9 @@ class Table:
 
     def run(self) -> None:
         """Collect, compare and write."""
-        from rich.console import Console
-
-        from symphony.evaluation.comparison import compare
-        from symphony.evaluation.entries import collect
-        from symphony.evaluation.formats import FORMATS, print_text
-        from symphony.evaluation.paired import differences
-        from symphony.evaluation.relations import RELATION_FORMATS, relations
+        from symphony.evaluation.formats import FORMATS
+        from symphony.evaluation.relations import RELATION_FORMATS, paired_lines, relations
+        from symphony.evaluation.table import collect, compare
 
         entries, left_out = collect(self.runs, self.setting, self.evaluation, each=self.each)
         for reason, folders in left_out.items():
@@ -75,13 +71,10 @@ class Table:
             sys.stderr.write(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}\n")
         comparison = compare(entries, self.setting, self.paper, self.columns)
         if self.paired is not None:
-            for difference in differences(entries, self.paired):
-                sys.stderr.write(f"{difference.text()}\n")
+            for line in paired_lines(entries, self.paired):
+                sys.stderr.write(f"{line}\n")
         if self.relations:
             text = RELATION_FORMATS[self.format](relations(entries, self.setting))
-        elif self.out is None and self.format == "text" and (console := Console()).is_terminal:
-            print_text(comparison, console)
-            return
         else:
             text = FORMATS[self.format](comparison)
         if self.out is not None:

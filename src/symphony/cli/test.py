@@ -39,7 +39,7 @@ class Test:
     workers: int = 1
     """Processes that simulate (this changes the speed, not the results)."""
     engine: Literal["local", "ray"] = "local"
-    """Where these processes run: on this machine, or on a Ray cluster."""
+    """Engine that runs these processes: `local`, on this machine, or `ray`, on a Ray cluster."""
     device: str = "cpu"
     """Device that simulates: `cpu`, `cuda` or `cuda:N`."""
 

@@ -161,8 +161,8 @@ class EvaluateConfig(SimulationConfig):
     """Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a
     planner, fewer where their agents see many points."""
     engine: Engine = "local"
-    """Where the worker processes run: on this machine, or on a Ray cluster (at RAY_ADDRESS, else one is started
-    here)."""
+    """Engine that runs the worker processes: `local`, on this machine, or `ray`, on a Ray cluster (at RAY_ADDRESS,
+    else one is started here)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -141,8 +141,8 @@ class RunConfig:
     resume: bool = False
     """Go on from the last checkpoint in `out`; without it a folder that holds a run is refused."""
     wandb: Literal["offline", "online", "disabled"] = "offline"
-    """Where Weights & Biases keeps the curves; a plain file has them in any case. Its own variables (WANDB_PROJECT,
-    WANDB_RUN_GROUP, WANDB_TAGS) name project, group and tags."""
+    """Mode of Weights & Biases; a plain file has the curves in any case. The variables WANDB_PROJECT, WANDB_RUN_GROUP
+    and WANDB_TAGS name project, group and tags."""
     device: str = "cpu"
     """Device that learns: `cpu`, `cuda` or `cuda:N`."""
 
@@ -157,7 +157,7 @@ class TrainConfig(RunConfig):
     """Train agents."""
 
     method: Positional[Method]
-    """What to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both."""
+    """Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both."""
     duration: int = 0
     """Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are)."""
     agent: AgentConfig = field(default_factory=AgentConfig)

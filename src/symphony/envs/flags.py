@@ -38,9 +38,9 @@ def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor,
         hit = boxes_overlap(own[..., :2], own[..., 2], own_size, state[..., :2], state[..., 2], size)
         return (hit & other).any(-1)
     # Boxes can only overlap where the circles around them do: of all pairs few are left to look at closely.
-    x, y = (state[..., k] - own[..., k] for k in (0, 1))
-    reach = 0.5 * (own_size.norm(dim=-1) + size.norm(dim=-1)) + _SLACK
-    row, n, a = (other & (x.square() + y.square() <= reach.square())).nonzero(as_tuple=True)
+    x, y = (state[..., k].contiguous() - own[..., k] for k in (0, 1))
+    reach = 0.5 * (own_size.norm(dim=-1) + size.norm(dim=-1).amax(-1, keepdim=True)) + _SLACK
+    row, n, a = (other & (x.square_().add_(y.square_()) <= reach.square())).nonzero(as_tuple=True)
     one, two = own[row, n, 0], state[row, 0, a]
     hit = boxes_overlap(one[:, :2], one[:, 2], own_size[row, n, 0], two[:, :2], two[:, 2], size[row, 0, a])
     return torch.zeros_like(index, dtype=torch.bool).index_put((row[hit], n[hit]), hit.new_ones(()))
@@ -61,9 +61,16 @@ def offroad_flags(
     if tables is None or height is not None or not on_host(position) or scenes.edge_start.shape[1] == 0:
         return road_distance(scenes, scene, position, tables, height) > 0
     row, where = scene.repeat_interleave(position.shape[1]), position.detach().reshape(-1, 2)
-    cell = tables.edge_cells.at(row.numpy(), *np.ascontiguousarray(where.numpy().T))
-    sign = torch.from_numpy(tables.edge_cells.sign[cell])
-    off, asked = sign > 0, (sign == 0).nonzero().squeeze(-1)
+    x, y = np.ascontiguousarray(where.numpy().T)
+    cells = tables.edge_cells
+    cell = cells.at(row.numpy(), x, y)
+    sign = cells.sign[cell]
+    off, asked = sign > 0, np.flatnonzero((sign == 0) & (cell >= 0))
     if len(asked):
-        off[asked] = road_distance(scenes, row[asked], where[asked, None], tables).squeeze(1) > 0
-    return off.view(position.shape[:2])
+        near = cells.nearest_edge(cell[asked], x[asked], y[asked])
+        off[asked] = cells.right_of(near, x[asked], y[asked])
+    far = torch.from_numpy(np.flatnonzero(cell < 0))
+    flags = torch.from_numpy(off)
+    if len(far):
+        flags[far] = road_distance(scenes, row[far], where[far, None]).squeeze(1) > 0
+    return flags.view(position.shape[:2])

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.evaluation.evaluator import EvaluatedBatch, Evaluation, evaluate
+    from symphony.evaluation.evaluator import Evaluation, evaluate
 
-__all__ = ["EvaluatedBatch", "Evaluation", "evaluate"]
+__all__ = ["Evaluation", "evaluate"]
 
 __getattr__, __dir__ = lazily(__name__)

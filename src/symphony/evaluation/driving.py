@@ -1,6 +1,6 @@
-"""How single rollouts drive: red lights, wrong way, progress, comfort, distance to the log.
+"""How single rollouts drive: red lights, wrong way, blocking traffic, progress, comfort, distance to the log.
 
-Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M evaluated agents, Q lights.
+Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M evaluated agents, Q lights, E moments.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from torch import from_numpy
 
-from symphony.data.segment import RunSegment, SignalState
+from symphony.data.segment import SignalState
 from symphony.evaluation.contacts import Bools, Indices, Reals
-from symphony.evaluation.fault import Lights, lane_widths
+from symphony.evaluation.lanes import Heights, Lanes
+from symphony.geometry import levels_apart
 from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
-from symphony.roadgraph import LaneGraph
+from symphony.roadgraph.lines import line_strings, turn_between
 from symphony.roadgraph.routes import ends_inside
 from symphony.saved.rollouts import SavedRollouts
 from symphony.saved.world import World
@@ -30,31 +32,55 @@ IN_LANE = 2.0
 """Metres from a centre line within which an agent is in the lane."""
 PAST_END = 5.0
 """Metres from the end of a route beyond which an agent has gone on."""
+SECONDS = 3.0
+"""For which an agent must stand on a free road to block it."""
+FREE = 15.0
+"""Metres ahead of the front that nobody is in and no light that is not green."""
+CROSSING = 25.0
+"""Metres within which others that move across are given way to."""
+ASIDE = 0.5
+"""Metres beside its box that an agent wants to be free."""
 _FOLLOWED = 3.0
 """Metres from a centre line, on average, within which a path follows the lane."""
+_PASSED = 5.0
+"""Metres that the front may be past a stop point and still wait for its light."""
+_LANE = 2.5
+"""Metres aside within which a light is that of an agent's lane."""
 
 
-def red_lights(world: World, evaluated: Indices, segment: RunSegment, start: int) -> Lights:
+class Lights(NamedTuple):
+    """Lights that were red when agents drove past, all [E]: row of A, state, light."""
+
+    agent: Indices
+    step: Indices
+    light: Indices
+
+
+def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Lights:
     """Red lights that the evaluated agents [M] of one rollout ran.
 
-    An agent runs a light if its front crosses the stop point in the direction of the lane, within the lane's width,
-    while the light is red (a plain or arrow stop, not a flashing one), and it follows that lane: of the lanes whose
-    lights it crosses at once the one that its path is nearest to, before the stop point where that lies at the end
-    of the lane, behind it elsewhere.
+    An agent runs a light if its front crosses the stop point in the direction of the lane, within the lane's width
+    and on its level, while the light is red (a plain or arrow stop, not a flashing one), and it follows that lane: of
+    the lanes whose lights it crosses at once the one that its path is nearest to, before the stop point where that
+    lies at the end of the lane, behind it elsewhere.
 
     Args:
         world: everyone.
         evaluated: [M] rows of A.
-        segment: the lights, with their states in all steps of the log.
+        lanes: the map, with the lights and their states in all steps of the log.
         start: step of the log at which the first state lies.
     """
-    lanes = [segment.road.lanes[int(lane)][:, :2].astype(np.float64) for lane in segment.signal_lane]
-    usable = np.array([len(np.unique(line, axis=0)) > 1 for line in lanes], bool)
-    if not usable.any():
-        return Lights(*(np.zeros(0, np.int64) for _ in range(3)))
-    stop = segment.signal_point[:, :2].astype(np.float64)
-    lines = [shapely.LineString(line) if ok else None for line, ok in zip(lanes, usable, strict=True)]
-    direction = np.stack([_direction(line, point) for line, point in zip(lines, stop, strict=True)])
+    segment, graph = lanes.segment, lanes.graph
+    known = np.flatnonzero(graph.length[segment.signal_lane] > 0)
+    lane, stop = segment.signal_lane[known], segment.signal_point[known, :2].astype(np.float64)
+    lines, length = line_strings([graph.lines[each] for each in lane]), graph.length[lane]
+    along_lane = shapely.line_locate_point(lines, shapely.points(stop))
+    piece = np.minimum(1.0, length)
+    begin = np.minimum(along_lane, length - piece)
+    ends = [
+        shapely.get_coordinates(shapely.line_interpolate_point(lines, at)) for at in (begin, begin + piece)
+    ]
+    direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0], axis=-1, keepdims=True)
     heading = world.heading[evaluated]
     forward = np.stack([np.cos(heading), np.sin(heading)], -1)
     front = world.position[evaluated] + 0.5 * world.size[evaluated, 0, None, None] * forward
@@ -62,56 +88,37 @@ def red_lights(world: World, evaluated: Indices, segment: RunSegment, start: int
     away = front[:, :, None] - stop
     along = (away * direction).sum(-1)
     across = away[..., 1] * direction[:, 0] - away[..., 0] * direction[:, 1]
-    beside = np.abs(across[:, 1:]) <= 0.5 * lane_widths(segment.road)[segment.signal_lane]
-    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < 15) & beside & usable
-    same = (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
-    passing &= same & (world.valid[evaluated, 1:] & world.valid[evaluated, :-1])[..., None]
-    who, step = passing.any(-1).nonzero()
+    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < 15)
+    passing &= np.abs(across[:, 1:]) <= 0.5 * lanes.width[lane]
+    passing &= (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
+    passing &= (world.valid[evaluated, 1:] & world.valid[evaluated, :-1])[..., None]
+    if world.height is not None:
+        here, there = world.height[evaluated, 1:, None], lanes.light_height[known]
+        passing &= ~levels_apart(from_numpy(here), from_numpy(there)).numpy()
     found = []
     # There are few crossings.
-    for m, t in zip(who.tolist(), step.tolist(), strict=True):
-        light = _followed(world, int(evaluated[m]), t + 1, passing[m, t].nonzero()[0], lines, stop)
+    for m, t in zip(*(part.tolist() for part in passing.any(-1).nonzero()), strict=True):
+        best, least = -1, _FOLLOWED
+        for light in passing[m, t].nonzero()[0]:
+            at_end = along_lane[light] > 0.5 * length[light]
+            part = slice(0, t + 1) if at_end else slice(t + 1, None)
+            points = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
+            points = points[np.linalg.norm(points - stop[light], axis=-1) <= length[light]]
+            if len(points):
+                distance = float(shapely.distance(lines[light], shapely.points(points)).mean())
+                best, least = (int(light), distance) if distance < least else (best, least)
         # One that changes just then is not held against the agent.
-        if light >= 0 and np.isin(segment.signal_state[light, start + t : start + t + 2], RED).all():
-            found.append((int(evaluated[m]), t + 1, light))
+        if best >= 0 and np.isin(segment.signal_state[known[best], start + t : start + t + 2], RED).all():
+            found.append((int(evaluated[m]), t + 1, int(known[best])))
     return Lights(*np.array(found, np.int64).reshape(-1, 3).T)
 
 
-def _direction(line: shapely.LineString | None, point: Reals) -> Reals:
-    """Unit vector of a lane where it is nearest to a point."""
-    if line is None:
-        return np.zeros(2)
-    at = min(line.project(shapely.Point(point)), line.length - min(1.0, line.length))
-    ends = [np.asarray(line.interpolate(s).coords[0]) for s in (at, at + min(1.0, line.length))]
-    return (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-
-
-def _followed(
-    world: World, agent: int, step: int, lights: Indices, lines: list[shapely.LineString | None], stop: Reals
-) -> int:
-    """Which of the lights is that of the lane an agent follows past a stop point; -1 for none."""
-    path, valid = world.position[agent], world.valid[agent]
-    best, least = -1, _FOLLOWED
-    for light in lights.tolist():
-        line = lines[light]
-        assert line is not None  # noqa: S101 - only usable lanes are passed
-        at_end = line.project(shapely.Point(stop[light])) > 0.5 * line.length
-        part = slice(0, step) if at_end else slice(step, None)
-        points = path[part][valid[part]]
-        driven = np.linalg.norm(points - stop[light], axis=-1)
-        points = points[driven <= line.length]
-        if len(points):
-            distance = float(shapely.distance(line, shapely.points(points)).mean())
-            best, least = (light, distance) if distance < least else (best, least)
-    return best
-
-
-def wrong_way(world: World, evaluated: Indices, graph: LaneGraph) -> Bools:
+def wrong_way(world: World, evaluated: Indices, lanes: Lanes) -> Bools:
     """[M, U] whether an evaluated agent drives in a lane that leads the other way, and in none that leads its way."""
     seen = world.valid[evaluated] & (np.abs(world.speed[evaluated]) > STANDING)
     position, heading = world.position[evaluated][seen], world.heading[evaluated][seen]
-    near = graph.index.near(position, IN_LANE)
-    turn = np.abs((near.heading - heading[near.point] + np.pi) % (2 * np.pi) - np.pi)
+    near = lanes.near(position, IN_LANE, None if world.height is None else world.height[evaluated][seen])
+    turn = turn_between(near.heading, heading[near.point])
     wrong, right = np.zeros((2, len(position)), bool)
     wrong[near.point[turn > WRONG_WAY]] = True
     right[near.point[turn < SAME_WAY]] = True
@@ -120,10 +127,102 @@ def wrong_way(world: World, evaluated: Indices, graph: LaneGraph) -> Bools:
     return out
 
 
-class Progress(NamedTuple):
-    """Metres [K, M] that evaluated agents got on in all, that they did while the log has them, and the log itself.
+def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bools:
+    """[M, U] when evaluated agents block traffic.
 
-    The first two are NaN where an agent went on beyond a route that ends inside the map.
+    That is, they stand (:data:`symphony.metrics.kinds.STANDING`) in a lane that goes on, for :data:`SECONDS` or more,
+    while nobody is in their way ahead or crosses it, no light ahead is other than green, and the log, where it has
+    the agent, moves. All this is on their level.
+
+    Args:
+        world: everyone.
+        evaluated: [M] rows of A.
+        lanes: the map, its lights and the log.
+        start: step of the log at which the first state lies.
+    """
+    segment = lanes.segment
+    within = slice(start, start + world.valid.shape[1])
+    logged = np.linalg.norm(segment.velocity[evaluated, within].astype(np.float64), axis=-1) <= STANDING
+    excused = logged & segment.valid[evaluated, within]
+    stands = world.valid[evaluated] & (np.abs(world.speed[evaluated]) <= STANDING) & ~excused
+    found, (who, step) = np.zeros(stands.shape, bool), _long(stands, segment.dt).nonzero()
+    if not len(who):
+        return found
+    row = evaluated[who]
+    height = None if world.height is None else world.height[row, step]
+    free = _goes_on(lanes, world.position[row, step], world.heading[row, step], height)
+    free &= _nobody_ahead(world, row, step) & _green(world, row, step, lanes, start, height)
+    found[who[free], step[free]] = True
+    return _long(found, segment.dt)
+
+
+def _long(flags: Bools, dt: float) -> Bools:
+    """Flags [M, U] that stay for :data:`SECONDS` at least."""
+    least = math.ceil(SECONDS / dt - 1e-6) + 1
+    if flags.shape[1] < least:
+        return np.zeros_like(flags)
+    whole = np.lib.stride_tricks.sliding_window_view(flags, least, axis=1).all(-1)
+    padded = np.pad(whole, ((0, 0), (least - 1, least - 1)))
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, least, axis=1).any(-1))
+
+
+def _seen_from(world: World, row: Indices, step: Indices, points: Reals) -> tuple[Reals, Reals]:
+    """How far points [E, K, 2] are ahead of agents' fronts, and to their left [E, K]."""
+    heading = world.heading[row, step][:, None]
+    x, y = np.moveaxis(points - world.position[row, step][:, None], -1, 0)
+    cos, sin = np.cos(heading), np.sin(heading)
+    return cos * x + sin * y - 0.5 * world.size[row, :1], cos * y - sin * x
+
+
+def _goes_on(lanes: Lanes, position: Reals, heading: Reals, height: Heights) -> Bools:
+    """Whether agents [E] are in lanes that go on for a while."""
+    graph, lane = lanes.graph, lanes.lane_of(position, heading, height)
+    found, inside = lane >= 0, np.flatnonzero(lane >= 0)
+    lines = graph.index.geometry[np.searchsorted(graph.usable_lanes, lane[inside])]
+    left = graph.length[lane[inside]] - shapely.line_locate_point(lines, shapely.points(position[inside]))
+    follows = np.array([len(after) > 0 for after in graph.successors], bool)
+    found[inside] = follows[lane[inside]] | (left > FREE)
+    return found
+
+
+def _nobody_ahead(world: World, row: Indices, step: Indices) -> Bools:
+    ahead, left = _seen_from(world, row, step, world.position[:, step].swapaxes(0, 1))
+    turn = (world.heading[:, step] - world.heading[row, step]).T
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    along, across = (
+        0.5 * (one * world.size[:, 0] + two * world.size[:, 1]) for one, two in ((cos, sin), (sin, cos))
+    )
+    there = world.valid[:, step].T & (row[:, None] != np.arange(len(world.size)))
+    if world.height is not None:
+        level = from_numpy(world.height[:, step].swapaxes(0, 1))
+        there &= ~levels_apart(level, from_numpy(world.height[row, step])[:, None]).numpy()
+    near = (ahead + along > 0) & (ahead - along < FREE)
+    wide = 0.5 * world.size[row, 1][:, None] + ASIDE
+    in_the_way = near & (np.abs(left) - across < wide)
+    moves = np.abs(world.speed[:, step].T) > STANDING
+    crossing = moves & (sin > math.sin(math.pi / 4)) & (np.hypot(ahead, left) < CROSSING) & (ahead > -along)
+    return ~(there & (in_the_way | crossing)).any(1)
+
+
+def _green(world: World, row: Indices, step: Indices, lanes: Lanes, start: int, height: Heights) -> Bools:
+    segment = lanes.segment
+    points = segment.signal_point[:, :2].astype(np.float64)
+    ahead, left = _seen_from(world, row, step, np.broadcast_to(points, (len(row), *points.shape)))
+    near = (ahead > -_PASSED) & (ahead < FREE) & (np.abs(left) < _LANE)
+    if height is not None:
+        near &= ~levels_apart(from_numpy(height[:, None]), from_numpy(lanes.light_height)).numpy()
+    state = segment.signal_state[:, np.minimum(start + step, segment.num_steps - 1)].T
+    green = (state == SignalState.GO) | (state == SignalState.ARROW_GO)
+    return ~(near & ~green).any(1)
+
+
+class Progress(NamedTuple):
+    """Metres [K, M] along the way.
+
+    Attributes:
+        driven: what evaluated agents got on in all; NaN where one went on beyond a route that ends inside the map.
+        compared: what they got on while the log has them; NaN where ``driven`` is.
+        logged: what the log itself got on.
     """
 
     driven: Reals
@@ -131,7 +230,7 @@ class Progress(NamedTuple):
     logged: Reals
 
 
-def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
+def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> Progress:
     """How far evaluated agents (numbers [M] of the driven ones) got on.
 
     It is measured along the route that an agent follows, and beyond its end along the path of the log, where the log
@@ -153,33 +252,26 @@ def progress(saved: SavedRollouts, evaluated: Indices) -> Progress:
     if not has.any():
         return Progress(driven, compared, logged)
     # Agents have routes of their own, so a route is that of one agent.
-    number = np.broadcast_to(np.arange(len(evaluated)), goal.shape)
-    pairs = dict(zip(goal[has].tolist(), number[has].tolist(), strict=True))
-    whole = {
-        route: _with_log(saved.routes[route][:, :2].astype(np.float64), log[agent], seen[agent])
+    pairs = dict(zip(goal[has].tolist(), has.nonzero()[1].tolist(), strict=True))
+    who, number = list(pairs.values()), {route: k for k, route in enumerate(pairs)}
+    which = [number[route] for route in goal[has].tolist()]
+    whole = [
+        _with_log(saved.routes[route][:, :2].astype(np.float64), log[agent], seen[agent])
         for route, agent in pairs.items()
-    }
-    most = max(map(len, whole.values()))
-    along = {route: np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for route, line in whole.items()}
-    lines = np.stack([along[route] for route in goal[has].tolist()])
-    places = stations_along(lines, path[has], there[has])
+    ]
+    most = max(map(len, whole))
+    lines = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in whole])
+    places = stations_along(lines[which], path[has], there[has])
     driven[has], compared[has] = _advance(places, there[has]), _advance(places, both[has])
-    who = list(pairs.values())
-    of_log = stations_along(np.stack(list(along.values())), log[who], seen[who])
-    advance = dict(zip(whole, _advance(of_log, seen[who]).tolist(), strict=True))
-    logged[has] = [advance[route] for route in goal[has].tolist()]
+    logged[has] = _advance(stations_along(lines, log[who], seen[who]), seen[who])[which]
     # Whoever is farther from the end than a vehicle is long has gone on from it.
-    past = np.linalg.norm(path[has] - lines[:, -1:], axis=-1) > PAST_END
-    past &= places >= np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)[:, None] - 1e-3
-    beyond = np.flatnonzero((past & there[has]).any(1))
-    if len(beyond):
-        graph = LaneGraph(saved.segment.road)
-        open_end = {route: ends_inside(graph, line) for route, line in whole.items()}
-        undefined = [k for k in beyond.tolist() if open_end[int(goal[has][k])]]
-        for part in (driven, compared):
-            values = part[has]
-            values[undefined] = np.nan
-            part[has] = values
+    past = np.linalg.norm(path[has] - lines[which][:, -1:], axis=-1) > PAST_END
+    past &= places >= np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)[which][:, None] - 1e-3
+    beyond = np.zeros_like(has)
+    beyond[has] = (past & there[has]).any(1)
+    if beyond.any():
+        beyond[has] &= np.array([ends_inside(lanes.graph, line) for line in whole])[which]
+        driven[beyond] = compared[beyond] = np.nan
     return Progress(driven, compared, logged)
 
 

@@ -15,19 +15,19 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+import torch
 from torch import from_numpy
 
-from symphony.data.segment import AgentType, LaneType, RoadMap, RunSegment
-from symphony.evaluation.contacts import STILL, Bools, Contacts, Indices, Reals, poses
+from symphony.data.segment import AgentType
+from symphony.evaluation.contacts import STILL, Bools, Contacts, Indices, Reals, pose_ends
+from symphony.evaluation.driving import Lights
+from symphony.evaluation.lanes import Heights, Lanes
+from symphony.geometry import pose_at
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind
 from symphony.metrics.kinds import STANDING
-from symphony.roadgraph import LaneGraph, lane_of
 from symphony.saved.world import World
 
-NOMINAL_WIDTH = 3.6
-"""Metres, of lanes whose width is not known."""
-BIKE_WIDTH = 1.6
 RED_SECONDS = 5.0
 """Seconds for which an agent that ran a red light answers for whom it meets across."""
 CUT_IN_SECONDS = 4.0
@@ -48,17 +48,17 @@ _AHEAD = 30.0
 _FRONT, _REAR, _SIDE = range(3)
 
 
-class Lights(NamedTuple):
-    """Lights that were red when agents drove past, all [E]: row of A, state, light."""
-
-    agent: Indices
-    step: Indices
-    light: Indices
-
-
 class _Party(NamedTuple):
-    """One of the two at each contact: row [E], position [E, 2], heading [E], velocity [E, 2], speed along the heading
-    [E], box [E, 2].
+    """One of the two at each contact.
+
+    Attributes:
+        row: [E] of A.
+        position: [E, 2].
+        heading: [E].
+        velocity: [E, 2].
+        speed: [E] along the heading.
+        size: [E, 2] of the box.
+        height: [E, 2] height and level; None where the map has no levels.
     """
 
     row: Indices
@@ -67,28 +67,22 @@ class _Party(NamedTuple):
     velocity: Reals
     speed: Reals
     size: Reals
+    height: Heights
 
 
-def at_fault(
-    world: World,
-    found: Contacts,
-    graph: LaneGraph,
-    segment: RunSegment,
-    offroad: Bools,
-    lights: Lights | None = None,
-) -> Bools:
+def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights: Lights) -> Bools:
     """Whether the agent of each contact is at fault [E].
 
     Args:
         world: everyone.
         found: the contacts.
-        graph: the lanes.
-        segment: they are of; its time step, too.
+        lanes: of the segment that they are in.
         offroad: [A, U] whether an agent is off the road; read for the agents of contacts only.
-        lights: that anybody ran; None for none.
+        lights: red ones that any of the agents ran.
     """
     if not len(found.agent):
         return np.zeros(0, bool)
+    segment = lanes.segment
     me, it = _party(world, found.agent, found), _party(world, found.other, found)
     kind, face = found.kind, _face(me, it)
     ends = np.isin(kind, [CollisionKind.INTO_LEADER, CollisionKind.REAR_ENDED])
@@ -102,7 +96,7 @@ def at_fault(
     red, their_red = (
         across & _ran_red(party.row, found.step, lights, RED_SECONDS / segment.dt) for party in (me, it)
     )
-    reaching, their_reaching = (_reaching(one, two, graph, segment.road) for one, two in ((me, it), (it, me)))
+    reaching, their_reaching = (_reaching(one, two, lanes) for one, two in ((me, it), (it, me)))
     reaching = reaching | offroad[me.row, found.step]
     backing = (me.speed < -STILL) & (face == _REAR)
     beside = np.isin(kind, [CollisionKind.ONCOMING, CollisionKind.SIDESWIPE])
@@ -127,12 +121,16 @@ def at_fault(
 
 def _party(world: World, row: Indices, found: Contacts) -> _Party:
     other = np.where(row == found.agent, found.other, found.agent)
-    position, heading, velocity = poses(world, row, other, found.step, found.share)
+    ends = torch.stack(pose_ends(world, row, other, found.step), 1)
+    share = torch.from_numpy(found.share)
+    position, heading = (part.numpy() for part in pose_at(ends[..., :2], ends[..., 2], share))
+    velocity = (ends[:, 0, 3:] + share[:, None] * (ends[:, 1, 3:] - ends[:, 0, 3:])).numpy()
     # The box may have turned by half a turn; where its front is the state says.
     front = world.heading[row, found.step]
     heading = heading + np.pi * (np.cos(heading - front) < 0)
     speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
-    return _Party(row, position, heading, velocity, speed, world.size[row])
+    height = None if world.height is None else world.height[row, found.step]
+    return _Party(row, position, heading, velocity, speed, world.size[row], height)
 
 
 def _face(me: _Party, it: _Party) -> Indices:
@@ -156,18 +154,16 @@ def _face(me: _Party, it: _Party) -> Indices:
     return np.where(which == 0, end, np.where(which == 1, side, corner))
 
 
-def _ran_red(row: Indices, step: Indices, lights: Lights | None, steps: float) -> Bools:
-    if lights is None:
-        return np.zeros(len(row), bool)
+def _ran_red(row: Indices, step: Indices, lights: Lights, steps: float) -> Bools:
     since = step[:, None] - lights.step
     return ((lights.agent == row[:, None]) & (since >= 0) & (since <= steps)).any(-1)
 
 
-def _reaching(me: _Party, it: _Party, graph: LaneGraph, road: RoadMap) -> Bools:
+def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:
     """Whether an agent is in no lane, reaches over that edge of its lane which is towards the other, or over the far
     one on its way in [E].
     """
-    lane = lane_of(graph, me.position, me.heading)
+    graph, lane = lanes.graph, lanes.lane_of(me.position, me.heading, me.height)
     found = np.ones(len(lane), bool)
     inside = lane >= 0
     number = np.searchsorted(graph.usable_lanes, lane[inside])
@@ -181,7 +177,7 @@ def _reaching(me: _Party, it: _Party, graph: LaneGraph, road: RoadMap) -> Bools:
     side = np.sign(((it.position[inside] - here) * left).sum(-1))
     off = side * ((here - nearest) * left).sum(-1)
     coming = side * (me.velocity[inside] * left).sum(-1) > ENTERING
-    reach = 0.5 * lane_widths(road)[lane[inside]] + _EDGE - covered
+    reach = 0.5 * lanes.width[lane[inside]] + _EDGE - covered
     found[inside] = (off > reach) | (coming & (off < -reach))
     return found
 
@@ -203,7 +199,8 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: floa
     start = np.take_along_axis(ours, seen.argmax(1)[:, None, None], 1)
     path = np.concatenate([np.where(seen[..., None], ours, start), onward[:, None]], 1)
     half = 0.5 * world.size
-    beside = _distance(theirs, path) - (half[rear, 1] + half[front, 1])[:, None]
+    away = shapely.distance(shapely.linestrings(path)[:, None], shapely.points(theirs))
+    beside = away - (half[rear, 1] + half[front, 1])[:, None]
     outside = known & (beside > 0)
     # The first state from which on it stays in the path.
     entered = outside.shape[1] - outside[:, ::-1].argmax(1)
@@ -218,18 +215,3 @@ def safe_distance(behind: Reals, ahead: Reals) -> Reals:
     faster = behind + RESPONSE * SPEED_UP
     travel = behind * RESPONSE + 0.5 * SPEED_UP * RESPONSE**2 + faster**2 / (2 * BRAKE_LEAST)
     return np.maximum(travel - ahead**2 / (2 * BRAKE_MOST), 0.0)
-
-
-def _distance(points: Reals, path: Reals) -> Reals:
-    """Metres [E, W] of points [E, W, 2] from polylines [E, P, 2]."""
-    begin, step = path[:, None, :-1], np.diff(path, axis=1)[:, None]
-    away = points[:, :, None] - begin
-    squared = (step**2).sum(-1)
-    along = np.clip((away * step).sum(-1) / np.maximum(squared, 1e-12), 0, 1)
-    return np.linalg.norm(away - along[..., None] * step, axis=-1).min(-1)
-
-
-def lane_widths(road: RoadMap) -> Reals:
-    """[L] metres, nominal ones where the source has none."""
-    nominal = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, NOMINAL_WIDTH)
-    return np.where(np.isnan(road.lane_width), nominal, road.lane_width).astype(np.float64)

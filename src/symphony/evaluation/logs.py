@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import shapely
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, interactive_agents, travel
@@ -21,6 +21,7 @@ from symphony.envs.scene import scene
 from symphony.errors import DataError
 from symphony.geometry.frames import forward_speed
 from symphony.roadgraph import LaneGraph, visited_regions
+from symphony.roadgraph.lines import turn_between
 from symphony.rollouts.driving import playback
 
 PERCENTILES = (1, 5, 50, 95, 99)
@@ -35,27 +36,8 @@ LIMITS = {"collision_rate": 0.5, "offroad_time": 0.5}
 LEAST_DIRECTION = 15.0
 """Percent of the choices that each direction has in a good set."""
 _CHUNK = 64
-
-Progress = Callable[[int, int], None]
-"""Called with the segments measured and how many there are."""
-
-
-@dataclass
-class _Sums:
-    """Values of all agents measured so far."""
-
-    collided: list[bool] = field(default_factory=list)
-    off: list[NDArray[np.bool_]] = field(default_factory=list)
-    speed: list[NDArray[np.float64]] = field(default_factory=list)
-    acceleration: list[NDArray[np.float64]] = field(default_factory=list)
-    yaw_rate: list[NDArray[np.float64]] = field(default_factory=list)
-    lateral: list[NDArray[np.float64]] = field(default_factory=list)
-    fit_error: list[float] = field(default_factory=list)
-    branches: list[NDArray[np.float64]] = field(default_factory=list)
-    turns: list[bool] = field(default_factory=list)
-    agents: list[int] = field(default_factory=list)
-    moving: list[int] = field(default_factory=list)
-    lights: list[bool] = field(default_factory=list)
+_Sums = defaultdict[str, list[Any]]
+"""Values of all agents measured so far."""
 
 
 def measure(
@@ -63,7 +45,7 @@ def measure(
     *,
     interactive: int = 2,
     dynamics: Bicycle | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Measure the logged driving of the interactive agents (see ``interactive_agents``) in every segment.
 
@@ -71,7 +53,7 @@ def measure(
         store: the run segments.
         interactive: agents measured in each, the ego included (N_I).
         dynamics: the action space their logs are fitted to.
-        progress: told how far it is.
+        progress: called with the segments measured and how many there are.
 
     Returns:
         As JSON can hold it: ``segments`` and ``skipped`` (with fewer agents); ``collision_rate`` (percent of segments
@@ -86,8 +68,7 @@ def measure(
     Raises:
         DataError: no segment has so many interactive agents.
     """
-    dynamics = dynamics or Bicycle()
-    sums, skipped = _Sums(), 0
+    sums, skipped = _Sums(list), 0
 
     @lru_cache(maxsize=16)
     def graph_of(number: int) -> LaneGraph:
@@ -104,40 +85,57 @@ def measure(
                 continue
             chosen.append((segment, rows))
             _add(sums, segment, rows, graph_of(int(store.map_index[i])))
-        _add_fits(sums, chosen, dynamics)
+        _add_fits(sums, chosen, dynamics or Bicycle())
         if progress is not None:
             progress(min(begin + _CHUNK, len(store)), len(store))
-    if not sums.collided:
+    if not sums["collided"]:
         message = f"none of {len(store)} segments has {interactive} interactive agents"
         raise DataError(message, file=store.path)
-    return {"interactive": interactive, "segments": len(sums.collided), "skipped": skipped, **_summary(sums)}
+    turn = np.concatenate(sums["branches"])
+    directions = {"straight": np.abs(turn) <= STRAIGHT, "left": turn > STRAIGHT, "right": turn < -STRAIGHT}
+    spreads = ("speed", "acceleration", "yaw_rate", "lateral_offset", "fit_error", "agents", "moving")
+    return {
+        "interactive": interactive,
+        "segments": len(sums["collided"]),
+        "skipped": skipped,
+        "collision_rate": _percent(np.concatenate(sums["collided"])),
+        "offroad_time": _percent(np.concatenate(sums["off"])),
+        "directions": {name: _percent(share) for name, share in directions.items()},
+        "choices": len(turn),
+        "turning": _percent(np.concatenate(sums["turns"])),
+        **{name: _spread(np.concatenate(sums[name])) for name in spreads},
+        "lights": _percent(np.concatenate(sums["lights"])),
+    }
 
 
 def _add(sums: _Sums, segment: RunSegment, rows: NDArray[np.int64], graph: LaneGraph) -> None:
-    """Everything but the fit, of one segment."""
+    """Add everything but the fit of one segment."""
     valid = segment.valid[rows]
     position = segment.position[rows, :, :2].astype(np.float64)
     heading, velocity = segment.heading[rows].astype(np.float64), segment.velocity[rows].astype(np.float64)
     # As the evaluator does, so that no figure here can differ from the playback row of a table.
     log = playback(scene(segment, rows.tolist()))
-    sums.collided.append(bool(log.collision.any()))
-    sums.off.append(log.offroad[log.counted].numpy())
     speed = np.linalg.norm(velocity, axis=-1)
     both = valid[:, 1:] & valid[:, :-1]
     turn = np.angle(np.exp(1j * np.diff(heading, axis=1)))
-    sums.speed.append(speed[valid])
-    sums.acceleration.append(np.diff(speed, axis=1)[both] / segment.dt)
-    sums.yaw_rate.append(turn[both] / segment.dt)
     spans = np.ptp(np.pad(np.cumsum(np.where(both, turn, 0), axis=1), ((0, 0), (1, 0))), axis=1)
-    sums.turns += (spans > STRAIGHT).tolist()
-    visited = np.nonzero(visited_regions(graph, position, heading, valid))[1]
-    lanes = graph.regions.lane[visited]
-    sums.branches.append(graph.curvature[lanes] * graph.length[lanes])
-    sums.lateral.append(_lateral(graph, position[valid], heading[valid]))
+    lanes = graph.regions.lane[np.nonzero(visited_regions(graph, position, heading, valid))[1]]
     seen = segment.valid[:, 0] & (segment.agent_type == AgentType.VEHICLE)
-    sums.agents.append(segment.num_agents)
-    sums.moving.append(int((seen & (travel(segment) > MOVING)).sum()))
-    sums.lights.append(len(segment.signal_lane) > 0)
+    found = {
+        "collided": [bool(log.collision.any())],
+        "off": log.offroad[log.counted].numpy(),
+        "speed": speed[valid],
+        "acceleration": np.diff(speed, axis=1)[both] / segment.dt,
+        "yaw_rate": turn[both] / segment.dt,
+        "turns": spans > STRAIGHT,
+        "branches": graph.curvature[lanes] * graph.length[lanes],
+        "lateral_offset": _lateral(graph, position[valid], heading[valid]),
+        "agents": [segment.num_agents],
+        "moving": [int((seen & (travel(segment) > MOVING)).sum())],
+        "lights": [len(segment.signal_lane) > 0],
+    }
+    for name, values in found.items():
+        sums[name].append(values)
 
 
 def _lateral(
@@ -146,24 +144,14 @@ def _lateral(
     """Metres to the left of the nearest straight lane's centre, of the points [K, 2] that are in one."""
     near = graph.index.near(points, IN_LANE)
     lane = graph.usable_lanes[near.line]
-    turn = np.angle(np.exp(1j * (near.heading - heading[near.point])))
-    keep = (np.abs(graph.curvature[lane]) < BEND) & (np.abs(turn) < 0.2)
-    order = np.lexsort((near.distance[keep], near.point[keep]))
-    point, first = np.unique(near.point[keep][order], return_index=True)
-    line, along = near.line[keep][order][first], near.along[keep][order][first]
-    sign = [
-        _side(graph.lines[graph.usable_lanes[k]], graph.arc[graph.usable_lanes[k]], s, points[p])
-        for k, s, p in zip(line, along, point, strict=True)
-    ]
-    return np.array(sign) * near.distance[keep][order][first]
-
-
-def _side(
-    line: NDArray[np.float64], arc: NDArray[np.float64], along: float, point: NDArray[np.float64]
-) -> float:
-    k = int(np.clip(np.searchsorted(arc, along, side="right") - 1, 0, len(line) - 2))
-    ahead, away = line[k + 1] - line[k], point - line[k]
-    return math.copysign(1.0, ahead[0] * away[1] - ahead[1] * away[0])
+    turn = turn_between(near.heading, heading[near.point])
+    near = near.only((np.abs(graph.curvature[lane]) < BEND) & (turn < 0.2))
+    order = np.lexsort((near.distance, near.point))
+    near = near.only(order[np.unique(near.point[order], return_index=True)[1]])
+    centre = shapely.line_interpolate_point(graph.index.geometry[near.line], near.along)
+    away = points[near.point] - shapely.get_coordinates(centre)
+    left = np.cos(near.heading) * away[:, 1] - np.sin(near.heading) * away[:, 0]
+    return np.copysign(near.distance, left)
 
 
 def _add_fits(sums: _Sums, chosen: list[tuple[RunSegment, NDArray[np.int64]]], dynamics: Bicycle) -> None:
@@ -172,38 +160,16 @@ def _add_fits(sums: _Sums, chosen: list[tuple[RunSegment, NDArray[np.int64]]], d
     for segment, rows in chosen:
         groups.setdefault((segment.num_steps, segment.dt), []).append((segment, rows))
     for (steps, dt), group in groups.items():
-
-        def gather(name: str, group: list[tuple[RunSegment, NDArray[np.int64]]] = group) -> Tensor:
-            return torch.from_numpy(np.concatenate([getattr(s, name)[rows] for s, rows in group]))
-
-        position, heading, velocity = gather("position")[..., :2], gather("heading"), gather("velocity")
-        valid, size = gather("valid"), gather("size")[:, :2]
-        speed = forward_speed(velocity, heading)
-        _, states = dynamics.fit(position, heading, speed, valid, size, dt)
+        position, heading, velocity, valid, size = (
+            torch.from_numpy(np.concatenate([getattr(segment, name)[rows] for segment, rows in group]))
+            for name in ("position", "heading", "velocity", "valid", "size")
+        )
+        position, speed = position[..., :2], forward_speed(velocity, heading)
+        _, states = dynamics.fit(position, heading, speed, valid, size[:, :2], dt)
         last = steps - 1 - valid.flip(1).int().argmax(1)
         which = torch.arange(len(last))
-        sums.fit_error += (states[which, last, :2] - position[which, last]).norm(dim=-1).tolist()
-
-
-def _summary(sums: _Sums) -> dict[str, Any]:
-    turn = np.concatenate(sums.branches)
-    directions = {"straight": np.abs(turn) <= STRAIGHT, "left": turn > STRAIGHT, "right": turn < -STRAIGHT}
-    off = np.concatenate(sums.off)
-    return {
-        "collision_rate": _percent(np.array(sums.collided)),
-        "offroad_time": _percent(off),
-        "directions": {name: _percent(share) for name, share in directions.items()},
-        "choices": len(turn),
-        "turning": _percent(np.array(sums.turns)),
-        "speed": _spread(np.concatenate(sums.speed)),
-        "acceleration": _spread(np.concatenate(sums.acceleration)),
-        "yaw_rate": _spread(np.concatenate(sums.yaw_rate)),
-        "lateral_offset": _spread(np.concatenate(sums.lateral)),
-        "fit_error": _spread(np.array(sums.fit_error)),
-        "agents": _spread(np.array(sums.agents)),
-        "moving": _spread(np.array(sums.moving)),
-        "lights": _percent(np.array(sums.lights)),
-    }
+        away = states[which, last, :2] - position[which, last]
+        sums["fit_error"].append(away.norm(dim=-1).double().numpy())
 
 
 def _percent(flags: NDArray[np.bool_]) -> float:

@@ -60,13 +60,10 @@ _TABLES: dict[tuple[Setting, PaperData], str] = {
 }
 
 
-def paper_figures(setting: Setting, dataset: PaperData) -> dict[str, dict[str, Figure]] | None:
-    """The paper's figures by method and metric, in our units (the divergence in nats); None if it has none."""
-    text = _TABLES.get((setting, dataset))
-    if text is None:
-        return None
+def paper_figures(setting: Setting, dataset: PaperData) -> dict[str, dict[str, Figure]]:
+    """The paper's figures by method and metric, in our units (the divergence in nats); empty if it has none."""
     found = {}
-    for method, *words in (line.split() for line in text.strip().splitlines()):
+    for method, *words in (line.split() for line in _TABLES.get((setting, dataset), "").strip().splitlines()):
         values = [math.nan if word == "-" else float(word) for word in words]
         figures = dict(zip(METRICS, zip(values[::2], values[1::2], strict=True), strict=True))
         mean, error = figures["curvature_jsd"]

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from symphony.errors import ConfigError, DataError
+from symphony.evaluation.records import read_object
 from symphony.evaluation.report import grouped_mean, report, total_numbers
-from symphony.files import locating
 from symphony.metrics.intervals import t_quantile
 from symphony.saved.folder import LATER, RolloutFolder
-from symphony.saved.rollouts import PLAYBACK, SavedRollouts
+from symphony.saved.rollouts import PLAYBACK
 
 FORMAT = 1
 """Version of a record."""
@@ -29,7 +27,7 @@ COLUMNS = (
     ("failed_runs", "failed", 0),
 )
 """Numbers of the table, their headings and digits."""
-_KEPT = (
+_RUN = (
     "segment",
     "rollout",
     "group",
@@ -42,19 +40,16 @@ _KEPT = (
 )
 """Of each run, in a record."""
 _LATER = ("beyond_route", "no_route")
-"""Likewise, but in older records there are none; they count as 0."""
-
-FREE = ("planner", "planner_seconds", "rollouts")
+"""Of each run, too, but in older records there are none; they count as 0."""
+_FREE = ("planner", "planner_seconds", "rollouts")
 """Settings that are the planner's own, and how often it is tried."""
-BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
-"""Those that mean something where all others play back their log."""
-
-_NUMBER = (int, float, type(None))
+_BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
+"""Settings that mean something where all others play back their log."""
 
 Record = dict[str, Any]
 
 
-def run_score(run: Record) -> float | None:
+def run_score(run: Mapping[str, Any]) -> float | None:
     """0 to 100 of one run: the progress relative to the log's, at most all of it; 0 for a run that failed, with a
     collision at fault, a red light, or time off the road. 100 where the log stays in place, as there is no progress
     to make; None where progress is not defined: beyond a route that ends inside the map, or without a route.
@@ -66,12 +61,6 @@ def run_score(run: Record) -> float | None:
     return 100.0 * min(max(float(run["progress_ratio"]), 0.0), 1.0)
 
 
-def _along_route(row: Record) -> Record:
-    """A run whose metres are no progress if the planner had no route but made some: it may have gone anywhere."""
-    lost = bool(row["no_route"]) and row["progress_ratio"] is not None
-    return row | {"no_route": int(lost), "progress_ratio": None if lost else row["progress_ratio"]}
-
-
 def planner_record(folder: RolloutFolder) -> Record:
     """How the planner in a folder of rollouts drove.
 
@@ -79,82 +68,39 @@ def planner_record(folder: RolloutFolder) -> Record:
         ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
         ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
         evaluated, progress relative to the log's along routes only; ``score``, the mean of :func:`run_score`,
-        ``score_se``, and ``score_runs`` that have one; ``search``, what :func:`selection` gives, None where no search
-        was kept; ``per_run``.
+        ``score_se``, and ``score_runs`` that have one; ``per_run``.
 
     Raises:
         DataError: there is no planner in it, or a file of it can't be read.
     """
-    drivers = folder.about.drivers
-    if "ego" not in drivers:
+    about = folder.about
+    if "ego" not in about.drivers:
         raise DataError("no planner drove here: simulate with --planner", file=folder.path, field="drivers")
-    found = report(folder, "ego")
-    rows = [_along_route(row) for row in found.rows]
-    per_run = [{name: row[name] for name in (*_KEPT, *_LATER)} for row in rows]
-    groups: list[str] = [row["group"] or row["segment"] for row in rows]
-    number = np.unique(groups, return_inverse=True)[1] if groups else np.zeros(0, np.int64)
-    scores = np.array([run_score(row) for row in per_run], np.float64)
+    rows = report(folder, "ego").rows
+    for row in rows:
+        # Metres of a planner without a route are no progress: it may have gone anywhere.
+        lost = bool(row["no_route"]) and row["progress_ratio"] is not None
+        row |= {"no_route": int(lost), "progress_ratio": None if lost else row["progress_ratio"]}
+    member = np.unique([row["group"] for row in rows], return_inverse=True)[1]
+    scores = np.array([run_score(row) for row in rows], np.float64)
     known = ~np.isnan(scores)
-    score, error = grouped_mean(np.where(known, scores, 0.0), known.astype(np.float64), number)
+    score, error = grouped_mean(np.where(known, scores, 0.0), known.astype(np.float64), member)
     return {
         "format": FORMAT,
-        "planner": drivers["ego"],
-        "crowd": drivers["interactive"],
-        "settings": dict(folder.about.settings),
+        "planner": about.drivers["ego"],
+        "crowd": about.drivers["interactive"],
+        "settings": dict(about.settings),
         # The path is of no use elsewhere.
-        "store": {"name": _store_name(folder.about.store), "checksum": folder.about.store["checksum"]},
+        "store": {
+            "name": "/".join(Path(str(about.store["path"])).parts[-2:]),
+            "checksum": about.store["checksum"],
+        },
         **total_numbers(rows),
         "score": score,
         "score_se": error,
         "score_runs": int(known.sum()),
-        "search": selection(saved for saved in folder if saved.trees is not None),
-        "per_run": per_run,
+        "per_run": [{name: row[name] for name in (*_RUN, *_LATER)} for row in rows],
     }
-
-
-def _store_name(store: Any) -> str:
-    return "/".join(Path(store["path"]).parts[-2:])
-
-
-def selection(found: Iterable[SavedRollouts]) -> Record | None:
-    """Whether searches flatter the ego, which they don't score: how often it begins to collide, per 100 steps without
-    a collision, in all that was ``simulated`` and in what was ``kept`` (the leaves); None without any search.
-    """
-    counts = sum((_begun(saved) for saved in found), np.zeros((2, 2)))
-    if not counts.any():
-        return None
-    out: Record = {}
-    for name, (begun, steps) in zip(("simulated", "kept"), counts.tolist(), strict=True):
-        out |= {name: 100.0 * begun / steps if steps else None, f"{name}_steps": int(steps)}
-    return out
-
-
-def _begun(saved: SavedRollouts) -> NDArray[np.float64]:
-    """[2, 2] collisions of the ego that begin, and the steps at which one could, in all slots and in leaves."""
-    trees = saved.trees
-    if trees is None:
-        return np.zeros((2, 2))
-    hit = trees.collision[..., 0]
-    before = np.zeros_like(hit)
-    before[..., 1:] = hit[..., :-1]
-    # The first step of a period follows the slot it was continued from.
-    for period in range(1, trees.parents.shape[1]):
-        step = period * trees.prune_every
-        if step < hit.shape[-1]:
-            before[..., step] = np.take_along_axis(hit[..., step - 1], trees.parents[:, period - 1], -1)
-    # Of leaves as of all slots at states; what is saved of rollouts is also found between them.
-    slot = np.repeat(trees.slots, trees.prune_every, 1)[:, : hit.shape[-1]]
-    own = np.take_along_axis(hit, slot.swapaxes(1, 2), 1).reshape(saved.counted.shape[:2])
-    own &= saved.counted[..., 0]
-    own_before = np.zeros_like(own)
-    own_before[:, 1:] = own[:, :-1]
-    going = saved.counted[..., 0]
-    return np.array(
-        [
-            [float((hit & ~before).sum()), float((~before).sum())],
-            [float((own & ~own_before).sum()), float((going & ~own_before).sum())],
-        ]
-    )
 
 
 def read_planner_record(path: Path) -> Record:
@@ -163,26 +109,17 @@ def read_planner_record(path: Path) -> Record:
     Raises:
         DataError: it can't be read, or is no such record.
     """
-    with locating(path):
-        text = path.read_text(encoding="utf-8", errors="replace")
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"not valid JSON ({error})", file=path) from error
-    if not isinstance(found, dict) or found.get("format") != FORMAT or "planner" not in found:
+    found = read_object(path)
+    if found.get("format") != FORMAT or "planner" not in found:
         raise DataError("no record of a planner (format 1)", file=path, field="format")
-    needed = ("crowd", "settings", "store", "per_run", *(name for name, _, _ in COLUMNS))
-    missing = [name for name in needed if name not in found]
-    if missing:
-        raise DataError("missing in this record of a planner", file=path, field=missing[0])
-    kinds = {"settings": dict, "store": dict, "per_run": list} | {name: _NUMBER for name, _, _ in COLUMNS}
-    wrong = [name for name, kind in kinds.items() if not isinstance(found[name], kind)]
-    runs = [] if wrong else found["per_run"]
-    if wrong or "checksum" not in found["store"]:
-        raise DataError(
-            "is not what a record of a planner has", file=path, field=(*wrong, "store.checksum")[0]
-        )
-    if not all(isinstance(run, dict) and run.keys() >= set(_KEPT) for run in runs):
+    kinds: dict[str, Any] = {"crowd": str, "settings": dict, "store": dict, "per_run": list}
+    kinds |= {name: (int, float, type(None)) for name, _, _ in COLUMNS}
+    wrong = [name for name, kind in kinds.items() if name not in found or not isinstance(found[name], kind)]
+    if not wrong and "checksum" not in found["store"]:
+        wrong = ["store"]
+    if wrong:
+        raise DataError("is not what a record of a planner has", file=path, field=wrong[0])
+    if not all(isinstance(run, dict) and run.keys() >= set(_RUN) for run in found["per_run"]):
         raise DataError("has a run without one of its numbers", file=path, field="per_run")
     return found
 
@@ -200,33 +137,43 @@ def crowd_name(record: Record) -> str:
     return f"{name}, {driven} driven{search}" + ("" if others == "log" else f", others {others}")
 
 
+def planner_title(record: Record) -> str:
+    """The planner's name without its folder."""
+    return str(record["planner"]).rpartition("/")[2]
+
+
+def _crowds(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """Records by their crowd, the best score first, those without any last."""
+    crowds: dict[str, list[Record]] = {}
+    for one in records:
+        crowds.setdefault(crowd_name(one), []).append(one)
+    return {
+        name: sorted(members, key=lambda one: (one["score"] is None, -(one["score"] or 0.0)))
+        for name, members in crowds.items()
+    }
+
+
 def planner_grid(records: Sequence[Record]) -> list[list[str]]:
     """A line for each record, its heading first; planners of a crowd beside each other, the best score first."""
-    order = {name: k for k, name in reversed(list(enumerate(crowd_name(one) for one in records)))}
-    ranked = sorted(records, key=lambda one: (order[crowd_name(one)], *_place(one)))
     grid = [["crowd", "planner", *(heading for _, heading, _ in COLUMNS)]]
-    for one in ranked:
-        cells = []
-        for name, _, digits in COLUMNS:
-            value, error = one[name], one.get(f"{name}_se")
-            text, bound = "–" if value is None else f"{value:.{digits}f}", one.get(f"{name}_bound")
-            spread = "" if value is None or error is None else f" ± {error:.{digits}f}"
-            cells.append(text + (spread if bound is None else f" (≤ {bound:.{digits}f})"))
-        grid.append([crowd_name(one), planner_title(one), *cells])
+    for crowd, members in _crowds(records).items():
+        for one in members:
+            cells = []
+            for name, _, digits in COLUMNS:
+                value, error, bound = one[name], one.get(f"{name}_se"), one.get(f"{name}_bound")
+                text = "–" if value is None else f"{value:.{digits}f}"
+                spread = "" if value is None or error is None else f" ± {error:.{digits}f}"
+                cells.append(text + (spread if bound is None else f" (≤ {bound:.{digits}f})"))
+            grid.append([crowd, planner_title(one), *cells])
     return grid
-
-
-def _place(record: Record) -> tuple[bool, float]:
-    """By which records are in order, the best score first, none last."""
-    return record["score"] is None, -(record["score"] or 0.0)
 
 
 def without_score(records: Sequence[Record]) -> list[str]:
     """Which runs have no score, in a sentence, where some have none."""
-    lost = [sum(run_score(run) is None for run in one["per_run"]) for one in records]
+    lost = [(one, sum(run_score(run) is None for run in one["per_run"])) for one in records]
     found = [
         f"{planner_title(one)} among {crowd_name(one)} {count} of {len(one['per_run'])} runs"
-        for one, count in zip(records, lost, strict=True)
+        for one, count in lost
         if count
     ]
     return [f"without a score, as progress is not defined: {', '.join(found)}"] if found else []
@@ -243,11 +190,6 @@ def counted_at_states(records: Sequence[Record]) -> list[str]:
     return [f"collisions are found between states, too; at states only: {', '.join(found)}"] if found else []
 
 
-def planner_title(record: Record) -> str:
-    """The planner's name without its folder."""
-    return str(record["planner"]).rpartition("/")[2]
-
-
 def check_crowds(records: Sequence[Record]) -> None:
     """Refuse to put planners beside each other that did not meet the same.
 
@@ -257,19 +199,19 @@ def check_crowds(records: Sequence[Record]) -> None:
     first: dict[str, Record] = {}
     for one in records:
         other = first.setdefault(crowd_name(one), one)
-        weights = [each["settings"].get("weights") for each in (one, other)]
-        names = [name for name in dict.fromkeys([*other["settings"], *one["settings"]]) if name not in FREE]
+        here, there = one["settings"], other["settings"]
+        names = [name for name in dict.fromkeys([*there, *here]) if name not in _FREE]
         if one["crowd"] == other["crowd"] == PLAYBACK:
-            names = [name for name in names if name in BESIDE_LOG]
+            names = [name for name in names if name in _BESIDE_LOG]
         # Records from before these were kept lack them.
-        lacking = {name for name in LATER if None in (one["settings"].get(name), other["settings"].get(name))}
-        names = [name for name in names if name not in lacking]
-        pairs = [(name, one["settings"].get(name), other["settings"].get(name)) for name in names]
+        names = [n for n in names if n not in LATER or None not in (here.get(n), there.get(n))]
+        differing = [name for name in names if here.get(name) != there.get(name)]
         # The same agent may go by several names.
-        if None in weights or weights[0] != weights[1]:
-            pairs.append(("the agent", one["crowd"], other["crowd"]))
-        pairs.append(("the store", one["store"]["checksum"], other["store"]["checksum"]))
-        differing = [name for name, here, there in pairs if here != there]
+        same_weights = here.get("weights") is not None and here.get("weights") == there.get("weights")
+        if one["crowd"] != other["crowd"] and not same_weights:
+            differing.append("the agent")
+        if one["store"].get("checksum") != other["store"].get("checksum"):
+            differing.append("the store")
         if not _segments(one) & _segments(other):
             differing.append("all segments")
         if differing:
@@ -284,28 +226,22 @@ def _segments(record: Record) -> set[str]:
 
 
 def winners(records: Sequence[Record]) -> list[str]:
-    """For each crowd a sentence: which planner scores best, by how much over the next one, paired over the runs of
-    the segments that both drove (± standard error over groups), and whether 0 is outside of its 95 % interval by
-    Student's t.
-    Of two that drove different ones the better is who was better where both did.
+    """For each crowd a sentence: which planner scores best, and by how much over the next one.
+
+    The difference is paired over the runs of the segments that both drove (± standard error over groups); whether 0
+    is outside of its 95 % interval is by Student's t. Of two that drove different segments the better is who was
+    better where both did.
     """
-    crowds: dict[str, list[Record]] = {}
-    for one in records:
-        crowds.setdefault(crowd_name(one), []).append(one)
     found = []
-    for crowd, members in crowds.items():
-        first, *rest = sorted(members, key=_place)
-        if not rest:
+    for crowd, members in _crowds(records).items():
+        if len(members) < 2:
             continue
-        second = rest[0]
+        first, second = members[:2]
         difference, error, groups = paired_difference(first, second)
         if difference is not None and difference < 0:
             first, second, difference = second, first, -difference
-        clear = (
-            error is not None
-            and difference is not None
-            and difference > t_quantile(0.975, groups - 1) * error
-        )
+        apart = 0.0 if difference is None else difference
+        clear = error is not None and apart > t_quantile(0.975, groups - 1) * error
         by = "–" if difference is None else f"{difference:.1f}"
         by += "" if error is None else f" ± {error:.1f}"
         verb = "wins" if clear else "is first, within the error"
@@ -326,10 +262,8 @@ def paired_difference(one: Record, other: Record) -> tuple[float | None, float |
             if (score := run_score(run)) is not None:
                 by_segment.setdefault(run["segment"], []).append(score)
         means.append({segment: float(np.mean(scores)) for segment, scores in by_segment.items()})
-    both = sorted(set(means[0]) & set(means[1]))
-    of = {run["segment"]: run["group"] or run["segment"] for run in one["per_run"]}
-    number = (
-        np.unique([of[segment] for segment in both], return_inverse=True)[1] if both else np.zeros(0, int)
-    )
+    both = sorted(means[0].keys() & means[1].keys())
+    group = {run["segment"]: run["group"] or run["segment"] for run in one["per_run"]}
+    names, member = np.unique([group[segment] for segment in both], return_inverse=True)
     apart = np.array([means[0][segment] - means[1][segment] for segment in both], np.float64)
-    return *grouped_mean(apart, np.ones_like(apart), number), len(np.unique(number))
+    return *grouped_mean(apart, np.ones_like(apart), member), len(names)

@@ -1,7 +1,7 @@
 """Evaluations of runs on disk: each run keeps its own, as ``RUN/evaluations/<name>.json``.
 
 The name says how the run was evaluated, so that the same evaluation made again takes the place of the earlier one and
-different ones lie side by side.
+different ones lie side by side; of several one is chosen by its name.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,15 +46,7 @@ _USUAL = {
 _NAMED = ("search", "trees", "branches", "rule", "interactive", "rollouts", "duration", "seed")
 _PRUNING = ("prune_every", "temperature")
 """Part of the name of the simulation; evaluations from before they could be set have none."""
-_PARTS: dict[str, tuple[str, ...]] = {
-    "run": ("updates",),
-    "data": ("name", "checksum"),
-    "config": _NAMED,
-    "playback": (),
-    "constant_velocity": (),
-    "curvature": ("policy", "log"),
-    "cost": ("simulation",),
-}
+_PARTS = ("run", "data", "config", "playback", "constant_velocity", "curvature", "cost")
 """What a kept evaluation must have."""
 
 
@@ -67,17 +59,15 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
         store: the run segments.
 
     Returns:
-        The numbers of ``result`` themselves; ``playback`` and ``constant_velocity``: those of baselines; ``cost``:
-        seconds of CPU time for ``simulation``, all rollouts of all segments together, and the ``steps`` of single
-        rollouts or branches in it; ``run``: ``method``, ``seed``, ``interactive``,
-        ``duration`` and ``updates`` of a trained agent, which ``checkpoint`` was taken and whether that is ``named``,
-        not the run's own choice, None for a baseline; ``data``: ``name`` and ``checksum`` of the store; ``config``:
-        the settings of the evaluation, with what was left to the agent filled in; ``horizon``: seconds of the longest
-        rollout; ``curvature``: histograms [201] of the branching regions visited, ``policy`` and ``log``, and
-        ``parts``, pseudo-values of the divergence by recording (see
-        :func:`symphony.metrics.sampled_divergence`); ``per_segment``: a row for each run segment. `symphony evaluate
-        --metrics wosac` adds ``wosac`` and numbers whose names begin so (see
-        :func:`symphony.wosac.evaluate.wosac_parts`).
+        The numbers of ``result`` themselves, and ``playback`` and ``constant_velocity``, those of the baselines.
+        ``cost``: seconds of CPU time for the ``simulation`` of all rollouts, and the ``steps`` of single rollouts or
+        branches in it. ``run``: ``method``, ``seed``, ``interactive``, ``duration`` and ``updates`` of a trained
+        agent, which ``checkpoint`` was taken and whether that is ``named``, not its own choice; None for a baseline.
+        ``data``: ``name`` and ``checksum`` of the store. ``config``: the settings of the evaluation, with what was
+        left to the agent filled in. ``horizon``: seconds of the longest rollout. ``curvature``: histograms [201] of
+        the branching regions visited, ``policy`` and ``log``, and ``parts``, pseudo-values of the divergence by
+        recording (see :func:`symphony.metrics.sampled_divergence`). ``per_segment``: a row for each run segment.
+        :func:`symphony.wosac.evaluate.wosac_parts` adds the WOSAC score.
     """
     visited, visited_log = result.metrics.curvature_histograms()
     divergence, names = result.metrics.curvature_divergence()
@@ -115,31 +105,22 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
     config, used = result.config, agent.plan(result.config).search
+    tree, searched = result.search == "tree", result.search not in ("none", "log")
     filled = dataclasses.asdict(config) | {
         "search": result.search,
-        "score": "discriminator",
+        "score": used.score if searched else "discriminator",
         "interactive": result.interactive,
         "duration": config.duration or agent.duration,
-        "goals": "tree",
-        "branches": 0,
-        "trees": 0,
-        "rule": "",
-        "prune_every": 0,
-        "temperature": 0.0,
-        "threshold": None,
+        "goals": used.goals if tree else "tree",
+        "branches": used.test_branches if result.search in ("tree", "best") else 0,
+        "trees": config.trees if tree else 0,
+        "rule": used.rule if tree else "",
+        "prune_every": used.prune_every if result.search in ("tree", "backtrack") else 0,
+        "temperature": used.temperature if tree and used.rule == "systematic" else 0.0,
+        "threshold": used.threshold
+        if result.search == "backtrack" or (tree and used.rule == "replace")
+        else None,
     }
-    if result.search not in ("none", "log"):
-        filled["score"] = used.score
-    if result.search in ("tree", "best"):
-        filled["branches"] = used.test_branches
-    if result.search == "backtrack":
-        filled["prune_every"], filled["threshold"] = used.prune_every, used.threshold
-    if result.search == "tree":
-        filled["trees"] = config.trees
-        filled["rule"], filled["prune_every"] = used.rule, used.prune_every
-        filled["temperature"] = used.temperature if used.rule == "systematic" else 0.0
-        filled["threshold"] = used.threshold if used.rule == "replace" else None
-        filled["goals"] = used.goals
     return {name: value for name, value in filled.items() if name not in _MEMORY}
 
 
@@ -194,9 +175,10 @@ def simulation_way(config: dict[str, Any]) -> str:
 def keep_evaluation(agent: str, record: dict[str, Any]) -> Path | None:
     """Write an evaluation into the folder of its run and return the file.
 
+    A baseline has no folder, and that of an agent that comes with the package is not the user's: nothing is written.
+
     Args:
-        agent: its name. A baseline has no folder, and the folder of an agent that comes with the package is not the
-            user's: nothing is written for them.
+        agent: its name.
         record: see :func:`evaluation_record`.
     """
     if record["run"] is None or is_pretrained(agent):
@@ -222,34 +204,43 @@ def read_evaluation(file: Path) -> dict[str, Any]:
     Raises:
         DataError: it can't be read or lacks something.
     """
-    record = _read_object(file)
+    record = read_object(file)
     if record.get("format") != FORMAT:
         raise DataError(
             f"format {record.get('format')!r}, this version reads {FORMAT}", file=file, field="format"
         )
-    for part, names in _PARTS.items():
-        held = record.get(part)
-        if not isinstance(held, dict):
+    for part in _PARTS:
+        if not isinstance(record.get(part), dict):
             raise DataError("is missing", file=file, field=part)
-        for name in names:
-            if name not in held:
-                raise DataError("is missing", file=file, field=f"{part}.{name}")
-    for part, name, kinds in (("data", "checksum", (str,)), ("cost", "simulation", (int, float))):
-        if type(record[part][name]) not in kinds:
-            raise DataError(f"is {record[part][name]!r}", file=file, field=f"{part}.{name}")
-    # Those of before have none.
-    horizon = record.get("horizon", 1.0)
-    if type(horizon) not in (int, float) or not 0 < horizon < math.inf:
-        raise DataError(f"is {horizon!r}", file=file, field="horizon")
-    segments, rows = record.get("segments"), record.get("per_segment")
-    if type(segments) is not int or segments < 1:
-        raise DataError("is missing", file=file, field="segments")
-    # Included agents come without the rows of segments.
-    if rows is not None and (not isinstance(rows, list) or len(rows) != segments):
-        raise DataError(f"has not one row for each of {segments} segments", file=file, field="per_segment")
-    if not all(isinstance(row, dict) and "segment" in row for row in rows or ()):
-        raise DataError("has a row without a segment", file=file, field="per_segment")
     return record
+
+
+def fitting(kept: Iterable[str], patterns: Sequence[str]) -> list[str]:
+    """Names of the evaluations that the first fitting pattern fits; all without patterns."""
+    found = ([name for name in kept if fnmatchcase(name, pattern)] for pattern in patterns or "*")
+    return next((names for names in found if names), [])
+
+
+def choose_evaluation(
+    run: Path, kept: Mapping[str, dict[str, Any]], patterns: Sequence[str] = ()
+) -> tuple[str, dict[str, Any]]:
+    """Name and record of the one evaluation of a run that fits.
+
+    Args:
+        run: its folder.
+        kept: the evaluations to choose from.
+        patterns: names (``*`` and ``?`` stand for anything); the first one that fits any decides.
+
+    Raises:
+        ConfigError: none or several do; names them.
+    """
+    names = fitting(kept, patterns)
+    if not kept:
+        raise ConfigError(f"{run} keeps no evaluation: symphony evaluate {run} --data DIR")
+    if len(names) != 1:
+        state = "was evaluated in several ways" if names else "was not evaluated in that way"
+        raise ConfigError(f"{run} {state}, choose one with --evaluation: {', '.join(names or kept)}")
+    return names[0], kept[names[0]]
 
 
 def read_run(folder: Path) -> dict[str, Any]:
@@ -258,17 +249,15 @@ def read_run(folder: Path) -> dict[str, Any]:
     Raises:
         DataError: it can't be read or names no method.
     """
-    file = folder / "config.json"
-    config = _read_object(file)
+    config = read_object(folder / "config.json")
     if not isinstance(config.get("method"), str):
-        raise DataError("is missing", file=file, field="method")
+        raise DataError("is missing", file=folder / "config.json", field="method")
     return config
 
 
-def run_interactive(config: dict[str, Any]) -> int:
+def run_interactive(config: Mapping[str, Any]) -> int:
     """Interactive agents per run segment, from the configuration of a run."""
-    agent = config.get("agent")
-    return agent.get("interactive", 2) if isinstance(agent, dict) else 2
+    return config.get("agent", {}).get("interactive", 2)
 
 
 def updates_done(run: Path) -> int:
@@ -296,15 +285,19 @@ def find_runs(folders: Iterable[Path]) -> list[Path]:
 def _runs_below(folder: Path) -> list[Path]:
     if (folder / "config.json").is_file():
         return [folder]
-    if not folder.is_dir():
-        return []
-    return [run for inner in sorted(folder.iterdir()) if inner.is_dir() for run in _runs_below(inner)]
+    inner = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [run for each in inner if each.is_dir() for run in _runs_below(each)]
 
 
-def _read_object(file: Path) -> dict[str, Any]:
+def read_object(file: Path) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        DataError: it is none.
+    """
     try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+        value = json.loads(file.read_text(encoding="utf-8", errors="replace"))
+    except (ValueError, RecursionError) as error:
         raise DataError(f"not valid JSON ({error})", file=file) from error
     if not isinstance(value, dict):
         raise DataError("not a JSON object", file=file)

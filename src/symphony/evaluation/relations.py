@@ -1,4 +1,7 @@
-"""The paper's relations between the methods, each held or not by our runs, with numbers and paired errors."""
+"""Comparisons of methods by run segment: the paper's relations, each held or not, and paired differences.
+
+Paired means that what makes segments hard cancels out. Errors are over recordings.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.config import PaperData, Setting, TableFormat
-from symphony.errors import ConfigError
-from symphony.evaluation.comparison import METHOD_COLUMNS
-from symphony.evaluation.entries import ROWS, Entry, method_name, number
-from symphony.evaluation.paired import clustered_mean, mean_rows
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation.formats import markdown
 from symphony.evaluation.paper import paper_figures
+from symphony.evaluation.table import ASKED, COLUMNS, ROWS, Entry, method_name, number
 from symphony.files import json_text
+from symphony.metrics.intervals import clustered_mean
 
 CLEAR = 2.0
 """Standard errors by which a number must differ from its bound to differ clearly."""
 STANDING_POINTS = 5.0
 """Points by which the share of agents that stand at the end may differ from the log's."""
 PAPER_NAMES: dict[PaperData, str] = {"proprietary": "own data", "womd": "WOMD"}
+_COLUMNS = {column.key: column for column in (*COLUMNS, *ASKED["standing"])}
 
 Kind = Literal["times", "lower", "not_higher", "higher", "near_log"]
+_VERBS = {"lower": "falls", "not_higher": "does not rise", "higher": "rises"}
 
 
 @dataclass(frozen=True)
@@ -51,39 +56,43 @@ class Statement:
     @property
     def text(self) -> str:
         """In words."""
-        title = METHOD_COLUMNS[self.metric].title
+        title, after = _COLUMNS[self.metric].title, method_name(self.after)
         if self.kind == "near_log":
-            return (
-                f"{method_name(self.after)}: {title} at the end as in the log, within {self.bound:g} points"
-            )
-        pair = f"{method_name(self.before)} to {method_name(self.after)}"
-        if self.kind == "times":
-            return f"{pair}: {title} falls{f' at least {self.bound:g} times' if self.bound > 1 else ''}"
-        verb = {"lower": "falls", "not_higher": "does not rise", "higher": "rises"}[self.kind]
-        return f"{pair}: {title} {verb}{', beyond sampling' if self.clearly else ''}"
+            return f"{after}: {title} at the end as in the log, within {self.bound:g} points"
+        verb = _VERBS.get(self.kind) or f"falls{f' at least {self.bound:g} times' if self.bound > 1 else ''}"
+        return f"{method_name(self.before)} to {after}: {title} {verb}{', beyond sampling' if self.clearly else ''}"
+
+    def shown(self, value: float) -> str:
+        """A factor or a difference as text, without its unit."""
+        column = _COLUMNS[self.metric]
+        return f"{value:.1f}" if self.kind == "times" else f"{value * column.scale:+.{column.digits}f}"
+
+    @property
+    def unit(self) -> str:
+        """The unit of a factor or a difference."""
+        unit = _COLUMNS[self.metric].unit
+        return "times" if self.kind == "times" else "points" if unit == "%" else unit
 
 
-def _statements() -> tuple[Statement, ...]:
-    jsd = "curvature_jsd"
-    found = [
-        Statement("times", "collision_rate", "bc", "bc_ts", 1.0),
-        Statement("times", "collision_rate", "bc", "bc_ts_h", 9.3),
-        Statement("times", "offroad_time", "bc", "bc_ts_h", 6.4),
-        Statement("times", "collision_rate", "mgail", "mgail_ts", 1.0),
-        Statement("times", "collision_rate", "mgail_h", "mgail_ts_h", 1.0),
-        Statement("times", "collision_rate", "mgail", "mgail_ts_h", 2.2),
-        Statement("lower", "collision_rate", "bc", "mgail"),
-        Statement("not_higher", "min_sade", "bc_h", "bc_ts_h"),
-    ]
-    for base in ("bc", "mgail"):
-        found += [Statement("lower", metric, f"{base}_ts", f"{base}_ts_h") for metric in ("ade", "min_sade")]
-    for base in ("bc", "mgail"):
-        found.append(Statement("higher", jsd, base, f"{base}_ts", clearly=True))
-        found.append(Statement("lower", jsd, f"{base}_ts", f"{base}_ts_h", clearly=True))
-    return (*found, *(Statement("near_log", "standing", "", method, STANDING_POINTS) for method in ROWS[2:]))
-
-
-STATEMENTS = _statements()
+STATEMENTS = (
+    Statement("times", "collision_rate", "bc", "bc_ts", 1.0),
+    Statement("times", "collision_rate", "bc", "bc_ts_h", 9.3),
+    Statement("times", "offroad_time", "bc", "bc_ts_h", 6.4),
+    Statement("times", "collision_rate", "mgail", "mgail_ts", 1.0),
+    Statement("times", "collision_rate", "mgail_h", "mgail_ts_h", 1.0),
+    Statement("times", "collision_rate", "mgail", "mgail_ts_h", 2.2),
+    Statement("lower", "collision_rate", "bc", "mgail"),
+    Statement("not_higher", "min_sade", "bc_h", "bc_ts_h"),
+    Statement("lower", "ade", "bc_ts", "bc_ts_h"),
+    Statement("lower", "min_sade", "bc_ts", "bc_ts_h"),
+    Statement("lower", "ade", "mgail_ts", "mgail_ts_h"),
+    Statement("lower", "min_sade", "mgail_ts", "mgail_ts_h"),
+    Statement("higher", "curvature_jsd", "bc", "bc_ts", clearly=True),
+    Statement("lower", "curvature_jsd", "bc_ts", "bc_ts_h", clearly=True),
+    Statement("higher", "curvature_jsd", "mgail", "mgail_ts", clearly=True),
+    Statement("lower", "curvature_jsd", "mgail_ts", "mgail_ts_h", clearly=True),
+    *(Statement("near_log", "standing", "", method, STANDING_POINTS) for method in ROWS[2:]),
+)
 """What the paper's tables say (and one of the log: agents that have learned to stop are safe)."""
 
 
@@ -130,30 +139,20 @@ def relations(entries: Sequence[Entry], setting: Setting = "main") -> list[Relat
 
 
 def _checked(one: Statement, entries: Sequence[Entry]) -> Relation:
-    runs = {
-        method: [e for e in entries if e.method == method] for method in (one.before, one.after) if method
-    }
-    absent = [method_name(method) for method, mine in runs.items() if not mine]
+    runs = [[e for e in entries if e.method == method] for method in (one.before, one.after)]
+    names = [method for method in (one.before, one.after) if method]
+    absent = [method_name(m) for m in names if not any(e.method == m for e in entries)]
     if absent:
         return Relation(one, missing=f"no runs of {' and '.join(absent)}")
-    if one.metric == "curvature_jsd":
-        found = _divergence(runs[one.before], runs[one.after])
-    elif one.kind == "near_log":
-        found = _near_log(runs[one.after])
-    else:
-        found = _pair(one, runs[one.before], runs[one.after])
+    found = _measured(one, *runs)
     if found is None:
         return Relation(one, missing="not in these evaluations: evaluate again")
     value, error = found
     if math.isnan(value):
         return Relation(one, missing="no number: both are 0, or a mean over nothing")
-    away = {
-        "times": value - one.bound,
-        "lower": one.bound - value,
-        "not_higher": one.bound - value,
-        "higher": value - one.bound,
-        "near_log": one.bound - abs(value),
-    }[one.kind]
+    away = {"times": value - one.bound, "higher": value - one.bound, "near_log": one.bound - abs(value)}.get(
+        one.kind, one.bound - value
+    )
     clear = abs(away) > CLEAR * error or math.isinf(value)
     # What stays the same does not fall.
     strict = one.clearly or one.kind in ("lower", "higher") or one.bound == 1.0
@@ -161,25 +160,62 @@ def _checked(one: Statement, entries: Sequence[Entry]) -> Relation:
     return Relation(one, held, value, error, clear)
 
 
+def _measured(one: Statement, before: Sequence[Entry], after: Sequence[Entry]) -> tuple[float, float] | None:
+    """The factor by which a metric falls, or the difference, and its error; None where records lack it."""
+    if one.metric == "curvature_jsd":
+        return _divergence(before, after)
+    if one.kind == "near_log":
+        keys = ("standing", "standing_log")
+        if any(key not in entry.record for entry in after for key in keys):
+            return None
+        member, (values, _) = _rows([after, after], keys)
+        error = clustered_mean(values[:, 0] - values[:, 1], member)[1]
+        return _mean(after, keys[0]) - _mean(after, keys[1]), error
+    first, second = _mean(before, one.metric), _mean(after, one.metric)
+    member, (a, b) = _rows([before, after], [one.metric])
+    if one.kind != "times":
+        return second - first, clustered_mean(b[:, 0] - a[:, 0], member)[1]
+    if second == 0:
+        return (math.inf if first > 0 else math.nan), math.nan
+    ratio = first / second
+    return ratio, clustered_mean((a[:, 0] - ratio * b[:, 0]) / second, member)[1]
+
+
 def _mean(entries: Sequence[Entry], key: str) -> float:
     return float(np.mean([number(entry, entry.record, key) for entry in entries]))
 
 
-def _pair(one: Statement, before: Sequence[Entry], after: Sequence[Entry]) -> tuple[float, float]:
-    """The factor by which a metric falls, or the difference, and its error."""
-    first, second = _mean(before, one.metric), _mean(after, one.metric)
-    rows = [mean_rows(entries, [one.metric]) for entries in (before, after)]
-    names = sorted(rows[0].keys() & rows[1].keys())
+def _rows(
+    sides: Sequence[Sequence[Entry]], metrics: Sequence[str]
+) -> tuple[NDArray[np.int64], list[NDArray[np.float64]]]:
+    """Numbers of the run segments that all evaluations of two methods have, averaged over those of each.
+
+    Returns:
+        The number of the recording of each segment [K], and for each method its numbers [K, metrics].
+
+    Raises:
+        ConfigError: there is no such segment.
+        DataError: an evaluation without rows of its segments.
+    """
+    tables = []
+    for entry in (entry for side in sides for entry in side):
+        rows: Any = entry.record.get("per_segment")
+        if not isinstance(rows, list):
+            raise DataError("is missing", file=f"{entry.folder}: {entry.name}", field="per_segment")
+        tables.append({str(row["segment"]): (entry, row) for row in rows})
+    names = sorted(set.intersection(*map(set, tables)))
     if not names:
-        raise ConfigError(f"{method_name(one.before)} and {method_name(one.after)} share no run segment")
-    groups = np.unique([rows[0][name][0] for name in names], return_inverse=True)[1]
-    a, b = (np.array([each[name][1][one.metric] for name in names]) for each in rows)
-    if one.kind != "times":
-        return second - first, clustered_mean(b - a, groups)[1]
-    if second == 0:
-        return (math.inf if first > 0 else math.nan), math.nan
-    ratio = first / second
-    return ratio, clustered_mean((a - ratio * b) / second, groups)[1]
+        each = " and ".join(method_name(side[0].method) for side in sides)
+        raise ConfigError(f"{each} share no run segment")
+    numbers = np.array(
+        [
+            [[number(table[name][0], {key: None} | table[name][1], key) for key in metrics] for name in names]
+            for table in tables
+        ]
+    )
+    groups = [str(tables[0][name][1].get("group") or name) for name in names]
+    split = np.split(numbers, [len(sides[0])])
+    return np.unique(groups, return_inverse=True)[1], [part.mean(0) for part in split]
 
 
 def _divergence(before: Sequence[Entry], after: Sequence[Entry]) -> tuple[float, float] | None:
@@ -188,71 +224,67 @@ def _divergence(before: Sequence[Entry], after: Sequence[Entry]) -> tuple[float,
     if any(one is None for each in parts for one in each):
         return None
     names = sorted(set.intersection(*(set(one) for each in parts for one in each)))
-    means = [np.mean([_row(one, names) for one in each], axis=0) for each in parts]
-    if np.isnan(means).any():  # all turns are of one recording, or there is but one
+    # A number that is not defined is None in JSON.
+    first, second = (
+        np.array([[one[name] for name in names] for one in each], dtype=np.float64).mean(0) for each in parts
+    )
+    if np.isnan(first).any() or np.isnan(second).any():  # all turns are of one recording, or there is but one
         return math.nan, math.nan
-    return clustered_mean(means[1] - means[0], np.arange(len(names)))
-
-
-def _row(parts: Mapping[str, Any], names: Sequence[str]) -> NDArray[np.float64]:
-    return np.array([math.nan if parts[name] is None else parts[name] for name in names], dtype=np.float64)
-
-
-def _near_log(entries: Sequence[Entry]) -> tuple[float, float] | None:
-    """By how many points more agents stand at the end than in the log."""
-    keys = ("standing", "standing_log")
-    if any(key not in entry.record for entry in entries for key in keys):
-        return None
-    rows = mean_rows(entries, keys).values()
-    away = np.array([numbers[keys[0]] - numbers[keys[1]] for _, numbers in rows])
-    groups = np.unique([group for group, _ in rows], return_inverse=True)[1]
-    return _mean(entries, keys[0]) - _mean(entries, keys[1]), clustered_mean(away, groups)[1]
+    return clustered_mean(second - first, np.arange(len(names)))
 
 
 def _paper(one: Statement, setting: Setting) -> dict[PaperData, float]:
     found: dict[PaperData, float] = {}
     for dataset in get_args(PaperData):
         figures = paper_figures(setting, dataset)
-        if figures is None or one.kind == "near_log":
-            continue
-        first, second = (figures[method][one.metric][0] for method in (one.before, one.after))
-        found[dataset] = first / second if one.kind == "times" else second - first
+        if figures and one.kind != "near_log":
+            first, second = (figures[method][one.metric][0] for method in (one.before, one.after))
+            found[dataset] = first / second if one.kind == "times" else second - first
     return found
 
 
-def formatted(one: Statement, value: float) -> str:
-    """A factor or a difference as text, without its unit."""
-    if one.kind == "times":
-        return f"{value:.1f}"
-    column = METHOD_COLUMNS[one.metric]
-    return f"{value * column.scale:+.{column.digits}f}"
+def paired_lines(entries: Sequence[Entry], base: str) -> list[str]:
+    """Every method less one of them, a line for each; seeds of a method are averaged first.
+
+    Raises:
+        ConfigError: the base is not among them, or they have no segments in common.
+        DataError: an evaluation without rows of its segments.
+    """
+    methods = list(dict.fromkeys(entry.method for entry in entries))
+    if base not in methods:
+        raise ConfigError(f"'{base}' is not among the methods {', '.join(methods)}")
+    columns = [column for column in COLUMNS if column.key != "curvature_jsd"]  # no segment has one of its own
+    lines = []
+    for method in methods:
+        if method == base:
+            continue
+        sides = [[entry for entry in entries if entry.method == each] for each in (method, base)]
+        member, (mine, other) = _rows(sides, [column.key for column in columns])
+        parts = []
+        for column, away in zip(columns, (mine - other).T, strict=True):
+            mean, error = clustered_mean(away, member)
+            parts.append(
+                f"{column.title} {mean:+.{column.digits}f} ± {error:.{column.digits}f} {column.unit}"
+            )
+        count = f"{len(member)} segments of {member.max() + 1} groups"
+        lines.append(f"{method_name(method)} less {method_name(base)}: {', '.join(parts)} ({count})")
+    return lines
 
 
-def unit(one: Statement) -> str:
-    """Of a factor or a difference."""
-    if one.kind == "times":
-        return "times"
-    column = METHOD_COLUMNS[one.metric]
-    return "points" if column.unit == "%" else column.unit
-
-
-def _measured(relation: Relation) -> str:
-    one, error = relation.statement, relation.error
-    if relation.held is None:
-        return relation.missing
-    plus = "" if math.isnan(error) else f" ± {formatted(one, error).lstrip('+')}"
-    return f"{formatted(one, relation.value)}{plus} {unit(one)}"
+# --- text ---
 
 
 def grid(found: Sequence[Relation]) -> list[list[str]]:
     """A line per relation under a heading: what is claimed, ours, the paper's, whether it is held."""
     lines = [["", "here", *(f"paper, {name}" for name in PAPER_NAMES.values()), "is it so?"]]
     for relation in found:
-        one = relation.statement
-        paper = [
-            formatted(one, relation.paper[data]) if data in relation.paper else "–" for data in PAPER_NAMES
-        ]
-        lines.append([one.text, _measured(relation), *paper, relation.verdict])
+        one, error = relation.statement, relation.error
+        plus = "" if math.isnan(error) else f" ± {one.shown(error).lstrip('+')}"
+        here = (
+            f"{one.shown(relation.value)}{plus} {one.unit}" if relation.held is not None else relation.missing
+        )
+        paper = [one.shown(relation.paper[data]) if data in relation.paper else "–" for data in PAPER_NAMES]
+        lines.append([one.text, here, *paper, relation.verdict])
     return lines
 
 
@@ -260,39 +292,23 @@ def _as_text(found: Sequence[Relation]) -> str:
     lines = []
     for text, here, *paper, verdict in grid(found)[1:]:
         beside = ", ".join(f"{n} {p}" for n, p in zip(PAPER_NAMES.values(), paper, strict=True) if p != "–")
-        lines.append(f"{verdict}: {text}: {here}{f' (paper: {beside})' if beside else ''}")
-    return "\n".join(lines) + "\n"
-
-
-def _as_markdown(found: Sequence[Relation]) -> str:
-    lines = [f"| {' | '.join(line)} |" for line in grid(found)]
-    return "\n".join([lines[0], "| --- | ---: | ---: | ---: | --- |", *lines[1:]]) + "\n"
+        lines.append(f"{verdict}: {text}: {here}{f' (paper: {beside})' if beside else ''}\n")
+    return "".join(lines)
 
 
 def _as_json(found: Sequence[Relation]) -> str:
-    return json_text(
-        [
-            {
-                "text": one.statement.text,
-                "kind": one.statement.kind,
-                "metric": one.statement.metric,
-                "before": one.statement.before,
-                "after": one.statement.after,
-                "bound": one.statement.bound,
-                "held": one.held,
-                "clear": one.clear,
-                "value": one.value,
-                "se": one.error,
-                "paper": dict(one.paper),
-                "missing": one.missing,
-            }
-            for one in found
-        ]
-    )
+    rows = []
+    for one in found:
+        names = ("kind", "metric", "before", "after", "bound")
+        about = {"text": one.statement.text} | {name: getattr(one.statement, name) for name in names}
+        ours = {"held": one.held, "clear": one.clear, "value": one.value, "se": one.error}
+        rows.append(about | ours | {"paper": dict(one.paper), "missing": one.missing})
+    return json_text(rows)
 
 
 RELATION_FORMATS: dict[TableFormat, Callable[[Sequence[Relation]], str]] = {
     "text": _as_text,
-    "markdown": _as_markdown,
+    "markdown": lambda found: markdown(grid(found)),
     "json": _as_json,
 }
+"""How relations are written."""

@@ -1,63 +1,26 @@
-"""What a search leaves of the goals that were drawn, and which agents stand at the end.
+"""What a search leaves of the goals that were drawn.
 
-Shapes: B segments, K rollouts, D draws (one per branch that was started), N interactive agents, G routes, U states.
+Shapes: B segments, K rollouts, D draws (one per branch that was started), N interactive agents, G routes.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.geometry import wrap
-from symphony.metrics.kinds import STANDING
 
 TURNS = ("right", "straight", "left")
 TURNED = math.radians(45)
 """A route turns where its direction has changed by this much since its beginning."""
 SHORTEST = 0.01
 """Metres of a piece of a route that has a direction."""
-
-
-class Standing(NamedTuple):
-    """Who stands at a segment's last step: speed below :data:`symphony.metrics.kinds.STANDING`.
-
-    Attributes:
-        rollouts: [B, K, N] agents of the rollouts.
-        log: [B, N] the same agents in the log.
-        counted: [B, K, N] agents that are there, and whose log lasts that long; the others are not compared.
-    """
-
-    rollouts: Bool[Tensor, "B K N"]
-    log: Bool[Tensor, "B N"]
-    counted: Bool[Tensor, "B K N"]
-
-
-def standing_at_end(
-    state: Float[Tensor, "B K U N 4"],
-    log: Float[Tensor, "B U N 4"],
-    logged: Bool[Tensor, "B U N"],
-    last: Int[Tensor, " B"],
-    there: Bool[Tensor, "B K T N"],
-) -> Standing:
-    """Who stands at the last step.
-
-    Args:
-        state: of the rollouts: x, y, heading, speed.
-        log: likewise.
-        logged: where the log is valid.
-        last: number of each segment's last state.
-        there: where agents are simulated and evaluated, of the T = U - 1 states after the first.
-    """
-    row = torch.arange(len(last), device=last.device)
-    slow, slow_log = state[row, :, last, :, 3].abs() < STANDING, log[row, last, :, 3].abs() < STANDING
-    return Standing(slow, slow_log, logged[row, last][:, None] & there[row, :, last - 1])
 
 
 def route_turns(
@@ -109,8 +72,8 @@ def choices(
 
     Args:
         drawn: number of the route that each agent of each branch drew, -1 for none.
-        kept: of the rollouts.
-        turn: of every route, from :func:`route_turns`.
+        kept: number of the route that each agent of each rollout follows, -1 for none.
+        turn: which way each route turns, from :func:`route_turns`.
         founders: first branches of each tree with descendants.
     """
     found = []
@@ -131,7 +94,7 @@ def choices(
 
 
 def choice_numbers(found: list[Choice]) -> dict[str, float]:
-    """Of all segments together.
+    """What searches made of the goals of all segments together.
 
     Returns:
         ``goals_drawn_left`` (and ``straight``, ``right``), percent of the agents of all branches; ``goals_kept_left``

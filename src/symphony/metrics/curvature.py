@@ -14,17 +14,15 @@ BINS = 201
 
 def curvature_histogram(curvature: NDArray[Any]) -> NDArray[np.int64]:
     """Counts [201] of average curvatures [...] in 1/m; values beyond +-1 fall into the outermost bins."""
-    flat = np.asarray(curvature, dtype=np.float64).reshape(-1)
-    if not np.isfinite(flat).all():
-        raise ValueError("curvatures must be finite")
     half = BINS // 2
-    return np.bincount(np.rint(flat.clip(-1, 1) * half).astype(np.int64) + half, minlength=BINS)
+    flat = np.asarray(curvature, dtype=np.float64).reshape(-1).clip(-1, 1)
+    return np.bincount(np.rint(flat * half).astype(np.int64) + half, minlength=BINS)
 
 
 def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
     """Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN where either is empty.
 
-    The divergence itself, not its square root.
+    It is the divergence itself, not its square root.
     """
     p, q = (_normalised(np.asarray(counts, dtype=np.float64)) for counts in (first, second))
     middle = (p + q) / 2
@@ -56,7 +54,7 @@ def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Diverg
 
     Args:
         counts: [n, K] histogram of the rollouts of each sample (a recording, or a segment).
-        counts_log: [n, K] of its logs.
+        counts_log: [n, K] histogram of the log of each sample.
 
     Source: Quenouille, "Notes on bias in estimation", Biometrika 43 (1956).
     """
@@ -71,11 +69,11 @@ def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Diverg
 
 
 def sampling_floor(counts_log: NDArray[Any], draws: int = 200) -> float:
-    """What a log of this size scores against the distribution that it is a sample of, nats: no policy is known to be
-    better, however many rollouts it has.
+    """What a log of this size scores against the distribution that it is a sample of, nats.
 
-    Estimated by bootstrap samples of the segments against all of them. Two logs of this size differ by about twice as
-    much. It is too low where segments of one recording are alike, or many turns are so rare that the log has none.
+    No policy is known to be better, however many rollouts it has. It is estimated by bootstrap samples of the
+    segments against all of them. Two logs of this size differ by about twice as much. It is too low where segments of
+    one recording are alike, or many turns are so rare that the log has none.
 
     Args:
         counts_log: [n, K] histogram of the log of each segment.

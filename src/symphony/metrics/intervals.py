@@ -1,45 +1,71 @@
-"""Exact intervals of rates and of means of few samples.
-
-Sources: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934); "Student", "The
-probable error of a mean", Biometrika 6 (1908); the incomplete beta function is DLMF 8.17.22.
-"""
+"""Standard errors over groups, exact bounds of rates of which nothing was seen, and quantiles of Student's t."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 _TINY = 1e-300
 
 
-def binomial_interval(hits: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Interval of a rate from 0 to 1 of which ``hits`` of so many independent samples are known (Clopper-Pearson).
+def summed(values: NDArray[Any], member: NDArray[np.int64]) -> NDArray[Any]:
+    """Sums of values [segments, ...] over the segments of each group, by the number of the group of each."""
+    out = np.zeros((int(member.max(initial=-1)) + 1, *values.shape[1:]), values.dtype)
+    np.add.at(out, member, values)
+    return out
 
-    With none or all of them it has one side only, with all of the doubt on it: of n samples without any the rate is
-    at most 1 - 0.05^(1/n), about 3 / n.
 
-    Raises:
-        ValueError: not 0 <= hits <= of, or no samples.
+def ratio(
+    total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]
+) -> tuple[float, float]:
+    """Ratio of sums and its standard error over groups (linearised; NaN for a single one).
+
+    Groups without anything to count are no samples: of two recordings of which one is empty there is no error.
+
+    Args:
+        total: [segments] what each adds to the numerator.
+        weight: [segments] what each adds to the denominator.
+        member: [segments] number of the group of each.
     """
-    if not 0 <= hits <= of or of < 1:
-        raise ValueError(f"{hits} of {of} samples are no rate")
-    doubt = (1.0 - confidence) / (1 if hits in (0, of) else 2)
-    low = 0.0 if hits == 0 else beta_quantile(doubt, hits, of - hits + 1)
-    return low, 1.0 if hits == of else beta_quantile(1.0 - doubt, hits + 1, of - hits)
+    if weight.sum() == 0:
+        return math.nan, math.nan
+    rate = total.sum() / weight.sum()
+    total, weight = summed(total, member), summed(weight, member)
+    some = (total != 0) | (weight != 0)
+    total, weight = total[some], weight[some]
+    count = len(total)
+    if count < 2:
+        return float(rate), math.nan
+    residual = (total - rate * weight) / weight.mean()
+    return float(rate), float(np.sqrt((residual**2).sum() / (count - 1) / count))
+
+
+def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
+    """Mean of the finite ones of some values and its standard error, where those of one group are not independent.
+
+    Args:
+        values: [K].
+        member: [K] number of the group of each.
+    """
+    known = np.isfinite(values)
+    return ratio(values[known], np.ones(known.sum()), member[known])
 
 
 def zero_bound(of: int) -> float:
-    """Percent that a rate has at most, with 95 % confidence, of which so many independent samples show nothing."""
-    return 100.0 * binomial_interval(0, of)[1]
+    """Percent that a rate has at most, with 95 % confidence, of which so many independent samples show nothing.
+
+    It is about 300 / n.
+
+    Source: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934).
+    """
+    return 100.0 * (1.0 - 0.05 ** (1.0 / of))
 
 
 def t_quantile(probability: float, freedom: int) -> float:
-    """Quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees of freedom.
-
-    Raises:
-        ValueError: no degree of freedom, or a probability that is not between 0 and 1.
-    """
-    if freedom < 1 or not 0 < probability < 1:
-        raise ValueError(f"no quantile {probability} of t with {freedom} degrees of freedom")
+    """Quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees of freedom."""
     if probability == 0.5:
         return 0.0
     tail = 2 * min(probability, 1 - probability)
@@ -60,7 +86,7 @@ def beta_quantile(probability: float, a: float, b: float) -> float:
 
 
 def _beta(x: float, a: float, b: float) -> float:
-    """Regularised incomplete beta function I_x(a, b)."""
+    """Regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22)."""
     if x > (a + 1) / (a + b + 2):
         return 1.0 - _beta(1.0 - x, b, a)
     front = a * math.log(x) + b * math.log1p(-x) + math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)

@@ -1,9 +1,9 @@
 """What kind of collision: who ran into whom, and from where.
 
-A rate alone doesn't tell a policy that brakes too late from one that is hit by playback vehicles, which can't react.
+A rate alone does not tell a policy that brakes too late from one that is hit by playback vehicles, which can't react.
 
 Metres, radians, seconds. Legend: A agents of the scene, N interactive agents, T simulated steps, T+1 states with the
-first one.
+first one, M collisions. A pose is x, y, heading, velocity x, velocity y.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class CollisionKind(IntEnum):
         OTHER: same way, end to end, because one backed into the other, which stood or backed too.
         REAR_ENDED: same way, its tail was met by the front of one behind.
         PEDESTRIAN: the other is a pedestrian, wherever they came from.
-        CYCLIST: the other is a cyclist, likewise.
+        CYCLIST: the other is a cyclist, wherever they came from.
     """
 
     INTO_LEADER = 0
@@ -93,19 +93,6 @@ class CollisionKinds(NamedTuple):
         return torch.where(happened, kind, -1), happened & (key % 2 == 0)
 
 
-class _Poses(NamedTuple):
-    """Position [M, A, 2], heading [M, A], velocity [M, A, 2] and validity [M, A]."""
-
-    position: Float[Tensor, "M *A 2"]
-    heading: Float[Tensor, "M ..."]
-    velocity: Float[Tensor, "M *A 2"]
-    valid: Bool[Tensor, "M ..."]
-
-    def of(self, row: Int[Tensor, " M"]) -> _Poses:
-        """Of one agent [M] each."""
-        return _Poses(*(value[torch.arange(len(row), device=row.device), row] for value in self))
-
-
 def collision_kinds(
     collided: Bool[Tensor, "*#lead N T"],
     state: Float[Tensor, "*#lead N T+1 4"],
@@ -114,7 +101,7 @@ def collision_kinds(
     log_state: Float[Tensor, "*#lead A T+1 5"],
     log_valid: Bool[Tensor, "*#lead A T+1"],
     size: Float[Tensor, "*#lead A 2"],
-    agent_type: Int[Tensor, "*#lead A"] | None = None,
+    agent_type: Int[Tensor, "*#lead A"],
     height: tuple[Float[Tensor, "*#lead N T+1 2"], Float[Tensor, "*#lead A T+1 2"]] | None = None,
 ) -> CollisionKinds:
     """With whom, when and how each interactive agent collides first. Leading dimensions broadcast.
@@ -129,57 +116,49 @@ def collision_kinds(
         state: [..., N, T+1, 4] x, y, heading, speed of the interactive agents.
         exists: [..., N, T+1] whether they are there.
         subject: [..., N] their rows of A; a negative one stands for no agent.
-        log_state: [..., A, T+1, 5] x, y, heading, velocity x, velocity y of all agents as logged; the rows of the
-            interactive agents are not read.
+        log_state: [..., A, T+1, 5] poses of all agents as logged; the rows of the interactive agents are not read.
         log_valid: [..., A, T+1].
         size: [..., A, 2] length and width.
-        agent_type: [..., A] ``AgentType`` numbers; without them all count as vehicles, and a pedestrian who is run
-            over as crossing, say.
-        height: and level, of the interactive agents and of all as logged; nobody meets another on another level, as
-            :func:`symphony.metrics.collisions` has it.
+        agent_type: [..., A] ``AgentType`` numbers.
+        height: height and level of the interactive agents and of all as logged; nobody meets another on another
+            level, as :func:`symphony.metrics.collisions` has it.
 
     Raises:
-        ValueError: for shapes that do not fit together, or a flagged agent that touches nobody.
+        ValueError: for a flagged agent that touches nobody.
     """
+    ranks = ((collided, 2), (state, 3), (exists, 2), (subject, 1), (log_state, 3), (log_valid, 2), (size, 2))
     # One leading dimension more, so that there always is one.
-    lead = (1, *_lead(collided, state, exists, subject, log_state, log_valid, size, agent_type))
-    collided = collided.expand(*lead, *collided.shape[-2:])
-    subject = subject.expand(*lead, subject.shape[-1])
+    lead = (1, *torch.broadcast_shapes(*(value.shape[:-rank] for value, rank in ranks)))
+
+    def expanded(value: Tensor, rank: int) -> Tensor:
+        return value.expand(*lead, *value.shape[-rank:])
+
+    collided, rows = expanded(collided, 2), expanded(subject, 1)
     hit = collided.any(-1)
     *where, who = hit.nonzero(as_tuple=True)
     step = collided.to(torch.uint8).argmax(-1)[hit]
-    rows = subject[tuple(where)]
+    rows = rows[tuple(where)]
     agent = rows.gather(-1, who[:, None])[:, 0]
-    if bool((agent < 0).any()):
-        raise ValueError("collided is True for a subject that stands for no agent")
 
-    def poses(index: Int[Tensor, " M"]) -> _Poses:
-        at = (*where, index)
-        logged = log_state.expand(*lead, *log_state.shape[-3:]).transpose(-3, -2)[at]
-        valid = log_valid.expand(*lead, *log_valid.shape[-2:]).transpose(-2, -1)[at]
-        driven = state.expand(*lead, *state.shape[-3:]).transpose(-3, -2)[at]
-        there = exists.expand(*lead, *exists.shape[-2:]).transpose(-2, -1)[at]
-        direction = torch.stack([driven[..., 2].cos(), driven[..., 2].sin()], -1)
-        driven = torch.cat([driven[..., :3], driven[..., 3:] * direction], -1).to(logged.dtype)
-        logged, valid = _placed(logged, driven, rows), _placed(valid, there, rows)
-        return _Poses(logged[..., :2], logged[..., 2], logged[..., 3:], valid)
+    def everyone(driven: Tensor, logged: Tensor, rank: int) -> tuple[Tensor, Tensor]:
+        """Of each collision the values [M, A, ...] of all agents before and after its step."""
+        driven, logged = (expanded(value, rank).movedim(-rank + 1, -rank) for value in (driven, logged))
+        before, after = (_placed(logged[at], driven[at], rows) for at in ((*where, step), (*where, step + 1)))
+        return before, after
 
-    def levels(driven: Float[Tensor, "*_"], logged: Float[Tensor, "*_"]) -> list[Float[Tensor, "M A 2"]]:
-        driven, logged = (part.expand(*lead, *part.shape[-3:]).transpose(-3, -2) for part in (driven, logged))
-        return [_placed(logged[at], driven[at], rows) for at in ((*where, step), (*where, step + 1))]
-
-    boxes = size.expand(*lead, *size.shape[-2:])[tuple(where)]
-    heights = [] if height is None else levels(*height)
-    other, share, before, after = _first_met(poses(step), poses(step + 1), boxes, agent, heights)
-    ours, theirs = (boxes[torch.arange(len(row), device=row.device), row] for row in (agent, other))
-    ends = [(before.of(row), after.of(row)) for row in (agent, other)]
-    one_hit, two_hit = (_at_contact(*end, share) for end in ends)
-    kind = _classify(ends[0][0], ends[1][0], one_hit, two_hit, ours, theirs)
-    if agent_type is not None:
-        types = agent_type.expand(*lead, agent_type.shape[-1])[tuple(where)]
-        hit_type = types.gather(-1, other[:, None])[:, 0]
-        for number, named in _TYPES.items():
-            kind = torch.where(hit_type == number, int(named), kind)
+    direction = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
+    poses = torch.cat([state[..., :3], state[..., 3:] * direction], -1).to(log_state.dtype)
+    boxes = expanded(size, 2)[tuple(where)]
+    levels = None if height is None else everyone(*height, 3)
+    other, share, before, after = _first_met(
+        everyone(poses, log_state, 3), everyone(exists, log_valid, 2), boxes, agent, levels
+    )
+    one, two = ((torch.arange(len(row), device=row.device), row) for row in (agent, other))
+    ends = ((before[one], after[one]), (before[two], after[two]))
+    kind = kind_of_contact(*ends, share, boxes[one], boxes[two])
+    other_type = expanded(agent_type, 1)[tuple(where)].gather(-1, other[:, None])[:, 0]
+    for number, named in _TYPES.items():
+        kind = torch.where(other_type == number, int(named), kind)
     playback = ~(other[:, None] == rows).any(-1)
 
     def filled(values: Int[Tensor, " M"]) -> Int[Tensor, "*_"]:
@@ -201,43 +180,39 @@ def _placed(
 
 
 def _first_met(
-    before: _Poses,
-    after: _Poses,
+    poses: tuple[Float[Tensor, "M A 5"], Float[Tensor, "M A 5"]],
+    valid: tuple[Bool[Tensor, "M A"], Bool[Tensor, "M A"]],
     boxes: Float[Tensor, "M A 2"],
     agent: Int[Tensor, " M"],
-    height: list[Float[Tensor, "M A 2"]],
-) -> tuple[Int[Tensor, " M"], Float[Tensor, " M"], _Poses, _Poses]:
-    """Whom each agent [M] meets first in a step, after which share of it, and the poses of everyone: before the step,
-    or after it of those that were not both there before. Heights are those before and after, or none.
+    height: tuple[Float[Tensor, "M A 2"], Float[Tensor, "M A 2"]] | None,
+) -> tuple[Int[Tensor, " M"], Float[Tensor, " M"], Float[Tensor, "M A 5"], Float[Tensor, "M A 5"]]:
+    """Whom each agent [M] meets first in a step, after which share of it, and the poses of everyone before and after.
+
+    Where the agent and the other were not both there before the step, the poses before it are those after it. Poses,
+    validity and heights are given before and after the step.
     """
     me = torch.arange(len(agent), device=agent.device), agent
-    seen = before.valid & before.valid[me][:, None]
-    start = _chosen(seen, before, after)
-    mine = _Poses(
-        *(
-            torch.where(_like(seen, b), b[me][:, None], a[me][:, None])
-            for b, a in zip(before, after, strict=True)
-        )
+    before, after = poses
+    seen = valid[0] & valid[0][me][:, None]
+    start = torch.where(seen[..., None], before, after)
+    mine, mine_after = (
+        torch.where(seen[..., None], before[me][:, None], after[me][:, None]),
+        after[me][:, None],
     )
-    others = after.valid & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
-    if height:
+    others = valid[1] & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
+    if height is not None:
         apart, apart_after = (levels_apart(level, level[me][:, None]) for level in height)
         others &= ~(apart_after & (apart | ~seen))
     share = contact_share(
-        torch.stack([mine.position, after.position[me][:, None].expand_as(mine.position)], -2),
-        torch.stack([mine.heading, after.heading[me][:, None].expand_as(mine.heading)], -1),
+        torch.stack([mine[..., :2], mine_after[..., :2].expand_as(mine[..., :2])], -2),
+        torch.stack([mine[..., 2], mine_after[..., 2].expand_as(mine[..., 2])], -1),
         boxes[me][:, None],
-        torch.stack([start.position, after.position], -2),
-        torch.stack([start.heading, after.heading], -1),
+        torch.stack([start[..., :2], after[..., :2]], -2),
+        torch.stack([start[..., 2], after[..., 2]], -1),
         boxes,
     )
     gap = box_gap(
-        after.position[me][:, None],
-        after.heading[me][:, None],
-        boxes[me][:, None],
-        after.position,
-        after.heading,
-        boxes,
+        mine_after[..., :2], mine_after[..., 2], boxes[me][:, None], after[..., :2], after[..., 2], boxes
     )
     share, gap = (torch.where(others, value, torch.inf) for value in (share, gap))
     first = share.amin(-1, keepdim=True)
@@ -249,49 +224,34 @@ def _first_met(
             f"an agent that is said to collide is {float(least[first.isinf()].max()):.2f} m away from all others: "
             "flags and states do not belong together"
         )
-    pair = torch.arange(len(agent), device=agent.device), other
-    start = _chosen(seen[pair][:, None].expand_as(seen), before, after)
-    return other, first.clamp(max=1.0), start, after
+    both = seen.gather(1, other[:, None])[..., None]
+    return other, first.clamp(max=1.0), torch.where(both, before, after), after
 
 
-def _at_contact(before: _Poses, after: _Poses, share: Float[Tensor, " M"]) -> _Poses:
-    centers, headings = (
-        torch.stack([before.position, after.position], -2),
-        torch.stack([before.heading, after.heading], -1),
-    )
-    position, heading = pose_at(centers, headings, share.to(centers.dtype))
-    return _Poses(
-        position,
-        heading,
-        torch.lerp(before.velocity, after.velocity, share[:, None].to(centers.dtype)),
-        after.valid,
-    )
-
-
-def _like(mask: Bool[Tensor, "M ..."], value: Shaped[Tensor, "M ..."]) -> Bool[Tensor, "M ..."]:
-    return mask.reshape(*mask.shape, *(1,) * (value.ndim - mask.ndim))
-
-
-def _chosen(condition: Bool[Tensor, "M ..."], yes: _Poses, no: _Poses) -> _Poses:
-    return _Poses(*(torch.where(_like(condition, a), a, b) for a, b in zip(yes, no, strict=True)))
-
-
-def _classify(
-    one: _Poses,
-    two: _Poses,
-    one_hit: _Poses,
-    two_hit: _Poses,
+def kind_of_contact(
+    one: tuple[Float[Tensor, "M 5"], Float[Tensor, "M 5"]],
+    two: tuple[Float[Tensor, "M 5"], Float[Tensor, "M 5"]],
+    share: Float[Tensor, " M"],
     size_one: Float[Tensor, "M 2"],
     size_two: Float[Tensor, "M 2"],
 ) -> Int[Tensor, " M"]:
-    """Kind [M] for poses before and at contact."""
-    turn = wrap(two.heading - one.heading)
-    away, along, across = _separations(one, two, size_one, size_two)
-    _, along_hit, across_hit = _separations(one_hit, two_hit, size_one, size_two)
+    """:class:`CollisionKind` [M] of contacts, whoever the other is, from the point of view of the first agent.
+
+    Args:
+        one: poses of the agent before and after the step.
+        two: poses of the other before and after the step.
+        share: of the step after which they first overlap.
+        size_one: box of the agent.
+        size_two: box of the other.
+    """
+    sizes = size_one, size_two
+    turn = wrap(two[0][:, 2] - one[0][:, 2])
+    away, along, across = _separations(one[0], two[0], *sizes)
+    _, along_hit, across_hit = _separations(_at_contact(*one, share), _at_contact(*two, share), *sizes)
     ends = _closing(along, along_hit) >= _closing(across, across_hit)
     ahead = away > 0
-    axis = one.heading + 0.5 * turn
-    forward, forward_other = (rotate(pose.velocity, -axis)[..., 0] for pose in (one, two))
+    axis = one[0][:, 2] + 0.5 * turn
+    forward, forward_other = (rotate(pose[0][:, 3:], -axis)[..., 0] for pose in (one, two))
     back, front = torch.where(ahead, forward, forward_other), torch.where(ahead, forward_other, forward)
     backing = (front < -STANDING) & (back < STANDING)
     kind = torch.where(ahead, int(CollisionKind.INTO_LEADER), int(CollisionKind.REAR_ENDED))
@@ -301,13 +261,25 @@ def _classify(
     return torch.where(turn.abs() >= OPPOSITE_WAY, int(CollisionKind.ONCOMING), kind)
 
 
+def _at_contact(
+    before: Float[Tensor, "M 5"], after: Float[Tensor, "M 5"], share: Float[Tensor, " M"]
+) -> Float[Tensor, "M 3"]:
+    """Position and heading between two states."""
+    ends = torch.stack([before, after], 1)
+    position, heading = pose_at(ends[..., :2], ends[..., 2], share.to(ends.dtype))
+    return torch.cat([position, heading[:, None]], -1)
+
+
 def _separations(
-    one: _Poses, two: _Poses, size_one: Float[Tensor, "M 2"], size_two: Float[Tensor, "M 2"]
+    one: Float[Tensor, "M _"],
+    two: Float[Tensor, "M _"],
+    size_one: Float[Tensor, "M 2"],
+    size_two: Float[Tensor, "M 2"],
 ) -> tuple[Float[Tensor, " M"], ...]:
     """How far two is ahead of one, and the gaps between their boxes along and across their mean heading."""
-    half = 0.5 * wrap(two.heading - one.heading)
+    half = 0.5 * wrap(two[:, 2] - one[:, 2])
     # The mean heading, not that of either: so the two agents always agree on what they did.
-    delta = rotate(two.position - one.position, -(one.heading + half))
+    delta = rotate(two[:, :2] - one[:, :2], -(one[:, 2] + half))
     reach = 0.5 * (size_one + size_two)
     cos, sin = half.cos().abs(), half.sin().abs()
     along = delta[..., 0].abs() - (cos * reach[..., 0] + sin * reach[..., 1])
@@ -318,31 +290,3 @@ def _separations(
 def _closing(gap: Float[Tensor, " M"], gap_hit: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
     """Share of the step after which a gap is closed; where it was closed before, minus its depth."""
     return torch.where(gap > 0, gap / (gap - gap_hit).clamp(min=1e-6), gap)
-
-
-def _lead(
-    collided: Tensor,
-    state: Tensor,
-    exists: Tensor,
-    subject: Tensor,
-    log_state: Tensor,
-    log_valid: Tensor,
-    size: Tensor,
-    agent_type: Tensor | None,
-) -> torch.Size:
-    (agents, steps), everyone = collided.shape[-2:], size.shape[-2]
-    expected = {
-        "state": (state, (agents, steps + 1, 4)),
-        "exists": (exists, (agents, steps + 1)),
-        "subject": (subject, (agents,)),
-        "log_state": (log_state, (everyone, steps + 1, 5)),
-        "log_valid": (log_valid, (everyone, steps + 1)),
-        "size": (size, (everyone, 2)),
-    }
-    if agent_type is not None:
-        expected["agent_type"] = agent_type, (everyone,)
-    for name, (value, shape) in expected.items():
-        if value.shape[-len(shape) :] != shape:
-            raise ValueError(f"{name} is {list(value.shape)}, expected {list(shape)} at the end")
-    shapes = [value.shape[: -len(shape)] for value, shape in expected.values()]
-    return torch.broadcast_shapes(collided.shape[:-2], *shapes)

@@ -1,6 +1,6 @@
-"""Who goes first: pass and yield between agents whose paths merge or cross, in rollouts and in the log.
+"""Who goes first between agents whose paths merge or cross (see :func:`symphony.data.context.relations`).
 
-Which pairs interact is for the caller to say (see :func:`symphony.data.context.relations`). Metres and seconds.
+Metres and seconds.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ def passing_gap(
     Negative where the second passes first; NaN where the paths don't come within ``reach`` of each other. Of all
     pairs of times at which the two are that close, the earliest counts, by the sum of the two.
     """
-    paths = [_finer(first, first_valid), _finer(second, second_valid)]
-    (a, a_valid), (b, b_valid) = paths
+    (a, a_valid), (b, b_valid) = _finer(first, first_valid), _finer(second, second_valid)
     near = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1) <= reach**2
     near &= a_valid[..., :, None] & b_valid[..., None, :]
     step = torch.arange(near.shape[-1], device=near.device)
@@ -82,12 +81,7 @@ class OrderStatistics:
 
 
 def order_statistics(simulated: Float[Tensor, "R K"], log: Float[Tensor, " K"]) -> OrderStatistics:
-    """Compare who goes first.
-
-    Args:
-        simulated: :func:`passing_gap` of each rollout and pair.
-        log: that of each pair in the log.
-    """
+    """Compare who goes first, by :func:`passing_gap` of each rollout and pair, and of each pair in the log."""
     known = ~log.isnan() & (log != 0)
     simulated, log = simulated[:, known], log[known]
     same = (simulated.sign() == log.sign()).float().mean().item()

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.metrics.agents import AgentSteps, agent_rates, agent_results, speed_distance
-from symphony.metrics.choices import Choice, Standing, choice_numbers
+from symphony.metrics.choices import Choice, choice_numbers
 from symphony.metrics.curvature import (
     BINS,
     Divergence,
@@ -24,20 +24,55 @@ from symphony.metrics.curvature import (
     sampled_divergence,
     sampling_floor,
 )
-from symphony.metrics.intervals import zero_bound
-from symphony.metrics.kinds import CollisionKinds
-from symphony.metrics.rates import (
-    SegmentResult,
-    count_agents,
-    count_kinds,
-    count_standing,
-    group_numbers,
-    kind_rates,
-    ratio,
-    role_rates,
-    standing_rates,
-    summed,
+from symphony.metrics.intervals import ratio, summed, zero_bound
+from symphony.metrics.kinds import STANDING, CollisionKind, CollisionKinds
+
+WIDTH, FASTEST = 0.5, 45.0
+"""Bins of speeds, and the last of them, in m/s."""
+_SPEEDS = round(FASTEST / WIDTH)
+_SHARES = (
+    "collision_rate",
+    "collision_rate_at_states",
+    "offroad_time",
+    "agent_collision_rate",
+    "agent_offroad_time",
 )
+"""Percentages of which a bound is known where they are zero."""
+_ROW = (
+    "collision_rate",
+    "offroad_time",
+    "min_sade",
+    "collision_rate_at_states",
+    "collision_with_playback",
+    "standing",
+    "standing_log",
+)
+"""Numbers that every run segment has for itself."""
+
+
+@dataclass(frozen=True)
+class SegmentResult:
+    """What one run segment adds to the table.
+
+    Attributes:
+        group: the recording it is part of.
+        rollouts: K.
+        sums: of every number that is a ratio of sums over segments, what the segment adds to the two sums.
+        ade: its own ADE, metres; NaN where the log is valid at no step.
+        histogram: [201] curvatures of the branching regions visited by the rollouts.
+        histogram_log: [201] curvatures of those visited by the log.
+        speeds: [bins, 2] agent-steps by speed, simulated and logged.
+        choice: what the search made of the goals; None without search or goals.
+    """
+
+    group: str
+    rollouts: int
+    sums: dict[str, tuple[float, float]]
+    ade: float
+    histogram: NDArray[np.int64]
+    histogram_log: NDArray[np.int64]
+    speeds: NDArray[np.int64]
+    choice: Choice | None
 
 
 class RolloutMetrics:
@@ -52,88 +87,96 @@ class RolloutMetrics:
     def update(
         self,
         segment_ids: Sequence[str],
+        groups: Sequence[str],
         *,
-        collided: Bool[Tensor, "B K N T"],
-        offroad: Bool[Tensor, "B K N T"],
-        displacement: Float[Tensor, "B K N T"],
         simulated: Bool[Tensor, "B K N T"],
         logged: Bool[Tensor, "B N T"],
+        at_states: Bool[Tensor, "B K N T"],
+        offroad: Bool[Tensor, "B K N T"],
+        bounded: Bool[Tensor, " B"],
+        displacement: Float[Tensor, "B K N T"],
+        speed: Float[Tensor, "B K N T"],
+        speed_log: Float[Tensor, "B N T"],
+        last: Int[Tensor, " B"],
+        kinds: CollisionKinds,
+        kinds_logged: CollisionKinds,
         curvature: Sequence[NDArray[Any]],
         curvature_log: Sequence[NDArray[Any]],
-        kinds: CollisionKinds | None = None,
-        groups: Sequence[str] | None = None,
-        single: AgentSteps | None = None,
-        standing: Standing | None = None,
         choices: Sequence[Choice] | None = None,
-        at_states: Bool[Tensor, "B K N T"] | None = None,
-        bounded: Bool[Tensor, " B"] | None = None,
     ) -> None:
         """Add the rollouts of some segments.
 
         Args:
             segment_ids: [B], each seen once in all updates.
-            collided: whether an agent's box overlaps another at some time of a step.
-            offroad: whether its centre is off the road.
-            displacement: metres from the log.
+            groups: [B] the recording each segment is part of (see ``RunSegment.group``). Segments of one recording
+                are no independent samples: standard errors are over groups.
             simulated: agent-steps that exist; the rest counts for nothing.
-            logged: where the log is valid; the rest does not count for ADE and minSADE.
-            curvature: per segment, the average curvature of every branching region visited by each rollout.
-            curvature_log: per segment, likewise by the log.
-            kinds: [B, K, N] of the collisions of simulated agents, the ego first, for all segments or for none.
-            groups: [B] the recording each segment is part of (see ``RunSegment.group``), for all segments or for
-                none. Segments of one recording are no independent samples: standard errors are then over groups.
-            single: what single agents did, for all segments or for none.
-            standing: who stands at the end, for all segments or for none.
-            choices: [B] what the search made of the goals, for all segments or for none.
-            at_states: whether boxes overlap at the state after each step, for all segments or for none.
+            logged: where the log is valid; the rest does not count for distances from the log.
+            at_states: whether an agent's box overlaps another at the state after a step.
+            offroad: whether an agent's centre is off the road.
             bounded: whether the map of a segment has a boundary: where it has none nobody is off or on the road.
+            displacement: metres from the log.
+            speed: m/s in the rollouts.
+            speed_log: m/s in the log.
+            last: number of the last step of each segment.
+            kinds: [B, K, N] first collisions of simulated agents.
+            kinds_logged: [B, K, N] first collisions of simulated agents while their log exists.
+            curvature: per segment, the average curvature of every branching region visited by each rollout.
+            curvature_log: per segment, the same of those visited by the log.
+            choices: [B] what the search made of the goals; None without search or goals.
 
         Raises:
-            ValueError: for a segment that was added before, shapes that do not fit together, a displacement or
-                curvature that is not finite, or kinds of other collisions.
+            ValueError: for a segment that was added before.
         """
-        _check_shapes(len(segment_ids), simulated, collided, offroad, displacement, logged)
-        compared = simulated & logged[:, None]
-        away = displacement.detach().double().masked_fill(~compared, 0.0).flatten(2).tolist()
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
-        error = np.array([[math.fsum(rollout) for rollout in segment] for segment in away])
-        if not np.isfinite(error).all():
-            bad = segment_ids[int(np.argwhere(~np.isfinite(error))[0, 0])]
-            raise ValueError(f"segment {bad}: displacement is not finite")
-        hit = (collided & simulated).flatten(2).any(-1)
-        counts = None if kinds is None else count_kinds(segment_ids, kinds, hit)
-        by_agent = None if kinds is None else count_agents(kinds)
-        there = simulated.any(-1).sum(1)
-        if groups is not None and len(groups) != len(segment_ids):
-            raise ValueError(f"{len(groups)} groups for {len(segment_ids)} segments")
-        singles = None if single is None else agent_results(single)
-        ends = None if standing is None else count_standing(standing)
-        hits = hit.sum(1)
-        off, steps = (offroad & simulated).sum((1, 2, 3)), simulated.sum((1, 2, 3))
-        if bounded is not None:
-            steps = steps * bounded.to(steps.device)
-        touched = None if at_states is None else (at_states & simulated).flatten(2).any(-1).sum(1).tolist()
-        count = compared.sum((2, 3))
-        for b, (name, seen, seen_log) in enumerate(zip(segment_ids, curvature, curvature_log, strict=True)):
+        away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()
+        kind, playback = (part.cpu().numpy() for part in kinds.first())
+        kind_logged, playback_logged = (
+            part.cpu().numpy() for part in (kinds_logged.kind, kinds_logged.playback)
+        )
+        steps = [part.cpu().numpy() for part in (simulated, logged, at_states, offroad, speed, speed_log)]
+        ends, edged = last.tolist(), bounded.tolist()
+        for b, name in enumerate(segment_ids):
             if name in self.segments:
                 raise ValueError(f"segment {name} was added twice")
+            there, has_log, touching, off, own, log = (part[b] for part in steps)
+            both, log = there & has_log, np.broadcast_to(log, own.shape)
+            at_end = both[..., ends[b]]
+            rollouts, agents, compared = len(there), both.any(-1).sum(), both.sum()
+            first = _by_kind(kind[b], playback[b])
+            met = _by_kind(kind_logged[b], playback_logged[b])
+            shares = {
+                **_collision_shares("", first.sum(-1), rollouts),
+                "collision_with_playback": (first[:, 1].sum(), rollouts),
+                "collision_rear_ended_by_playback": (first[CollisionKind.REAR_ENDED, 1], rollouts),
+                "collision_rate_at_states": ((touching & there).any((1, 2)).sum(), rollouts),
+                "offroad_time": ((off & there).sum(), there.sum() * edged[b]),
+                **_collision_shares("agent_", met.sum(-1), agents),
+                "agent_collision_with_playback": (met[:, 1].sum(), agents),
+                "agent_offroad_time": ((off & both).sum(), compared * edged[b]),
+                "agent_progress": (own[both].sum(dtype=np.float64), log[both].sum(dtype=np.float64)),
+            }
+            error = np.array([math.fsum(rollout) for rollout in away[b]])
+            count = both.sum((1, 2)).astype(np.float64)
+            sums = {
+                "ade": (error.mean(), count.mean()),
+                "min_sade": _nearest(error, count),
+            }
+            for beside, driven in (("", own), ("_log", log)):
+                slow = np.abs(driven) < STANDING
+                sums[f"agent_speed{beside}"] = driven[both].sum(dtype=np.float64), compared
+                shares[f"agent_standing{beside}"] = (slow & both).sum(), compared
+                shares[f"standing{beside}"] = (slow[..., ends[b]] & at_end).sum(), at_end.sum()
+            sums |= {key: (100.0 * total, weight) for key, (total, weight) in shares.items()}
             self.segments[name] = SegmentResult(
-                collided=int(hits[b]),
-                rollouts=simulated.shape[1],
-                offroad=int(off[b]),
-                steps=int(steps[b]),
-                error=error[b],
-                logged=count[b].double().cpu().numpy(),
-                histogram=curvature_histogram(seen),
-                histogram_log=curvature_histogram(seen_log),
-                kinds=None if counts is None else counts[b],
-                agents=None if by_agent is None else by_agent[b],
-                simulated=(int(there[b, 0]), int(there[b, 1:].sum())),
-                group=None if groups is None else groups[b],
-                single=None if singles is None else singles[b],
-                standing=None if ends is None else ends[b],
+                group=groups[b],
+                rollouts=rollouts,
+                sums={key: (float(total), float(weight)) for key, (total, weight) in sums.items()},
+                ade=_quotient(error.sum(), count.sum()),
+                histogram=curvature_histogram(curvature[b]),
+                histogram_log=curvature_histogram(curvature_log[b]),
+                speeds=np.stack([_speed_histogram(driven[both]) for driven in (own, log)], -1),
                 choice=None if choices is None else choices[b],
-                at_states=None if touched is None else touched[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -150,32 +193,23 @@ class RolloutMetrics:
     def rows(self) -> list[dict[str, Any]]:
         """One row per segment, ordered by its id, for paired comparisons; ``group`` is the recording it is part of.
 
-        ``collision_rate`` and ``offroad_time`` in percent, ``ade`` and ``min_sade`` in metres (NaN where the log is
-        valid at no step, and off-road time where the map has no boundary); where given ``collision_rate_at_states``,
-        ``collision_with_playback``, ``standing`` and ``standing_log`` in percent, and
-        ``goals_variation``.
+        Percentages (see :meth:`compute`), ``ade`` and ``min_sade`` in metres, and ``goals_variation`` where a search
+        had goals; NaN for a mean over nothing.
         """
-        return [
-            {
-                "segment": name,
-                "group": s.group or name,
-                "collision_rate": 100.0 * s.collided / s.rollouts,
-                "offroad_time": 100.0 * s.offroad / s.steps if s.steps else math.nan,
-                "ade": s.error.sum() / s.logged.sum() if s.logged.any() else math.nan,
-                "min_sade": s.nearest[0] / s.nearest[1] if s.logged.any() else math.nan,
-                **_more(s),
-            }
-            for name, s in sorted(self.segments.items())
-        ]
+        found = []
+        for name, segment in sorted(self.segments.items()):
+            own: dict[str, Any] = {key: _quotient(*segment.sums[key]) for key in _ROW}
+            choice = {} if segment.choice is None else {"goals_variation": segment.choice.variation}
+            about = {"segment": name, "group": segment.group, "ade": segment.ade}
+            found.append(about | own | choice)
+        return found
 
     def mean(self, values: Mapping[str, float]) -> tuple[float, float]:
         """Mean of another number of every segment, and its standard error over the same groups; NaN is left out."""
         known = {name: value for name, value in sorted(values.items()) if not math.isnan(value)}
-        if not known:
-            return math.nan, math.nan
         if any(map(math.isinf, known.values())):
             return sum(known.values()), math.nan
-        member = group_numbers([self.segments[name] for name in known])
+        member = np.unique([self.segments[name].group for name in known], return_inverse=True)[1]
         return ratio(np.array(list(known.values())), np.ones(len(known)), member)
 
     def curvature_histograms(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -187,141 +221,89 @@ class RolloutMetrics:
         return visited, visited_log
 
     def curvature_divergence(self) -> tuple[Divergence, list[str]]:
-        """The divergence, and the names of its samples: the groups, or without any the segments."""
+        """The divergence, and the names of its samples: the groups."""
         found = [self.segments[name] for name in sorted(self.segments)]
-        member = group_numbers(found)
-        names = sorted(self.segments) if member is None else sorted({str(s.group) for s in found})
+        names, member = np.unique([one.group for one in found], return_inverse=True)
         counts = (
             np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True)
         )
-        return sampled_divergence(*(summed(each, member) for each in counts)), names
+        return sampled_divergence(*(summed(each, member) for each in counts)), names.tolist()
 
     def compute(self) -> dict[str, Any]:
         """The table row.
 
         Returns:
-            ``collision_rate`` (percent of rollouts with at least one collision of an interactive agent),
-            ``offroad_time`` (percent of agent-steps), ``ade`` and ``min_sade`` (metres, means over agent-steps of
-            all segments), ``curvature_jsd`` (nats, NaN if rollouts or logs visit no branching region), each with its
-            standard error over segments under ``*_se`` (linearised for the ratios, jackknife for the divergence);
-            ``segments`` and ``rollouts`` (per segment); ``offroad_segments``, those with a boundary, of which alone
-            the off-road time is (NaN without any). Of each percentage that is zero ``*_bound`` is the exact one-sided
-            bound with 95 % confidence over these samples (:func:`symphony.metrics.intervals.zero_bound`), else NaN.
-            ``collision_rate_at_states`` (where given) counts overlaps at states only, as the paper and WOSAC do, and
-            not those between states. ``curvature_jsd_floor`` is what the
-            log's finite size alone gives, ``curvature_jsd_corrected`` the divergence without its bias by sampling
-            (its error is that of the divergence; NaN for a single segment or group). Where kinds were given, likewise
-            the percent of rollouts whose first collision is of a kind, ``collision_into_leader`` and so on for every
-            :class:`CollisionKind` (they sum to ``collision_rate``), that is with a playback agent,
-            ``collision_with_playback``, and that is both, ``collision_rear_ended_by_playback``; and of the agents
-            themselves, the ego apart, the percent that collide, ``ego_collision_rate`` and
-            ``others_collision_rate``, and by kind, ``ego_collision_into_leader`` and so on.
-            Where steps of single agents were given, of those at which an agent is driven and logged: the percent of
-            agents that collide, ``agent_collision_rate``, by kind and ``agent_collision_with_playback``;
-            ``agent_offroad_time``; metres driven in percent of the log's, ``agent_progress``; mean speed,
-            ``agent_speed``, and the percent of time that agents stand, ``agent_standing``, both also as ``*_log``;
-            and how far the speeds are from the log's, ``agent_speed_distance`` (Wasserstein, m/s).
-            Where standing was given, ``standing`` and ``standing_log`` are the percent of agents that stand at the
-            last step, of those whose log lasts that long. Where choices were given, see :func:`choice_numbers`.
-            Where groups were given, ``groups`` is how many, and all standard errors are over them (as if each were
-            one segment: cluster-robust, and a jackknife that leaves out a group).
+            Percentages, distances in metres, each with its standard error over groups under ``*_se`` (linearised for
+            the ratios, jackknife for the divergence). Of each percentage that is zero ``*_bound`` is the exact
+            bound with 95 % confidence over groups (:func:`symphony.metrics.intervals.zero_bound`), else NaN.
 
-        Raises:
-            ValueError: if nothing was added, or kinds or groups for some segments only.
+            The paper's: ``collision_rate``, rollouts with at least one collision of an interactive agent;
+            ``offroad_time``, of agent-steps; ``ade`` and ``min_sade``, means over agent-steps of all segments;
+            ``curvature_jsd``, nats, NaN if rollouts or logs visit no branching region. Beside it
+            ``curvature_jsd_floor`` is what the log's finite size alone gives, ``curvature_jsd_corrected`` the
+            divergence without its bias by sampling (NaN for a single group).
+
+            Of collisions: ``collision_rate_at_states`` counts overlaps at states only, as the paper and WOSAC do;
+            ``collision_into_leader`` and so on are rollouts by the :class:`CollisionKind` of their first collision
+            (they sum to ``collision_rate``), ``collision_with_playback`` those in which that is with a playback
+            agent, ``collision_rear_ended_by_playback`` both.
+
+            Of single agents while they are driven and logged: ``agent_collision_rate``, by kind, and
+            ``agent_collision_with_playback``, percent of agents; ``agent_offroad_time``; ``agent_progress``, metres
+            driven in percent of the log's; ``agent_speed``, its mean, and ``agent_standing``, percent of time, both
+            also as ``*_log``; ``agent_speed_distance``, how far the speeds are from the log's (Wasserstein, m/s).
+
+            ``standing`` and ``standing_log`` are the percent of agents that stand at the last step, of those whose
+            log lasts that long; of goals see :func:`symphony.metrics.choices.choice_numbers`. ``segments``,
+            ``offroad_segments`` (those with a boundary, of which alone the off-road time is), ``groups`` and
+            ``rollouts`` (per segment) say how many there are.
         """
-        if not self.segments:
-            raise ValueError("no segments were added")
         found = [self.segments[name] for name in sorted(self.segments)]
-
-        def column(values: Sequence[float]) -> NDArray[np.float64]:
-            return np.array(values, dtype=np.float64)
-
-        single = [s.single for s in found if s.single is not None]
-        if 0 < len(single) < len(found):
-            raise ValueError(f"steps of agents were given for {len(single)} of {len(found)} segments")
-        nearest = [s.nearest for s in found]
-        parts = {
-            "collision_rate": (
-                100 * column([s.collided for s in found]),
-                column([s.rollouts for s in found]),
-            ),
-            "offroad_time": (100 * column([s.offroad for s in found]), column([s.steps for s in found])),
-            "ade": (column([s.error.mean() for s in found]), column([s.logged.mean() for s in found])),
-            "min_sade": (column([error for error, _ in nearest]), column([steps for _, steps in nearest])),
-            **_touching(found),
-            **kind_rates(found),
-            **role_rates(found),
-            **(agent_rates(single) if single else {}),
-            **standing_rates(found),
-        }
-        member = group_numbers(found)
+        groups, member = np.unique([one.group for one in found], return_inverse=True)
         out: dict[str, Any] = {}
-        for name, (total, weight) in parts.items():
+        for name in found[0].sums:
+            total, weight = np.array([one.sums[name] for one in found]).T
             out[name], out[f"{name}_se"] = ratio(total, weight, member)
             if name in _SHARES:
                 samples = int((summed(weight, member) > 0).sum())
                 out[f"{name}_bound"] = zero_bound(samples) if out[name] == 0 else math.nan
         divergence, _ = self.curvature_divergence()
         out["curvature_jsd"], out["curvature_jsd_se"] = divergence.value, divergence.error
-        out["curvature_jsd_floor"] = sampling_floor(np.stack([s.histogram_log for s in found]))
+        out["curvature_jsd_floor"] = sampling_floor(np.stack([one.histogram_log for one in found]))
         out["curvature_jsd_corrected"] = divergence.corrected
-        chosen = [s.choice for s in found if s.choice is not None]
+        chosen = [one.choice for one in found if one.choice is not None]
         out |= choice_numbers(chosen) if chosen else {}
-        if single:
-            out["agent_speed_distance"] = speed_distance(single)
+        speeds = np.sum([one.speeds for one in found], axis=0)
+        share = np.cumsum(speeds / speeds.sum(0), axis=0) if speeds.any() else np.full((1, 2), math.nan)
+        out["agent_speed_distance"] = float(WIDTH * np.abs(share[:, 0] - share[:, 1]).sum())
         out["segments"] = len(found)
-        out["offroad_segments"] = sum(s.steps > 0 for s in found)
-        if member is not None:
-            out["groups"] = int(member.max()) + 1
-        out["rollouts"] = max(s.rollouts for s in found)
+        out["offroad_segments"] = sum(one.sums["offroad_time"][1] > 0 for one in found)
+        out["groups"] = len(groups)
+        out["rollouts"] = max(one.rollouts for one in found)
         return out
 
 
-_SHARES = (
-    "collision_rate",
-    "collision_rate_at_states",
-    "offroad_time",
-    "agent_collision_rate",
-    "agent_offroad_time",
-)
-"""Percentages of which a bound is known where they are zero."""
+def _nearest(error: NDArray[np.float64], count: NDArray[np.float64]) -> tuple[float, float]:
+    """Error and agent-steps of the rollout that is nearest to the log on average; 0 where none is compared."""
+    best = int(np.where(count > 0, error / np.maximum(count, 1), np.inf).argmin())
+    return float(error[best]), float(count[best])
 
 
-def _touching(found: Sequence[SegmentResult]) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Collisions at states only, of all segments or of none."""
-    given = [s.at_states for s in found if s.at_states is not None]
-    if not given:
-        return {}
-    if len(given) < len(found):
-        raise ValueError(f"collisions at states were given for {len(given)} of {len(found)} segments")
-    rollouts = np.array([s.rollouts for s in found], np.float64)
-    return {"collision_rate_at_states": (100 * np.array(given, np.float64), rollouts)}
+def _by_kind(kind: NDArray[np.int64], playback: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """How many collisions there are by kind and whether the other is a playback agent [kinds, 2]."""
+    same = kind[..., None] == np.array(CollisionKind)
+    other = playback[..., None] == np.array([False, True])
+    return (same[..., None] & other[..., None, :]).sum(tuple(range(kind.ndim)))
 
 
-def _more(s: SegmentResult) -> dict[str, float]:
-    """What a row has where it was asked for."""
-    out: dict[str, float] = {}
-    if s.at_states is not None:
-        out["collision_rate_at_states"] = 100.0 * s.at_states / s.rollouts
-    if s.kinds is not None:
-        out["collision_with_playback"] = 100.0 * float(s.kinds[:, 1].sum()) / s.rollouts
-    if s.standing is not None:
-        slow, slow_log, agents = s.standing
-        out["standing"] = 100.0 * slow / agents if agents else math.nan
-        out["standing_log"] = 100.0 * slow_log / agents if agents else math.nan
-    if s.choice is not None:
-        out["goals_variation"] = s.choice.variation
-    return out
+def _collision_shares(who: str, counts: NDArray[np.int64], of: Any) -> dict[str, tuple[Any, Any]]:
+    each = {f"{who}collision_{kind.name.lower()}": (counts[kind], of) for kind in CollisionKind}
+    return {f"{who}collision_rate": (counts.sum(), of), **each}
 
 
-def _check_shapes(
-    batch: int, simulated: Tensor, collided: Tensor, offroad: Tensor, displacement: Tensor, logged: Tensor
-) -> None:
-    shape = tuple(simulated.shape)
-    if len(shape) != 4 or shape[0] != batch or shape[1] < 1:
-        raise ValueError(f"simulated is {list(shape)}, expected [B = {batch}, K >= 1, N, T]")
-    for name, value in (("collided", collided), ("offroad", offroad), ("displacement", displacement)):
-        if tuple(value.shape) != shape:
-            raise ValueError(f"{name} is {list(value.shape)}, expected {list(shape)}")
-    if tuple(logged.shape) != (batch, *shape[2:]):
-        raise ValueError(f"logged is {list(logged.shape)}, expected {[batch, *shape[2:]]}")
+def _quotient(total: float, weight: float) -> float:
+    return float(total / weight) if weight else math.nan
+
+
+def _speed_histogram(speed: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+    return np.bincount((np.abs(speed) / WIDTH).astype(np.int64).clip(max=_SPEEDS - 1), minlength=_SPEEDS)

@@ -44,7 +44,7 @@ COLUMNS = {
     "max_lateral_acceleration": "lateral m/s²",
     "log_distance": "to log m",
 }
-"""Of the table of runs: a number's name and its heading."""
+"""Columns of the table of runs: the name of a number and its heading."""
 LEAD = 2.0
 """Seconds before the first event of a run at which its replay begins."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Indices, Near, turn_between
+from symphony.roadgraph.lines import Bools, Indices, Near, turn_between
 
 LATERAL = 3.0
 """Metres from a centre line within which a vehicle can be on a lane."""
@@ -32,6 +33,7 @@ def lane_of(
     heading: NDArray[Any],
     *,
     tolerance: float = LATERAL,
+    keep: Callable[[Near], Bools] | None = None,
 ) -> Indices:
     """Lane of each vehicle, -1 where there is none.
 
@@ -43,6 +45,7 @@ def lane_of(
         position: [..., 2] metres.
         heading: [...] radians.
         tolerance: largest distance from the centre line, metres.
+        keep: which of some pairs of a vehicle and a lane near to it count, where not all do.
 
     Raises:
         ValueError: a position or heading that is not finite; names the vehicle.
@@ -52,6 +55,8 @@ def lane_of(
     if len(wrong):
         raise ValueError(f"vehicle {wrong[0].tolist()}: a position or heading that is not finite")
     near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance)
+    if keep is not None:
+        near, turn = near.only(kept := keep(near)), turn[kept]
     return _nearest(graph, near, turn, position[..., 0].size).reshape(position.shape[:-1])
 
 
@@ -106,5 +111,4 @@ def _compatible(
     near = graph.index.near(position, tolerance)
     turn = turn_between(near.heading, np.asarray(heading, dtype=np.float64)[near.point])
     keep = turn <= TURN
-    point, line, distance, along, direction = near
-    return Near(point[keep], line[keep], distance[keep], along[keep], direction[keep]), turn[keep]
+    return near.only(keep), turn[keep]

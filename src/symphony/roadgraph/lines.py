@@ -31,6 +31,11 @@ class Near(NamedTuple):
     along: Reals
     heading: Reals
 
+    def only(self, keep: Bools | Indices) -> Near:
+        """Some of the pairs."""
+        point, line, distance, along, heading = self
+        return Near(point[keep], line[keep], distance[keep], along[keep], heading[keep])
+
 
 class LineIndex:
     """Spatial index over polylines.

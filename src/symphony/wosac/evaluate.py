@@ -20,8 +20,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import BASELINES
-from symphony.evaluation.paired import clustered_mean
 from symphony.metrics import OrderStatistics
+from symphony.metrics.intervals import clustered_mean
 from symphony.rollouts.workers import shared
 from symphony.wosac.passing import PassingGaps, order_of, passing_gaps, passing_pairs
 from symphony.wosac.records import DT

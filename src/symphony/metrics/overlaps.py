@@ -1,7 +1,6 @@
-"""Per-step realism of rollouts: collisions, off-road driving, distance from the log (section V of the paper).
+"""Who collides, between states or at them (paper, section V).
 
-Metres and radians. T are the simulated steps: the first state, where rollout and log are equal by construction, is
-left out by the caller. Legend: A agents, N interactive agents, E boundary segments.
+Metres and radians. Legend: A agents, N interactive agents, U states, T steps, R worlds, E meetings.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.geometry import box_corners, contact_share, levels_apart, signed_distance
+from symphony.geometry import contact_share, levels_apart
 
 _SLACK = 1e-3
 _PAIRS = 1 << 22
@@ -145,42 +144,3 @@ def collisions(
     result = torch.zeros(*flat[4].shape, steps, dtype=torch.bool, device=position.device)
     result[found.row, found.subject, found.step] = True
     return result.reshape(*lead, subject.shape[-1], steps)
-
-
-def offroad(
-    position: Float[Tensor, "B *rest 2"],
-    start: Float[Tensor, "B E 2"],
-    end: Float[Tensor, "B E 2"],
-    valid: Bool[Tensor, "B E"],
-    previous: Int[Tensor, "B E"] | None = None,
-    following: Int[Tensor, "B E"] | None = None,
-    *,
-    heading: Float[Tensor, " B *rest"] | None = None,
-    size: Float[Tensor, "B *#rest 2"] | None = None,
-) -> Bool[Tensor, " B *rest"]:
-    """Whether boxes are off the drivable area.
-
-    By their centre or, where ``heading`` and ``size`` are given, by any of their corners. The boundary is that of
-    :func:`symphony.geometry.signed_distance`; a point on it is not off the road.
-    """
-    shape = position.shape[:-1]
-    if heading is None or size is None:
-        if heading is not None or size is not None:
-            raise ValueError("corners need both heading and size")
-        points = position[..., None, :]
-    else:
-        points = box_corners(position, heading, size)
-    flat = points.reshape(len(position), -1, 2)
-    with torch.no_grad():
-        distance = signed_distance(flat, start, end, valid, previous, following)
-    return (distance > 0).reshape(*shape, points.shape[-2]).any(-1)
-
-
-def displacement(
-    position: Float[Tensor, "*#batch N T 2"],
-    log: Float[Tensor, "*#batch N T 2"],
-    valid: Bool[Tensor, "*#batch N T"],
-) -> Float[Tensor, "*batch N T"]:
-    """Euclidean distance to the logged position, 0 where the log is not valid. Leading dimensions broadcast."""
-    away = torch.where(valid[..., None], position - log, 0.0)
-    return torch.hypot(away[..., 0], away[..., 1])

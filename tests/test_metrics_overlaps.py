@@ -1,18 +1,17 @@
-"""Collisions, off-road driving and displacement against shapely and by hand."""
+"""Collisions against shapely and by hand."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import pytest
 import shapely
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from symphony.geometry import box_corners, segments_of
-from symphony.metrics import collisions, displacement, offroad
+from symphony.geometry import box_corners
+from symphony.metrics import collisions
 
 
 def scene(seed, lead=(2,), agents=7, steps=5, spread=14.0):
@@ -93,72 +92,3 @@ def test_leading_dimensions_broadcast():
     for b, k in np.ndindex(2, 3):
         one = collisions(position[b, k], heading[b, k], size[b, 0], valid[b, k], subject[b, 0])
         assert torch.equal(whole[b, k], one)
-
-
-def boundary(polygons):
-    """start, end, valid, previous, following of one scene per polygon, padded."""
-    parts = []
-    for polygon in shapely.orient_polygons(polygons):
-        lines = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
-        parts.append(segments_of(np.concatenate(lines), np.cumsum([0, *(len(x) for x in lines)])))
-    width = max(len(p[0]) for p in parts)
-
-    def stack(k, fill):
-        pads = [np.concatenate((p[k], np.full((width - len(p[k]), *p[k].shape[1:]), fill))) for p in parts]
-        return torch.tensor(np.stack(pads))
-
-    valid = torch.tensor(np.stack([np.arange(width) < len(p[0]) for p in parts]))
-    return stack(0, 0.0), stack(1, 0.0), valid, stack(2, -1), stack(3, -1)
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_offroad_agrees_with_shapely(seed):
-    rng = np.random.default_rng(seed)
-    roads = []
-    for _ in range(2):
-        line = shapely.LineString(np.cumsum(rng.uniform(-15, 15, (5, 2)), axis=0))
-        area = line.buffer(rng.uniform(3, 6))
-        roads.append(max(shapely.get_parts(area), key=shapely.area))
-    edge = boundary(roads)
-    position = torch.tensor(rng.uniform(-40, 40, (2, 3, 4, 5, 2)))
-    heading = torch.tensor(rng.uniform(-4, 4, (2, 3, 4, 5)))
-    size = torch.tensor(rng.uniform(1, 5, (2, 1, 4, 1, 2)))
-    center = offroad(position, *edge)
-    corner = offroad(position, *edge, heading=heading, size=size)
-    assert center.shape == corner.shape == (2, 3, 4, 5)
-    corners = box_corners(position, heading, size).numpy()
-    for i in np.ndindex(2, 3, 4, 5):
-        assert center[i] == (not roads[i[0]].contains(shapely.Point(position[i].numpy())))
-        inside = shapely.contains(roads[i[0]], shapely.points(corners[i]))
-        assert corner[i] == (not inside.all())
-
-
-def test_offroad_of_a_car_at_the_kerb():
-    edge = boundary([shapely.box(0, 0, 100, 10)])
-    position, heading = (
-        torch.tensor([[[50.0, 1.0], [50.0, 0.5], [50.0, -0.1]]]).double(),
-        torch.zeros(1, 3).double(),
-    )
-    size = torch.tensor([[[4.0, 1.8]] * 3]).double()
-    assert offroad(position, *edge).tolist() == [[False, False, True]]
-    assert offroad(position, *edge, heading=heading, size=size).tolist() == [[False, True, True]]
-    assert not offroad(
-        torch.tensor([[[50.0, 0.0], [0.0, 5.0], [0.0, 0.0]]]).double(), *edge
-    ).any()  # on the edge
-    with pytest.raises(ValueError, match="heading and size"):
-        offroad(position, *edge, size=size)
-
-
-def test_nothing_is_offroad_without_a_boundary():
-    none = torch.zeros(2, 0, 2)
-    assert not offroad(torch.rand(2, 3, 4, 2), none, none, torch.zeros(2, 0, dtype=torch.bool)).any()
-
-
-def test_displacement():
-    log = torch.tensor([[[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]])
-    position = (log + torch.tensor([3.0, 4.0])).expand(2, 1, 3, 2).clone()
-    position[0] += torch.tensor([3.0, 4.0])
-    valid = torch.tensor([[True, False, True]])
-    log[0, 1] = torch.nan
-    assert displacement(position, log, valid).tolist() == [[[10, 0, 10]], [[5, 0, 5]]]
