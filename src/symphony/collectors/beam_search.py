@@ -96,11 +96,6 @@ class BeamSearchResult:
         """How many of the leaves have what a slot simulated in a period in their history."""
         return torch.zeros_like(self.parents).scatter_add(-1, self.slots, torch.ones_like(self.slots))
 
-    @property
-    def reaches_leaf(self) -> Bool[Tensor, "*b P S"]:
-        """Whether what a slot simulated in a period is part of the history of one of the L leaves."""
-        return self.descendants > 0
-
 
 def beam_search(
     env: EnvBase,

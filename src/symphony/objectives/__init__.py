@@ -5,11 +5,27 @@ Each takes the entries it reads as settable keys. By default they lie under ``"a
 
 from __future__ import annotations
 
-from symphony.objectives.bc import BCLoss
-from symphony.objectives.discriminator import DiscriminatorLoss
-from symphony.objectives.distillation import DistillationLoss
-from symphony.objectives.goal import GoalLoss
-from symphony.objectives.mgail import MGAILLoss
-from symphony.objectives.statistics import auc
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from symphony.objectives.bc import BCLoss
+    from symphony.objectives.discriminator import DiscriminatorLoss
+    from symphony.objectives.distillation import DistillationLoss
+    from symphony.objectives.goal import GoalLoss
+    from symphony.objectives.mgail import MGAILLoss
+    from symphony.objectives.statistics import auc
 
 __all__ = ["BCLoss", "DiscriminatorLoss", "DistillationLoss", "GoalLoss", "MGAILLoss", "auc"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, and no other loss."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    room = "statistics" if name == "auc" else name.removesuffix("Loss").lower()
+    return getattr(importlib.import_module(f"{__name__}.{room}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
