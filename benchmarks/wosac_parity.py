@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from symphony.files import write_json
-from symphony.wosac.records import parse_scenario, read_scenario_payloads, scenario_arrays
-from symphony.wosac.rollouts import read_rollouts
+from symphony.wosac.files import read_rollouts
+from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
 from symphony.wosac.scorer import (
     CHALLENGES,
-    SimulatedRollouts,
     WosacFeatures,
     WosacScenario,
     compute_features,
@@ -36,8 +35,8 @@ def feature_differences(found: WosacFeatures, file: Path) -> dict[str, float]:
     largest = {}
     with np.load(file, allow_pickle=False) as official:
         for prefix, part in (("log", found.log), ("sim", found.simulated)):
-            for name in part.__dataclass_fields__:
-                ours, theirs = getattr(part, name).numpy(), official[f"{prefix}_{name}"]
+            for name, values in part.items():
+                ours, theirs = values.numpy(), official[f"{prefix}_{name}"]
                 if ours.dtype == bool:
                     apart = float((ours != theirs).sum())
                 else:
@@ -50,10 +49,10 @@ def feature_differences(found: WosacFeatures, file: Path) -> dict[str, float]:
 
 def compared(scenario: WosacScenario, file: Path, expected: dict[str, Any]) -> dict[str, Any]:
     """One case: our scores, and the largest differences."""
-    found = compute_features(scenario, SimulatedRollouts.of(**vars(read_rollouts(file))))
+    found = compute_features(scenario, read_rollouts(file))
     result: dict[str, Any] = {"features": feature_differences(found, file)}
     for year, config in CHALLENGES.items():
-        ours, theirs = score_features(found, config).to_dict(), expected[EXPECTED[year]]
+        ours, theirs = score_features(found, config), expected[EXPECTED[year]]
         apart = {name: abs(value - theirs.get(NAMES.get(name, name), value)) for name, value in ours.items()}
         result[year] = {
             "metametric": ours["metametric"],
@@ -73,8 +72,8 @@ def main() -> None:
     parser.add_argument("--official", type=Path, required=True)
     parser.add_argument("--json", type=Path, required=True)
     given = parser.parse_args()
-    ((_, record, payload),) = read_scenario_payloads([given.scenario])
-    scenario = WosacScenario.of(**scenario_arrays(parse_scenario(payload, given.scenario, record)))
+    ((_, record, payload),) = read_scenarios(given.scenario)
+    scenario = logged_scenario(parse_scenario(payload, given.scenario, record))
     cases = json.loads((given.official / "manifest.json").read_text())["cases"]
     found = {
         name.removeprefix(f"{scenario.scenario_id}_"): compared(

@@ -1,21 +1,19 @@
-"""Small scenarios for the WOSAC score, and slow, plain computations to compare with."""
+"""Small scenarios for the WOSAC score."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from helpers_sources import womd_scenario
 from symphony.data.sources import womd_pb2 as pb
-from symphony.wosac.rollouts import RolloutArrays
 from symphony.wosac.scorer import SimulatedRollouts, WosacScenario
 
 Reals = NDArray[np.floating[Any]]
-ROAD = [(-200.0, -8.0, 0.0), (0.0, -8.0, 0.0), (200.0, -8.0, 0.0)]
+ROAD = np.array([(-200.0, -8.0, 0.0), (0.0, -8.0, 0.0), (200.0, -8.0, 0.0)])
 """Right edge of a road along +x; the drivable side is on its left."""
 
 
@@ -36,17 +34,17 @@ def made_scenario(agents: int = 4, seed: int = 0, **changes: Any) -> WosacScenar
         "heading": np.zeros((agents, 91), np.float32),
         "size": np.tile(np.array([4.5, 2.0, 1.5], np.float32), (agents, 1)),
         "valid": np.ones((agents, 91), bool),
-        "evaluated": [10, 11],
+        "evaluated": np.array([10, 11]),
         "road_edges": [ROAD],
-        "lanes": [[(k, y, 0.0) for k in range(0, 100, 5)] for y in (0.0, 4.0)],
-        "lane_id": [7, 8],
-        "lane_type": [2, 2],
+        "lanes": [np.array([(k, y, 0.0) for k in range(0, 100, 5)]) for y in (0.0, 4.0)],
+        "lane_id": np.array([7, 8]),
+        "lane_type": np.array([2, 2]),
         "signal_step": np.arange(91),
         "signal_lane": np.full(91, 7),
         "signal_state": np.where(np.arange(91) >= 20, 4, 6),
         "signal_point": np.tile([30.0, 0.0], (91, 1)),
     }
-    return WosacScenario.of("made", **{**arrays, **changes})
+    return WosacScenario("made", **{**arrays, **changes})
 
 
 def made_rollouts(
@@ -54,12 +52,12 @@ def made_rollouts(
 ) -> SimulatedRollouts:
     """The log with noise, for every agent that is valid at step 10."""
     rng = np.random.default_rng(seed)
-    rows = scenario.valid[:, 10].numpy()
-    future = scenario.position.numpy()[rows, 11:]
+    rows = scenario.valid[:, 10]
+    future = scenario.position[rows, 11:]
     states = future[None] + rng.normal(0, noise, (count, *future.shape))
-    heading = scenario.heading.numpy()[rows, 11:] + rng.normal(0, noise / 5, (count, *future.shape[:-1]))
+    heading = scenario.heading[rows, 11:] + rng.normal(0, noise / 5, (count, *future.shape[:-1]))
     x, y, z = np.moveaxis(states.astype(np.float32), -1, 0)
-    return SimulatedRollouts.of(scenario.object_id.numpy()[rows], x, y, z, heading.astype(np.float32))
+    return SimulatedRollouts(scenario.object_id[rows], x, y, z, heading.astype(np.float32))
 
 
 def womd_record(name: str = "0123456789abcdef", tracks: int = 3) -> pb.Scenario:
@@ -69,7 +67,7 @@ def womd_record(name: str = "0123456789abcdef", tracks: int = 3) -> pb.Scenario:
     return scenario
 
 
-def record_rollouts(scenario: pb.Scenario, count: int = 32, seed: int = 0) -> RolloutArrays:
+def record_rollouts(scenario: pb.Scenario, count: int = 32, seed: int = 0) -> SimulatedRollouts:
     """Log playback of a record with a little noise."""
     rng = np.random.default_rng(seed)
     logged = np.array(
@@ -77,7 +75,12 @@ def record_rollouts(scenario: pb.Scenario, count: int = 32, seed: int = 0) -> Ro
     )
     states = logged + rng.normal(0, 0.1, (count, *logged.shape))
     ids = np.array([track.id for track in scenario.tracks])
-    return RolloutArrays(ids, *np.moveaxis(states.astype(np.float32), -1, 0))
+    return SimulatedRollouts(ids, *np.moveaxis(states.astype(np.float32), -1, 0))
+
+
+def write_rollouts(file: Path, rollouts: SimulatedRollouts) -> None:
+    """Write a file that ``symphony wosac score`` reads."""
+    np.savez(file, **vars(rollouts))
 
 
 def box(center: Reals, heading: Reals | float, length: float, width: float) -> Reals:
@@ -86,49 +89,3 @@ def box(center: Reals, heading: Reals | float, length: float, width: float) -> R
     cos, sin = np.cos(heading), np.sin(heading)
     turn = np.moveaxis(np.array([[cos, sin], [-sin, cos]]), (0, 1), (-2, -1))
     return np.asarray(center)[..., None, :] + corners @ turn
-
-
-def rounded_gap(a: tuple[Any, ...], b: tuple[Any, ...]) -> float:
-    """Signed distance of two rounded boxes (centre, heading, length, width), by shapely."""
-    radii = [0.7 * min(shape[2:]) / 2 for shape in (a, b)]
-    cores = [
-        box(shape[0], shape[1], shape[2] - 2 * r, shape[3] - 2 * r)
-        for shape, r in zip((a, b), radii, strict=True)
-    ]
-    differences = shapely.MultiPoint((cores[0][:, None] - cores[1][None]).reshape(-1, 2)).convex_hull
-    origin = shapely.Point(0, 0)
-    inside = differences.contains(origin)
-    return (-1 if inside else 1) * differences.exterior.distance(origin) - sum(radii)
-
-
-def edge_distance(point: Reals, lines: list[Reals], stretch: float = 3.0) -> float:
-    """Signed distance to the road edge by looking at every segment."""
-    longest = max(map(len, lines))
-    best: tuple[float, float] | None = None
-    for line in lines:
-        closed = np.square(line[0] - line[-1]).sum() < 1.0 and len(line) == longest
-        segments = list(pairwise(line))
-        for k, (start, end) in enumerate(segments):
-            along, away = end - start, point - start
-            squared = along[:2] @ along[:2]
-            share = away[:2] @ along[:2] / squared if squared else 0.0
-            offset = away - np.clip(share, 0, 1) * along
-            far = np.hypot(np.hypot(*offset[:2]), stretch * offset[2])
-            if best is not None and far >= best[0]:
-                continue
-            sign = _side(point, start, end)
-            near = k + 1 if share > 1 else k - 1 if share < 0 else None
-            if near is not None and (closed or 0 <= near < len(segments)):
-                other = segments[near % len(segments)]
-                first, second = (segments[k], other) if share > 1 else (other, segments[k])
-                bend = np.outer((first[1] - first[0])[:2], (second[1] - second[0])[:2])
-                turn = bend[0, 1] - bend[1, 0]
-                sign = (max if turn > 0 else min)(sign, _side(point, *other))
-            best = far, sign * np.hypot(*offset[:2])
-    assert best is not None
-    return best[1]
-
-
-def _side(point: Reals, start: Reals, end: Reals) -> float:
-    away, along = (point - start)[:2], (end - start)[:2]
-    return float(np.sign(away[0] * along[1] - away[1] * along[0]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from helpers_wosac import Reals, box
 from symphony.data.sources import womd_pb2 as pb
-from symphony.wosac.rollouts import RolloutArrays
+from symphony.wosac.scorer import SimulatedRollouts
 
 Bools = NDArray[np.bool_]
 BINS = {
@@ -71,7 +71,7 @@ def short_way(values: Reals) -> Reals:
 
 
 def oracle_features(
-    record: pb.Scenario, rollouts: RolloutArrays | None, number: int = 0
+    record: pb.Scenario, rollouts: SimulatedRollouts | None, number: int = 0
 ) -> dict[str, NDArray[Any]]:
     """Features [E, 80] of one rollout, or of the log."""
     tracks = {}

@@ -58,6 +58,7 @@ def test_names_of_packages_are_theirs() -> None:
         "roadgraph",
         "rollouts",
         "training",
+        "wosac",
     ):
         package = importlib.import_module(f"symphony.{room}")
         for name in package.__all__:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import json
 import os
 import shutil
 import sys
-import tarfile
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -24,8 +22,7 @@ from symphony.cli import main
 from symphony.data.builtin import builtin_store
 from symphony.data.npz import read_npz
 from symphony.errors import ConfigError, DataError, DataWarning, SymphonyError
-from symphony.wosac.rollouts import read_rollouts
-from symphony.wosac.submission_check import _encoded, check_submission
+from symphony.wosac.files import read_rollouts
 
 NOTES = """
 from pathlib import Path
@@ -146,19 +143,6 @@ def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
                     part.write(bytes(min(1 << 24, size - begin)))
 
 
-def shard(path: Path, size: int, key: int = 10, kind: bytes = tarfile.REGTYPE) -> None:
-    """A submission with one member: a message of so many bytes of zeros, or a header of the archive's own."""
-    head = _encoded(key) + _encoded(size) if kind == tarfile.REGTYPE else b""
-    member = tarfile.TarInfo("a.binproto-00000-of-00001")
-    member.size, member.type = len(head) + size, kind
-    path.write_bytes(gzip.compress(member.tobuf(tarfile.GNU_FORMAT) + head + bytes(size + 10_240), 1))
-
-
-def check(path: Path) -> None:
-    (problem, *_) = check_submission(path).problems
-    raise problem
-
-
 MIB = 1 << 20
 BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]] = {
     "an array by its header": (
@@ -176,14 +160,6 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]]
         lambda of: read_npz(of, most=30 * MIB),
         "field b",
     ),
-    "a scenario": (lambda to: shard(to, 130 * MIB), check, "a message of 136314880 bytes"),
-    "another message": (lambda to: shard(to, 50 * MIB, 18), check, "a message of 52428800 bytes"),
-    "a long name": (
-        lambda to: shard(to, 50 * MIB, kind=tarfile.GNUTYPE_LONGNAME),
-        check,
-        "52428800 bytes of a header",
-    ),
-    "a header": (lambda to: shard(to, 50 * MIB, kind=tarfile.XHDTYPE), check, "52428800 bytes of a header"),
 }
 
 

@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 
 from helpers_wosac_oracle import BINS, FLAGS, oracle_features, oracle_scores
 from symphony.data.sources import womd_pb2 as pb
-from symphony.wosac.records import parse_scenario, scenario_arrays
-from symphony.wosac.rollouts import RolloutArrays
+from symphony.wosac.records import logged_scenario, parse_scenario
 from symphony.wosac.scorer import (
     CHALLENGES,
     SimulatedRollouts,
-    WosacFeatures,
-    WosacScenario,
     compute_features,
     object_scores,
     score_features,
@@ -155,7 +152,7 @@ def add_lights(record: pb.Scenario, kind: str, middle: NDArray[Any], rng: np.ran
             light.stop_point.x, light.stop_point.y = middle + rng.normal(0, 3, 2) * (lane == 101)
 
 
-def odd_rollouts(record: pb.Scenario, seed: int = 0) -> RolloutArrays:
+def odd_rollouts(record: pb.Scenario, seed: int = 0) -> SimulatedRollouts:
     """The log, bent and sped up, of all who are valid at step 10, the last one first."""
     rng = np.random.default_rng(seed + 1)
     tracks = [track for track in record.tracks if track.states[10].valid][::-1]
@@ -174,17 +171,13 @@ def odd_rollouts(record: pb.Scenario, seed: int = 0) -> RolloutArrays:
         y = now.center_y + np.cumsum(0.1 * pace * np.sin(heading), -1)
         made.append((x, y, now.center_z + 0.05 * time + 0 * x, heading))
     x, y, z, heading = (np.stack(part, 1).astype(np.float32) for part in zip(*made, strict=True))
-    return RolloutArrays(np.array([track.id for track in tracks]), x, y, z, heading)
-
-
-def features_of(record: pb.Scenario, rollouts: RolloutArrays) -> WosacFeatures:
-    parsed = parse_scenario(record.SerializeToString(), Path("made"), 0)
-    scenario = WosacScenario.of(**scenario_arrays(parsed))
-    return compute_features(scenario, SimulatedRollouts.of(**vars(rollouts)))
+    return SimulatedRollouts(np.array([track.id for track in tracks]), x, y, z, heading)
 
 
 @cache
-def plain(kind: str) -> tuple[pb.Scenario, RolloutArrays, dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+def plain(
+    kind: str,
+) -> tuple[pb.Scenario, SimulatedRollouts, dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Record, rollouts, and features of the log and of the rollouts by the plain computation."""
     seed = ODD.index(kind)
     record = odd_record(kind, seed)
@@ -197,11 +190,12 @@ def plain(kind: str) -> tuple[pb.Scenario, RolloutArrays, dict[str, NDArray[Any]
 @pytest.mark.parametrize("kind", ODD)
 def test_features_and_scores_are_those_of_a_plain_computation(kind: str) -> None:
     record, rollouts, log, simulated = plain(kind)
-    found = features_of(record, rollouts)
+    scenario = logged_scenario(parse_scenario(record.SerializeToString(), Path("made"), 0))
+    found = compute_features(scenario, rollouts)
     own: list[dict[str, NDArray[Any]]] = []
     for got, expected in ((found.log, log), (found.simulated, simulated)):
-        arrays = {name: getattr(got, name).numpy() for name in (*BINS, *FLAGS.values())}
-        arrays["ade"] = got.average_displacement_error.numpy()
+        arrays = {name: got[name].numpy() for name in (*BINS, *FLAGS.values())}
+        arrays["ade"] = got["average_displacement_error"].numpy()
         own.append(arrays)
         for name, values in expected.items():
             # float32 against float64: of speeds from positions some tens of metres out, a few thousandths.
@@ -209,7 +203,7 @@ def test_features_and_scores_are_those_of_a_plain_computation(kind: str) -> None
             # Whatever is decided by a sign or a limit may go the other way within rounding.
             assert close.mean() > 0.995, (name, arrays[name][~close], values[~close])
     for year in CHALLENGES:
-        scores = score_features(found, CHALLENGES[year]).to_dict()
+        scores = score_features(found, CHALLENGES[year])
         for name, value in oracle_scores(record, *own, year).items():
             assert scores[name] == pytest.approx(value, abs=1e-5), name
         for name, value in oracle_scores(record, log, simulated, year).items():

@@ -31,6 +31,8 @@ class Stream(IntEnum):
     """Seeds of the planners of egos."""
     PERSONAS = (1 << 40) + 4
     """Styles of driving."""
+    WALKS = (1 << 40) + 5
+    """How people walk whom nobody drives."""
     BACKTRACKING = 1 << 41
     """Lines that go back, each of its tries: this and how many there were."""
 

@@ -41,8 +41,8 @@ def submission(records: Callable[[Rng, bytes], bytes]) -> Target:
 def _submission() -> Files:
     from helpers_wosac import record_rollouts, womd_record
     from symphony.data.sources.tfrecord import write_records
+    from symphony.wosac.meta import SubmissionMeta
     from symphony.wosac.submission import write_submission
-    from symphony.wosac.submission_meta import SubmissionMeta
 
     meta = SubmissionMeta(
         account_name="somebody@example.org",
@@ -117,7 +117,7 @@ def _packed(data: bytes) -> bytes:
 
 def _check_submission(folder: Path, file: str) -> tuple[str, str]:
     from symphony.errors import DataError
-    from symphony.wosac.submission_check import check_submission, required_agents
+    from symphony.wosac.submission import check_submission, required_agents
 
     try:
         required = required_agents(folder / "a.tfrecord")
@@ -126,7 +126,7 @@ def _check_submission(folder: Path, file: str) -> tuple[str, str]:
     report = check_submission(folder / file, required)
     for problem in report.problems:
         str(problem)
-    if report.count:
+    if report.problems:
         return REFUSED, ""
     wrong = _unfit(folder / file, {name: set(agents) for name, agents in required.items()})
     return (ABSURD, wrong) if wrong else (ACCEPTED, "")

@@ -131,7 +131,7 @@ class Evaluate:
         print_evaluation(found, self.data, aside=str(self.json) == "-", details=self.details)
         record = evaluation_record(agent, found, store)
         if self.metrics:
-            from symphony.cli.wosac_evaluate import print_wosac
+            from symphony.cli.wosac import print_wosac
             from symphony.wosac.evaluate import evaluate_wosac, wosac_parts
 
             items, settings = chosen or range(len(store)), WosacSettings.of(config)

@@ -241,9 +241,8 @@ class DrivingEnv(EnvBase):
         """Compile the step in place, as :meth:`torch.nn.Module.compile` compiles a forward pass.
 
         For few agents a step is mostly calls of small operators, which is what this saves; of many it compares each
-        with every point of the map, and loses. Copies of the environment are not compiled.
-
-        Arguments are those of :func:`torch.compile`, whose default backend needs a C++ compiler.
+        with every point of the map, and loses. Copies of the environment are not compiled. Arguments are those of
+        :func:`torch.compile`, whose default backend needs a C++ compiler.
         """
         step = torch.compile(type(self)._step.__get__(self), *args, **kwargs)
         self._step = step  # type: ignore[method-assign]
@@ -398,13 +397,7 @@ class DrivingEnv(EnvBase):
             there, waits = there | enters, waits & ~enters
         return there.reshape(valid.shape), waits.reshape(valid.shape)
 
-    def objects(
-        self,
-        row: Int[Tensor, " M"],
-        step: Int[Tensor, " M"],
-        state: Float[Tensor, "M N 4"],
-        valid: Bool[Tensor, "M N"],
-    ) -> Objects:
+    def objects(self, row: Tensor, step: Tensor, state: Tensor, valid: Tensor) -> Objects:
         """Everyone at logged steps of scenes ``row``: agents that are ``valid`` in their states, others as logged."""
         return everyone_at(self.scenes, row, step, state, valid)
 

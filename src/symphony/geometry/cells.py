@@ -60,14 +60,7 @@ class Cells(ABC):
     """
 
     def __init__(
-        self,
-        low: Reals,
-        high: Reals,
-        some: Bools,
-        size: float,
-        *,
-        total: int,
-        wanted: int = 1,
+        self, low: Reals, high: Reals, some: Bools, size: float, *, total: int, wanted: int = 1
     ) -> None:
         self.total, self.wanted = total, wanted
         low, high = (np.where(some[:, None], value, 0.0).astype(np.float64) for value in (low, high))
@@ -97,13 +90,7 @@ class Cells(ABC):
         return np.zeros(len(x), np.int8)
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
-        """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells.
-
-        Args:
-            scene: any shape that broadcasts against the positions.
-            x: metres of the positions.
-            y: metres of the positions.
-        """
+        """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells."""
         per_metre, columns = self.per_metre.take(scene), self.columns.take(scene)
         column = np.floor((x - self.x.take(scene)) * per_metre)
         row = np.floor((y - self.y.take(scene)) * per_metre)
@@ -179,12 +166,8 @@ class PointCells(Cells):
         self.points = x, y
 
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
-        squared, across = (v.take(scene, 0) for v in self.points)
-        squared -= x
-        across -= y
-        np.square(squared, out=squared)
-        squared += np.square(across, out=across)
-        return squared
+        points_x, points_y = (v.take(scene, 0) for v in self.points)
+        return np.square(points_x - x) + np.square(points_y - y)
 
     def nearest_points(self, cell: Indices, x: Reals, y: Reals) -> Indices:
         """Numbers [R, K] of the points nearest to positions [R] in cells that have lists, ascending."""
@@ -195,11 +178,8 @@ class PointCells(Cells):
             held = self.count[cell[rows], None]
             place = np.arange(held.max())
             candidate = self.items.take(self.begin[cell[rows], None] + place, mode="clip")
-            squared, across = points_x.take(candidate), points_y.take(candidate)
-            squared -= x[rows, None]
-            across -= y[rows, None]
-            np.square(squared, out=squared)
-            squared += np.square(across, out=across)
+            squared = np.square(points_x.take(candidate) - x[rows, None])
+            squared += np.square(points_y.take(candidate) - y[rows, None])
             np.copyto(squared, np.inf, where=place >= held)
             found[rows] = candidate.ravel()[smallest(squared, self.wanted)].reshape(-1, self.wanted)
         return found
@@ -306,13 +286,5 @@ def _squared_to(edges: Sequence[Reals] | Reals, x: Reals, y: Reals) -> Reals:
     """Squared metres from positions to edges [5, ...] as :class:`EdgeCells` keeps them."""
     start_x, start_y, unit_x, unit_y, half = edges
     away_x, away_y = x - start_x, y - start_y
-    beyond = away_x * unit_x
-    beyond += away_y * unit_y
-    beyond -= half
-    np.abs(beyond, out=beyond)
-    beyond -= half
-    np.maximum(beyond, 0, out=beyond)
-    away_x *= unit_y
-    away_y *= unit_x
-    away_x -= away_y
-    return np.square(beyond, out=beyond) + np.square(away_x, out=away_x)
+    beyond = np.maximum(np.abs(away_x * unit_x + away_y * unit_y - half) - half, 0)
+    return np.square(beyond) + np.square(away_x * unit_y - away_y * unit_x)

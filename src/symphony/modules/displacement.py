@@ -107,13 +107,9 @@ def displacement_policy(
     """
     if cells and (cells < 3 or cells % 2 == 0):
         raise ValueError(f"cells must be odd and at least 3, or 0 for none, is {cells}")
-    for name, value in (
-        ("dt", dt),
-        ("max_acceleration", max_acceleration),
-        ("max_lateral", max_lateral),
-        ("max_slope", max_slope),
-        ("min_scale", min_scale),
-    ):
+    bounds = {"dt": dt, "max_acceleration": max_acceleration, "max_lateral": max_lateral}
+    bounds |= {"max_slope": max_slope, "min_scale": min_scale}
+    for name, value in bounds.items():
         if not value > 0.0:
             raise ValueError(f"{name} must be positive, is {value}")
     encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)

@@ -21,8 +21,7 @@ FEW = 48
 """Largest set for which encoding everything with a graph is faster than finding winners first (measured on one
 CPU core at width 64: the two meet between 48 and 64 elements)."""
 
-Function = Callable[[Tensor], Tensor]
-"""A row-wise network `[n, F] -> [n, H]`."""
+Function = Callable[[Tensor], Tensor]  # row-wise, `[n, F] -> [n, H]`
 
 
 def pool_elements(
@@ -45,9 +44,6 @@ def pool_elements(
             a graph and the at most H winners of each set again with one. Both have the same values and gradients,
             those of any order included, up to rounding. `"auto"` is `"winner"` for large sets on the CPU, where that
             takes half of the time, and `"dense"` elsewhere.
-
-    Returns:
-        `[..., H]`.
     """
     if mask.shape != elements.shape[:-1] or mask.dtype != torch.bool:
         raise ValueError(
@@ -59,8 +55,7 @@ def pool_elements(
     n = math.prod(batch)
     sets, valid = elements.reshape(n, count, features), mask.reshape(n, count)
     if count == 0 or n == 0:
-        width = function(elements.new_zeros(1, features)).shape[-1]
-        return elements.new_zeros(*batch, width)
+        return elements.new_zeros(*batch, function(elements.new_zeros(1, features)).shape[-1])
     if not _wants_gradient(function, elements):
         with torch.no_grad():
             pooled = _maxima(function, sets, valid)

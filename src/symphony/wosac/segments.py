@@ -9,11 +9,8 @@ import numpy as np
 from symphony.data.resample import resample
 from symphony.data.segment import RunSegment, SignalState
 from symphony.errors import DataError
-from symphony.wosac.records import CURRENT, DT
-from symphony.wosac.rollouts import RolloutArrays
-from symphony.wosac.scorer import WosacScenario
-from symphony.wosac.simulate import between_decisions
-from symphony.wosac.submission import FUTURE, ROLLOUTS
+from symphony.wosac.scorer import SimulatedRollouts, WosacScenario
+from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 
 _AWAY, _APART = 1e5, 1e3
 """Metres from the origin, and from one another, at which agents do not meet anyone."""
@@ -38,16 +35,11 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
         DataError: less than 8 s.
     """
     tenth = segment if abs(segment.dt - DT) < 1e-6 else resample(segment, DT)
-    whole = CURRENT + 1 + future
-    steps = min(tenth.num_steps, whole)
+    steps = min(tenth.num_steps, CURRENT + 1 + future)
     if steps <= future:
-        raise DataError(
-            f"has {(tenth.num_steps - 1) * DT:g} s, the score needs {future * DT:g}",
-            file=segment.file or None,
-            segment=segment.segment_id,
-            field="valid",
-        )
-    missing = whole - steps
+        message = f"has {(tenth.num_steps - 1) * DT:g} s, the score needs {future * DT:g}"
+        raise DataError(message, file=segment.file or None, segment=segment.segment_id, field="valid")
+    missing = CURRENT + 1 + future - steps
 
     def taken(values: Any) -> Any:
         return np.pad(values[:, :steps], [(0, 0), (missing, 0), *[(0, 0)] * (values.ndim - 2)])
@@ -61,8 +53,8 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
     return tenth.replace(dt=DT, current_step=CURRENT, origin=origin, **found)
 
 
-def wosac_scenario(segment: RunSegment, future: int = FUTURE) -> WosacScenario:
-    """What is scored of a run segment, see :func:`wosac_window`.
+def wosac_scenario(window: RunSegment) -> WosacScenario:
+    """What is scored of a :func:`wosac_window`.
 
     Scored are the ego and the agents the source marks for prediction, as far as they are valid at step 10; where it
     marks none, all agents that are. The road's boundary stands for road edges; lanes and lights are the segment's.
@@ -70,23 +62,21 @@ def wosac_scenario(segment: RunSegment, future: int = FUTURE) -> WosacScenario:
     Raises:
         DataError: it can't be scored; names the segment.
     """
-    window = wosac_window(segment, future)
     present = window.valid[:, CURRENT]
     chosen = np.zeros(len(present), bool)
     chosen[[window.ego, *window.predict.tolist()]] = True
     scored = present & (chosen | (len(window.predict) == 0))
     road, origin = window.road, window.origin
     light, step = (window.signal_state != SignalState.UNKNOWN).nonzero()
-    return WosacScenario.of(
+    return WosacScenario(
         window.segment_id,
-        future=future,
+        future=window.num_steps - CURRENT - 1,
         object_id=window.agent_id.astype(np.int64),
         object_type=window.agent_type.astype(np.int64),
         position=window.position + origin,
-        # Copies: what lies in a store can't be written to, which torch.as_tensor warns of.
-        heading=window.heading.copy(),
-        size=window.size.copy(),
-        valid=window.valid.copy(),
+        heading=window.heading,
+        size=window.size,
+        valid=window.valid,
         evaluated=np.sort(window.agent_id[scored]).astype(np.int64),
         road_edges=[road.boundary[k] + origin for k in range(len(road.boundary))],
         lanes=[road.lanes[k] + origin for k in range(len(road.lanes))],
@@ -99,28 +89,12 @@ def wosac_scenario(segment: RunSegment, future: int = FUTURE) -> WosacScenario:
     )
 
 
-def log_playback(window: RunSegment, every: int = 1) -> RolloutArrays:
-    """32 times the log of a :func:`wosac_window`; agents that it does not see are far away from everyone.
-
-    Args:
-        window: the log.
-        every: take one in so many steps, and between valid ones interpolate as in
-            :func:`symphony.wosac.simulate.wosac_rollouts`; a divisor of the number of future steps.
-    """
-    rows = np.flatnonzero(window.valid[:, CURRENT])
-    valid = window.valid[rows, CURRENT:]
-    future = valid.shape[1] - 1
-    place = (window.position[rows, CURRENT:] + window.origin).astype(np.float64)
-    heading = window.heading[rows, CURRENT:].astype(np.float64)
-    if every > 1:
-        states = np.concatenate([place[..., :2], heading[..., None]], -1).swapaxes(0, 1)
-        between = between_decisions(states[None, ::every], every * DT, future)[0]
-        steps = np.arange(1, future + 1)
-        known = valid[:, steps // every * every] & valid[:, -(-steps // every) * every]
-        place[:, 1:, :2] = np.where(known[..., None], between[..., :2], place[:, 1:, :2])
-        heading[:, 1:] = np.where(known, between[..., 2], heading[:, 1:])
+def log_playback(window: RunSegment) -> SimulatedRollouts:
+    """32 times the log of a :func:`wosac_window`; agents that it does not see are far away from everyone."""
+    rows, later = np.flatnonzero(window.valid[:, CURRENT]), slice(CURRENT + 1, None)
+    place = (window.position[rows, later] + window.origin).astype(np.float64)
     away = np.zeros((len(rows), 1, 3))
     away[:, 0, 0] = _AWAY + _APART * np.arange(len(rows))
-    place = np.where(valid[:, 1:, None], place[:, 1:], away + window.origin)
-    states = np.concatenate([place, heading[:, 1:, None]], -1)
-    return RolloutArrays(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))
+    place = np.where(window.valid[rows, later, None], place, away + window.origin)
+    states = np.concatenate([place, window.heading[rows, later, None].astype(np.float64)], -1)
+    return SimulatedRollouts(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))

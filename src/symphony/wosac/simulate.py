@@ -1,8 +1,9 @@
 """Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of everyone, 8 s (or less) at 10 Hz.
 
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
-latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive; everyone
-else goes on at the velocity of the current step.
+latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive. Those that
+stand stay, and people walk on; whoever drives sees the latter at constant velocity. See
+:mod:`symphony.rollouts.bystanders`.
 
 Legend: n agents valid at the current step, N vehicles among them, R rollouts, F future steps (80), U decisions and
 the first state.
@@ -11,6 +12,10 @@ the first state.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,17 +24,22 @@ from numpy.typing import NDArray
 
 from symphony.agents import Agent
 from symphony.config import WosacSettings
+from symphony.data.odd import mended
 from symphony.data.resample import wrap
-from symphony.data.segment import AgentType, RunSegment, SignalState
+from symphony.data.segment import AgentType, RunSegment, SignalState, validate
+from symphony.data.sources.womd import scenario_to_segment
 from symphony.envs.routes import route_table
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
+from symphony.rollouts.bystanders import standing, walks
 from symphony.rollouts.driving import simulation
 from symphony.rollouts.finite import NotFiniteError
-from symphony.wosac.records import CURRENT, DT
-from symphony.wosac.rollouts import RolloutArrays
-from symphony.wosac.submission import FUTURE, ROLLOUTS
+from symphony.rollouts.workers import shared
+from symphony.wosac.records import parse_scenario, read_scenarios
+from symphony.wosac.scorer import SimulatedRollouts
+from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
+from symphony.wosac.scorer.scenario import STATES
 
 Doubles = NDArray[np.float64]
 
@@ -37,7 +47,7 @@ AT_ONCE = 1600
 """Observations made at a time in a search, 0.1 MB each."""
 
 
-def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings | None = None) -> RolloutArrays:
+def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -> SimulatedRollouts:
     """32 rollouts of everyone who is valid at the segment's current step.
 
     Between the agent's decisions positions are interpolated linearly and headings along the shorter arc; z is held.
@@ -56,36 +66,72 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings | 
         DataError: other steps, or nobody is valid at the current one.
         NotFiniteError: a network of the agent puts out a number that is not finite; names the segment.
     """
-    settings = WosacSettings() if settings is None else settings
     if agent.policy is None:
         raise ConfigError("log playback knows the future and can't be simulated")
-    rows = _present(segment)
+    rows, held = _present(segment), standing(segment)
+    segment = segment.replace(velocity=np.where(held[:, None, None], np.float32(0), segment.velocity))
     dt = DT if agent.spec is None else agent.spec.dt
-    future = settings.future
-    start = history_only(segment, dt, future)
-    vehicles = np.flatnonzero(start.agent_type == AgentType.VEHICLE)
-    states = _repeated(_extrapolated(segment, rows, future))
+    start = history_only(segment, dt, settings.future)
+    is_vehicle = start.agent_type == AgentType.VEHICLE
+    vehicles, people = np.flatnonzero(is_vehicle & ~held[rows]), np.flatnonzero(~is_vehicle)
+    states = _extrapolated(segment, rows, settings.future)
+    states[:, people] = walks(segment, rows[people], ROLLOUTS, settings.future, settings.seed)
     if len(vehicles):
         try:
             log = future_log(segment) if settings.logged_goals else None
             driven = _driven(agent, start, vehicles, settings, log)
-            states[:, vehicles] = between_decisions(driven, dt, future)
+            states[:, vehicles] = between_decisions(driven, dt, settings.future)
         except NotFiniteError as error:
             raise error.named(segment.segment_id) from error
-    return _arrays(segment, rows, states)
+    return _rollouts(segment, rows, states)
 
 
-def constant_velocity(segment: RunSegment, future: int = FUTURE) -> RolloutArrays:
+def constant_velocity(segment: RunSegment, future: int = FUTURE) -> SimulatedRollouts:
     """32 equal rollouts of everyone at the velocity and heading of the current step.
 
     Raises:
         DataError: as :func:`wosac_rollouts`.
     """
     rows = _present(segment)
-    return _arrays(segment, rows, _repeated(_extrapolated(segment, rows, future)))
+    return _rollouts(segment, rows, _extrapolated(segment, rows, future))
 
 
-def with_the_rest(found: RolloutArrays, segment: RunSegment) -> RolloutArrays:
+def simulated_scenarios(
+    agent: Agent, data: Path, settings: WosacSettings, progress: Callable[[int], None] = lambda done: None
+) -> Iterator[tuple[str, SimulatedRollouts]]:
+    """Yield id and rollouts of every WOMD scenario of a file, folder or pattern; everyone's, odd ones included.
+
+    Raises:
+        DataError: a record can't be used; names file, scenario and field.
+    """
+    with closing(
+        shared(_Simulation(agent, settings), read_scenarios(data), settings.config(1, 0))
+    ) as results:
+        for done, found in enumerate(results, 1):
+            yield found
+            progress(done)
+
+
+@dataclass(frozen=True)
+class _Simulation:
+    """Simulates a packed scenario."""
+
+    agent: Agent
+    settings: WosacSettings
+
+    def __call__(self, packed: tuple[Path, int, bytes]) -> tuple[str, SimulatedRollouts]:
+        """The id and the rollouts."""
+        file, record, payload = packed
+        scenario = parse_scenario(payload, file, record)
+        try:
+            whole = scenario_to_segment(scenario, file=file.name)
+            found = wosac_rollouts(self.agent, validate(mended(whole)), self.settings)
+            return scenario.scenario_id, with_the_rest(found, whole)
+        except DataError as error:
+            raise error.at(file=file, segment=scenario.scenario_id) from None
+
+
+def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRollouts:
     """Rollouts with those of the agents that were left out of them as odd: a submission must hold everyone.
 
     Args:
@@ -102,14 +148,9 @@ def with_the_rest(found: RolloutArrays, segment: RunSegment) -> RolloutArrays:
     logged = [getattr(segment, name)[rest, now] for name in ("position", "heading", "velocity")]
     if not all(np.isfinite(values).all() for values in logged):
         raise DataError("not finite at the current step", segment=segment.segment_id, field="tracks.states")
-    alone = segment.replace(valid=segment.valid & rest[:, None])
-    more = constant_velocity(alone, found.x.shape[-1])
-    joined = {n: np.concatenate([getattr(found, n), getattr(more, n)], 1) for n in ("x", "y", "z", "heading")}
-    return RolloutArrays(np.concatenate([found.object_id, more.object_id]), **joined)
-
-
-def _repeated(states: Doubles) -> Doubles:
-    return np.repeat(states[None], ROLLOUTS, 0)
+    more = constant_velocity(segment.replace(valid=segment.valid & rest[:, None]), found.x.shape[-1])
+    joined = {name: np.concatenate([getattr(found, name), getattr(more, name)], 1) for name in STATES}
+    return SimulatedRollouts(np.concatenate([found.object_id, more.object_id]), **joined)
 
 
 def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
@@ -126,40 +167,35 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
     velocity = segment.velocity[rows, now].astype(np.float64)
     path = np.repeat(segment.position[rows, now, None].astype(np.float64), steps, 1)
     path[..., :2] += velocity[:, None] * (np.arange(steps) * dt)[:, None]
-    where = {int(row): k for k, row in enumerate(rows)}
-    return segment.replace(
+    # The latest known state of each light up to the current step.
+    seen = segment.signal_state[:, now::-1]
+    latest = seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
+    return _from_now_on(
+        segment,
+        rows,
         dt=dt,
-        # The recording vehicle is not always among them; nothing here depends on who it is.
-        ego=where.get(segment.ego, 0),
-        agent_id=segment.agent_id[rows],
-        agent_type=segment.agent_type[rows],
-        size=segment.size[rows],
         position=path.astype(np.float32),
         heading=np.repeat(segment.heading[rows, now, None], steps, 1),
         velocity=np.repeat(segment.velocity[rows, now, None], steps, 1),
         valid=np.ones((len(rows), steps), bool),
-        signal_state=np.repeat(_latest_lights(segment)[:, None], steps, 1),
-        current_step=0,
-        interest=np.zeros(0, np.int32),
-        predict=np.zeros(0, np.int32),
+        signal_state=np.repeat(latest[:, None], steps, 1),
     )
 
 
 def future_log(segment: RunSegment) -> RunSegment:
     """What became of those who are valid at the current step, from it on, in the rows of :func:`history_only`."""
     rows, now = _present(segment), segment.current_step
-    timed = ("position", "heading", "velocity", "valid")
-    return segment.replace(
-        ego=0,
-        agent_id=segment.agent_id[rows],
-        agent_type=segment.agent_type[rows],
-        size=segment.size[rows],
-        **{name: getattr(segment, name)[rows, now:] for name in timed},
-        signal_state=segment.signal_state[:, now:],
-        current_step=0,
-        interest=np.zeros(0, np.int32),
-        predict=np.zeros(0, np.int32),
-    )
+    states = {
+        name: getattr(segment, name)[rows, now:] for name in ("position", "heading", "velocity", "valid")
+    }
+    return _from_now_on(segment, rows, signal_state=segment.signal_state[:, now:], **states)
+
+
+def _from_now_on(segment: RunSegment, rows: NDArray[np.int64], **changes: Any) -> RunSegment:
+    """Some agents of a segment; its ego, which is not always among them, and what it marks decide nothing here."""
+    kept = {name: getattr(segment, name)[rows] for name in ("agent_id", "agent_type", "size")}
+    none = np.zeros(0, np.int32)
+    return segment.replace(ego=0, current_step=0, interest=none, predict=none, **kept, **changes)
 
 
 def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubles:
@@ -176,34 +212,24 @@ def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubl
 
 def _present(segment: RunSegment) -> NDArray[np.int64]:
     """[n] rows of the agents that are valid at the current step."""
-
-    def error(message: str, field: str) -> DataError:
-        return DataError(message, file=segment.file or None, segment=segment.segment_id, field=field)
-
-    if abs(segment.dt - DT) > 1e-6:
-        raise error(f"has steps of {segment.dt:g} s, needs {DT:g}", "dt")
-    if segment.current_step != CURRENT:
-        raise error(f"is {segment.current_step}, needs {CURRENT}", "current_step")
     rows = np.flatnonzero(segment.valid[:, CURRENT])
-    if len(rows) == 0:
-        raise error(f"no agent at step {CURRENT}", "valid")
+    for wrong, message, field in (
+        (abs(segment.dt - DT) > 1e-6, f"has steps of {segment.dt:g} s, needs {DT:g}", "dt"),
+        (segment.current_step != CURRENT, f"is {segment.current_step}, needs {CURRENT}", "current_step"),
+        (len(rows) == 0, f"no agent at step {CURRENT}", "valid"),
+    ):
+        if wrong:
+            raise DataError(message, file=segment.file or None, segment=segment.segment_id, field=field)
     return rows
 
 
-def _latest_lights(segment: RunSegment) -> NDArray[Any]:
-    """[Q] the latest known states up to the current step."""
-    seen = segment.signal_state[:, segment.current_step :: -1]
-    latest = (seen != SignalState.UNKNOWN).argmax(1)
-    return seen[np.arange(len(seen)), latest]
-
-
 def _extrapolated(segment: RunSegment, rows: NDArray[np.int64], future: int) -> Doubles:
-    """[n, F, 3] x, y, heading at constant velocity."""
+    """[R, n, F, 3] x, y, heading at constant velocity."""
     now = segment.current_step
     place = segment.position[rows, now, None, :2].astype(np.float64)
     path = place + segment.velocity[rows, now, None] * (np.arange(1, future + 1) * DT)[:, None]
     heading = np.repeat(wrap(segment.heading[rows, now, None].astype(np.float64)), future, 1)
-    return np.concatenate([path, heading[..., None]], -1)
+    return np.repeat(np.concatenate([path, heading[..., None]], -1)[None], ROLLOUTS, 0)
 
 
 def _driven(
@@ -223,7 +249,8 @@ def _driven(
     scenes = scenes.to(torch.device(settings.device))
     one = agent.plan(settings.config(1, 0))
     if one.kind == "none":
-        plans = [settings.config(ROLLOUTS, settings.seed)]
+        # What a rule drives is alike in all of them.
+        plans = [settings.config(1 if agent.rule else ROLLOUTS, settings.seed)]
     else:
         # All branches of all trees together would take gigabytes.
         trees = max(AT_ONCE // (one.branches * len(vehicles)), 1)
@@ -232,13 +259,14 @@ def _driven(
             for first in range(0, ROLLOUTS, trees)
         ]
     found = [simulation(agent, scenes, plan).rollouts.state[0, ..., :3].cpu() for plan in plans]
-    return torch.cat(found).double().numpy()
+    states = torch.cat(found).double().numpy()
+    return np.repeat(states, ROLLOUTS // len(states), 0)
 
 
-def _arrays(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> RolloutArrays:
+def _rollouts(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> SimulatedRollouts:
     """States [32, n, F, 3] of the segment's frame in that of the log."""
     z = segment.position[rows, segment.current_step, 2].astype(np.float64) + segment.origin[2]
-    return RolloutArrays(
+    return SimulatedRollouts(
         object_id=segment.agent_id[rows],
         x=states[..., 0] + segment.origin[0],
         y=states[..., 1] + segment.origin[1],

@@ -1,4 +1,4 @@
-"""Writing a submission to the Waymo Open Sim Agents Challenge.
+"""Submissions to the Waymo Open Sim Agents Challenge: written, and checked offline before a server refuses them.
 
 A submission is a ``.tar.gz`` of shards, each a ``SimAgentsChallengeSubmission`` message with some of the scenarios
 and the same metadata in all of them.
@@ -11,24 +11,36 @@ import gzip
 import re
 import tarfile
 import tempfile
-from collections.abc import Iterable
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from dataclasses import field as default
 from pathlib import Path
+from typing import IO
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from symphony.errors import ConfigError, DataError
 from symphony.wosac import wosac_pb2 as pb
-from symphony.wosac.rollouts import STATES, RolloutArrays
-from symphony.wosac.submission_meta import SubmissionMeta
+from symphony.wosac.meta import SubmissionMeta
+from symphony.wosac.records import parse_scenario, read_scenarios, simulated_ids
+from symphony.wosac.scorer import SimulatedRollouts
+from symphony.wosac.scorer.config import CURRENT, FUTURE, ROLLOUTS
+from symphony.wosac.scorer.scenario import STATES, check_agents
 
-ROLLOUTS, FUTURE = 32, 80
-"""Rollouts of a scenario and steps of a rollout that the challenge asks for."""
 SIM_AGENTS = 1
 """Type of the submission."""
 FIELDS = dict(zip(STATES, ("center_x", "center_y", "center_z", "heading"), strict=True))
 """Field of the message that holds each array."""
 
 _PARAMETERS = re.compile(r"\d+(\.\d+)?[KMBT]?")
+_SHARD = re.compile(r".+\.binproto-(\d{5})-of-(\d{5})")
+_SCENARIO_TAG = b"\x0a"
+"""What comes before a scenario on the wire of a shard: field 1, of a length that follows."""
+_LARGEST = 128 << 20
+"""Bytes of the rollouts of a scenario: of more than 3 000 agents."""
+_DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError)
 
 
 def meta_message(meta: SubmissionMeta) -> pb.SimAgentsChallengeSubmission:
@@ -36,39 +48,24 @@ def meta_message(meta: SubmissionMeta) -> pb.SimAgentsChallengeSubmission:
     return pb.SimAgentsChallengeSubmission(submission_type=SIM_AGENTS, **vars(meta))
 
 
-def meta_problems(message: pb.SimAgentsChallengeSubmission) -> list[tuple[str, str]]:
+def meta_problems(message: pb.SimAgentsChallengeSubmission) -> Iterator[tuple[str, str]]:
     """(field, what is wrong with it) of a submission's metadata."""
-    found = [(name, "is not UTF-8") for name in _not_text(message)]
-    if found:
-        return found
     if message.submission_type != SIM_AGENTS:
-        found.append(("submission_type", f"is {message.submission_type}, expected {SIM_AGENTS} (sim agents)"))
+        yield "submission_type", f"is {message.submission_type}, expected {SIM_AGENTS} (sim agents)"
     if "@" not in message.account_name:
-        found.append(("account_name", f"{message.account_name!r} is no e-mail address"))
+        yield "account_name", f"{message.account_name!r} is no e-mail address"
     if not message.unique_method_name.strip():
-        found.append(("unique_method_name", "missing"))
+        yield "unique_method_name", "missing"
     for field in ("uses_lidar_data", "uses_camera_data", "uses_public_model_pretraining"):
         if not message.HasField(field):
-            found.append((field, "missing; must be said, yes or no"))
+            yield field, "missing; must be said, yes or no"
     if message.uses_public_model_pretraining and not message.public_model_names:
-        found.append(("public_model_names", "missing, though public models were used"))
+        yield "public_model_names", "missing, though public models were used"
     if not _PARAMETERS.fullmatch(message.num_model_parameters):
-        found.append(
-            (
-                "num_model_parameters",
-                f"{message.num_model_parameters!r} is no number with a suffix, such as 200K",
-            )
-        )
+        problem = f"{message.num_model_parameters!r} is no number with a suffix, such as 200K"
+        yield "num_model_parameters", problem
     if not message.acknowledge_complies_with_closed_loop_requirement:
-        found.append(("acknowledge_complies_with_closed_loop_requirement", "not acknowledged"))
-    return found
-
-
-def _not_text(message: pb.SimAgentsChallengeSubmission) -> list[str]:
-    """Fields of text that the message was given other bytes for, which it keeps as they are."""
-    texts = [(field.name, value) for field, value in message.ListFields() if field.type == field.TYPE_STRING]
-    several = ((name, [value] if isinstance(value, str | bytes) else value) for name, value in texts)
-    return [name for name, values in several if any(isinstance(value, bytes) for value in values)]
+        yield "acknowledge_complies_with_closed_loop_requirement", "not acknowledged"
 
 
 def shard_name(shard: int, shards: int) -> str:
@@ -77,7 +74,7 @@ def shard_name(shard: int, shards: int) -> str:
 
 
 def write_submission(
-    rollouts: Iterable[tuple[str, RolloutArrays]], meta: SubmissionMeta, out: Path, shards: int = 150
+    rollouts: Iterable[tuple[str, SimulatedRollouts]], meta: SubmissionMeta, out: Path, shards: int = 150
 ) -> int:
     """Write an archive; one scenario at a time is in memory, and ``out`` appears once all are written.
 
@@ -104,9 +101,9 @@ def write_submission(
     seen: set[str] = set()
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        names = [shard_name(shard, shards) for shard in range(shards)]
+        parts = [Path(folder) / shard_name(shard, shards) for shard in range(shards)]
         with contextlib.ExitStack() as stack:
-            files = [stack.enter_context((Path(folder) / name).open("wb")) for name in names]
+            files = [stack.enter_context(part.open("wb")) for part in parts]
             for number, (name, arrays) in enumerate(rollouts):
                 if name in seen:
                     raise DataError("more than once", segment=name, field="scenario_id")
@@ -119,7 +116,7 @@ def write_submission(
             for file in files:
                 file.write(message.SerializeToString(deterministic=True))
         packed = Path(folder) / "packed"
-        _pack([Path(folder) / name for name in names], packed)
+        _pack(parts, packed)
         packed.replace(out)
     return len(seen)
 
@@ -138,45 +135,185 @@ def _pack(files: list[Path], out: Path) -> None:
                 archive.addfile(member, content)
 
 
-def scenario_message(scenario_id: str, rollouts: RolloutArrays) -> pb.ScenarioRollouts:
+def scenario_message(scenario_id: str, rollouts: SimulatedRollouts) -> pb.ScenarioRollouts:
     """The message of a scenario's rollouts.
 
     Raises:
         DataError: not 32 rollouts of 80 steps of finite numbers, an agent twice, or an id that the format has no room
             for; names scenario, field and agent.
     """
-
-    def error(message: str, field: str) -> DataError:
-        return DataError(message, segment=scenario_id, field=field)
-
-    ids = np.asarray(rollouts.object_id)
-    if ids.ndim != 1:
-        raise error(f"has shape {ids.shape}, expected (agents,)", "object_id")
-    wide = ids[(ids < -(2**31)) | (ids >= 2**31)]
-    if len(wide):
-        raise error(f"agent {wide[0]} has no number of 32 bits", "object_id")
-    values, counts = np.unique(ids, return_counts=True)
-    if (counts > 1).any():
-        raise error(f"agent {values[counts > 1][0]} more than once", "object_id")
-    states = {}
-    for name in STATES:
-        array = np.asarray(getattr(rollouts, name))
-        expected = (ROLLOUTS, len(ids), FUTURE)
-        if array.shape != expected:
-            raise error(f"has shape {array.shape}, expected {expected} (rollouts, agents, steps)", name)
-        with np.errstate(over="ignore"):
-            narrow = array.astype(np.float32)
-        bad = np.argwhere(~np.isfinite(narrow))
-        if len(bad):
-            rollout, agent, step = bad[0]
-            raise error(f"agent {ids[agent]}, rollout {rollout}, future step {step}: not finite", name)
-        states[FIELDS[name]] = narrow
+    ids = rollouts.object_id
+    try:
+        rollouts.check(count=ROLLOUTS)
+        if len(wide := ids[(ids < -(2**31)) | (ids >= 2**31)]):
+            raise DataError(f"agent {wide[0]} has no number of 32 bits", field="object_id")
+    except DataError as error:
+        raise error.at(segment=scenario_id) from None
     message = pb.ScenarioRollouts(scenario_id=scenario_id)
     for rollout in range(ROLLOUTS):
         scene = message.joint_scenes.add()
         for agent, object_id in enumerate(ids.tolist()):
-            scene.simulated_trajectories.add(
-                object_id=object_id,
-                **{field: array[rollout, agent].tolist() for field, array in states.items()},
-            )
+            states = {
+                field: getattr(rollouts, name)[rollout, agent].tolist() for name, field in FIELDS.items()
+            }
+            scene.simulated_trajectories.add(object_id=object_id, **states)
     return message
+
+
+@dataclass
+class Report:
+    """What was found in a submission.
+
+    Attributes:
+        problems: what a server would refuse, naming shard, scenario, agent and field; the first of each scenario.
+        shards: names of those that were read.
+        scenarios: ids of the scenarios in it.
+    """
+
+    problems: list[DataError] = default(default_factory=list)
+    shards: list[str] = default(default_factory=list)
+    scenarios: set[str] = default(default_factory=set)
+
+
+def required_agents(path: Path) -> dict[str, list[int]]:
+    """The agents that each scenario's rollouts must hold, by scenario id.
+
+    Args:
+        path: file, folder or pattern of WOMD scenario files; those of the test set will do.
+
+    Raises:
+        DataError: a file or record can't be used; names it.
+    """
+    found: dict[str, list[int]] = {}
+    for file, record, payload in read_scenarios(path):
+        scenario = parse_scenario(payload, file, record)
+        if scenario.scenario_id in found:
+            raise DataError("more than once", file=file, segment=scenario.scenario_id, field="scenario_id")
+        try:
+            found[scenario.scenario_id] = simulated_ids(scenario)
+        except DataError as error:
+            raise error.at(file=file) from None
+    return found
+
+
+def check_submission(path: Path, required: Mapping[str, list[int]] | None = None) -> Report:
+    """Read a submission from end to end, one scenario at a time.
+
+    Args:
+        path: the ``.tar.gz``.
+        required: agents by scenario (see :func:`required_agents`). Without it, that scenarios and agents are the
+            right ones is not checked; only that all rollouts of a scenario have the same agents.
+
+    Raises:
+        OSError: the file can't be opened.
+    """
+    report, metas = Report(), set[bytes]()
+    try:
+        with gzip.open(path) as unzipped:
+            with tarfile.open(fileobj=unzipped, mode="r|") as archive:
+                for member in archive:
+                    if (stream := archive.extractfile(member)) is not None:
+                        name = member.name.removeprefix("./")
+                        metas.add(_check_shard(stream, name, f"{path}:{member.name}", report, required))
+            # To the end, where the checksum of the whole lies.
+            while unzipped.read(1 << 20):
+                pass
+    except _DAMAGED as error:
+        report.problems.append(DataError(f"not a .tar.gz archive, or damaged: {error}", file=path))
+        return report
+    texts = _names_problem(report.shards) + ["metadata differ between shards"] * (len(metas - {b""}) > 1)
+    report.problems += [DataError(text, file=path, field="shards") for text in texts]
+    for missing in sorted(set(required or ()) - report.scenarios):
+        report.problems.append(DataError("missing", file=path, segment=missing, field="scenario_id"))
+    return report
+
+
+def _check_shard(
+    stream: IO[bytes], name: str, where: str, report: Report, required: Mapping[str, list[int]] | None
+) -> bytes:
+    """Note what is wrong with a shard; its metadata as bytes, none where it is damaged."""
+    problems = report.problems
+    if not _SHARD.fullmatch(name):
+        wanted = "NAME.binproto-NNNNN-of-NNNNN, by which the server finds shards"
+        problems.append(DataError(f"not a shard: the name must be {wanted}", file=where))
+        return b""
+    report.shards.append(name)
+    try:
+        for message in _messages(stream):
+            for scenario in message.scenario_rollouts:
+                try:
+                    _check_scenario(scenario, report.scenarios, required)
+                except DataError as error:
+                    problems.append(error.at(file=where, segment=scenario.scenario_id or None))
+                report.scenarios.add(scenario.scenario_id)
+        message.ClearField("scenario_rollouts")
+        if any(isinstance(value, bytes) for _, value in message.ListFields()):
+            raise DecodeError("text that is not UTF-8")
+    except (DecodeError, UnicodeDecodeError) as error:
+        text = f"not a SimAgentsChallengeSubmission message, or damaged: {error}"
+        problems.append(DataError(text, file=where))
+        return b""
+    problems += [DataError(text, file=where, field=field) for field, text in meta_problems(message)]
+    return message.SerializeToString(deterministic=True)
+
+
+def _messages(stream: IO[bytes]) -> Iterator[pb.SimAgentsChallengeSubmission]:
+    """A shard in parts: its scenarios one by one, as long as they come first, then the rest, with the metadata."""
+    while (tag := stream.read(1)) == _SCENARIO_TAG:
+        head = b""  # the length: seven bits in each byte, the last of which is below 0x80
+        while len(head) < 5 and (byte := stream.read(1)):
+            head += byte
+            if byte[0] < 0x80:
+                break
+        length = sum((byte & 0x7F) << 7 * k for k, byte in enumerate(head))
+        if length > _LARGEST:
+            raise DecodeError(f"a scenario of {length} bytes, at most {_LARGEST} are read")
+        yield pb.SimAgentsChallengeSubmission.FromString(tag + head + stream.read(length))
+    yield pb.SimAgentsChallengeSubmission.FromString(tag + stream.read())
+
+
+def _names_problem(names: list[str]) -> list[str]:
+    """What is wrong with the names of the shards, counted from 0, as the organisers' example does, or from 1."""
+    numbers = [tuple(map(int, match.groups())) for name in names if (match := _SHARD.fullmatch(name))]
+    totals = {total for _, total in numbers}
+    if len(totals) != 1:
+        return [f"names of {len(totals)} different numbers of shards" if totals else "no shards found"]
+    (total,), there = totals, sorted(shard for shard, _ in numbers)
+    first = int(total in there)
+    wrong = there != list(range(first, total + first))
+    return [f"shards {', '.join(map(str, there))} of {total}, expected each once"] * wrong
+
+
+def _check_scenario(
+    scenario: pb.ScenarioRollouts, seen: set[str], required: Mapping[str, list[int]] | None
+) -> None:
+    name: str | bytes = scenario.scenario_id
+    if not name or isinstance(name, bytes):
+        raise DataError("missing, or not UTF-8", field="scenario_id")
+    if name in seen:
+        raise DataError("more than once in the submission", field="scenario_id")
+    if required is not None and name not in required:
+        raise DataError("none of the scenarios to simulate", field="scenario_id")
+    scenes = scenario.joint_scenes
+    if len(scenes) != ROLLOUTS:
+        raise DataError(f"{len(scenes)} rollouts, expected {ROLLOUTS}", field="joint_scenes")
+    ids = [[one.object_id for one in scene.simulated_trajectories] for scene in scenes]
+    wanted = ids[0] if required is None else required[name]
+    for number, (agents, scene) in enumerate(zip(ids, scenes, strict=True)):
+        try:
+            check_agents(np.array(agents, np.int64), np.array(wanted, np.int64))
+            for one in scene.simulated_trajectories:
+                _check_trajectory(one)
+        except DataError as error:
+            raise DataError(f"rollout {number}: {error.message}", field=error.field) from None
+
+
+def _check_trajectory(one: pb.SimulatedTrajectory) -> None:
+    for field in FIELDS.values():
+        values = np.array(getattr(one, field))
+        if len(values) != FUTURE:
+            message = f"agent {one.object_id}: {len(values)} steps, expected {FUTURE}"
+            raise DataError(message, field=field)
+        if not (good := np.isfinite(values)).all():
+            step = CURRENT + 1 + int(good.argmin())
+            raise DataError(f"agent {one.object_id}, step {step}: not finite", field=field)

@@ -5,29 +5,18 @@ The definitions are in ``docs/wosac.md``, with the legal notice that goes with t
 
 from __future__ import annotations
 
-from symphony.wosac.scorer.config import CHALLENGE_2024, CHALLENGE_2025, CHALLENGES, WosacConfig
-from symphony.wosac.scorer.features import StepFeatures, WosacFeatures, compute_features
-from symphony.wosac.scorer.scenario import Lines, SimulatedRollouts, WosacScenario
-from symphony.wosac.scorer.scoring import (
-    WosacScores,
-    check_scored,
-    mean_scores,
-    object_scores,
-    score,
-    score_features,
-)
+from symphony.wosac.scorer.config import CHALLENGES, Component, WosacConfig
+from symphony.wosac.scorer.features import WosacFeatures, compute_features
+from symphony.wosac.scorer.scenario import SimulatedRollouts, WosacScenario
+from symphony.wosac.scorer.scoring import check_scored, mean_scores, object_scores, score, score_features
 
 __all__ = [
     "CHALLENGES",
-    "CHALLENGE_2024",
-    "CHALLENGE_2025",
-    "Lines",
+    "Component",
     "SimulatedRollouts",
-    "StepFeatures",
     "WosacConfig",
     "WosacFeatures",
     "WosacScenario",
-    "WosacScores",
     "check_scored",
     "compute_features",
     "mean_scores",

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
+import numpy as np
+import shapely
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.wosac.scorer.cells import Bounds, Boxes, Measure, nearest
-from symphony.wosac.scorer.scenario import SURFACE_STREET, Lines, WosacScenario
+from symphony.wosac.scorer.road import first_of_least
 
 RED = (1, 4)
 """States of a red signal: arrow stop and stop; flashing ones are none."""
@@ -27,82 +31,59 @@ class Lanes:
         along: [S, 2] from the first point to the last.
         squared: [S] squared length.
         lane: [S] id of the lane.
-        number: [S] of the segment in its lane.
     """
 
     start: Float[Tensor, "S 2"]
     along: Float[Tensor, "S 2"]
     squared: Float[Tensor, " S"]
     lane: Int[Tensor, " S"]
-    number: Int[Tensor, " S"]
 
     @classmethod
-    def of(cls, lines: Lines, lane_id: Int[Tensor, " K"]) -> Lanes:
-        """Cut lanes into segments, float32; lanes of one point have none."""
-        kept = lines.counts >= 2
-        lines, lane_id = lines.keep(kept), lane_id[kept]
-        points, counts = lines.points[:, :2].float(), lines.counts
-        line = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-        last = torch.ones_like(line, dtype=torch.bool)
-        last[:-1] = line[1:] != line[:-1]
-        following = torch.where(last[:, None], torch.zeros_like(points), points.roll(-1, 0))
-        # Segment number k of a lane starts at its point k; the last point starts one only where there is padding.
-        longest = counts.max() if len(counts) else counts.new_zeros(())
-        starts = ~(last & (counts == longest)[line])
-        along = (following - points)[starts]
-        number = torch.arange(len(line), device=counts.device) - (counts.cumsum(0) - counts)[line]
-        return cls(
-            points[starts],
-            along,
-            along[:, 0] * along[:, 0] + along[:, 1] * along[:, 1],
-            lane_id[line][starts],
-            number[starts],
+    def of(cls, lines: Sequence[Any], lane_id: Any) -> Lanes:
+        """Cut lanes [P, 2 or 3] into segments, float32; lanes of one point have none."""
+        pairs = [
+            (np.asarray(line, np.float32)[:, :2], name)
+            for line, name in zip(lines, lane_id, strict=True)
+            if len(line) >= 2
+        ]
+        longest = max((len(line) for line, _ in pairs), default=0)
+        origin = np.zeros((1, 2), np.float32)
+        whole = [line if len(line) == longest else np.concatenate([line, origin]) for line, _ in pairs]
+        start = torch.from_numpy(np.concatenate([origin[:0], *(line[:-1] for line in whole)]))
+        along = torch.from_numpy(np.concatenate([origin[:0], *(np.diff(line, axis=0) for line in whole)]))
+        lane = torch.tensor(
+            [int(name) for line, (_, name) in zip(whole, pairs, strict=True) for _ in line[1:]]
         )
+        return cls(start, along, along[:, 0] * along[:, 0] + along[:, 1] * along[:, 1], lane)
 
     def __getitem__(self, rows: Tensor) -> Lanes:
-        return Lanes(
-            self.start[rows], self.along[rows], self.squared[rows], self.lane[rows], self.number[rows]
-        )
+        return Lanes(self.start[rows], self.along[rows], self.squared[rows], self.lane[rows])
 
-    def fraction(self, points: Float[Tensor, "M 2"], segment: Int[Tensor, " M"]) -> Float[Tensor, " M"]:
+    @cached_property
+    def _starts(self) -> shapely.STRtree:
+        return shapely.STRtree(shapely.points(self.start.double().numpy()))
+
+    def share(self, points: Float[Tensor, "*#shape 2"]) -> Float[Tensor, "*#shape"]:
         """Where along the line through each segment a point is: 0 at the first point, 1 at the last."""
-        away, along, squared = points - self.start[segment], self.along[segment], self.squared[segment]
-        share = (away[:, 0] * along[:, 0] + away[:, 1] * along[:, 1]) / torch.where(
-            squared == 0, 1.0, squared
-        )
-        return torch.where(squared == 0, 0.0, share)
+        away = points - self.start
+        dot = away[..., 0] * self.along[..., 0] + away[..., 1] * self.along[..., 1]
+        return torch.where(self.squared == 0, 0.0, dot / torch.where(self.squared == 0, 1.0, self.squared))
+
+    def compared(self, points: Float[Tensor, "M 2"]) -> Float[Tensor, " M"]:
+        """What the official scorer takes for the distance of a point to each of M segments: ``|away + t along|``,
+        where the distance would be ``|away - t along|``.
+        """
+        x, y = (points - self.start + self.share(points).clamp(0, 1)[:, None] * self.along).unbind(-1)
+        return (x * x + y * y).sqrt()
 
     def nearest(self, points: Float[Tensor, "M 2"]) -> Int[Tensor, " M"]:
-        """Index of the segment that the official scorer takes for the nearest; there must be one.
-
-        What it compares is ``|away + t along|``, where the distance would be ``|away - t along|``.
-        """
-        # What is compared is never less than the distance to the first point.
-        boxes = Boxes(self.start, self.start)
-        return nearest(points, boxes, torch.ones(2), self._bounds(), self._measure(points))
-
-    def _measure(self, points: Tensor) -> Measure:
-        def measure(point: Tensor, segment: Tensor) -> Tensor:
-            chosen = points[point]
-            share = self.fraction(chosen, segment).clamp(0, 1)[:, None]
-            x, y = (chosen - self.start[segment] + share * self.along[segment]).unbind(-1)
-            return (x * x + y * y).sqrt()
-
-        return measure
-
-    def _bounds(self) -> Bounds:
-        length = self.squared.sqrt()
-
-        def bounds(cells: Boxes, segment: Tensor) -> tuple[Tensor, Tensor]:
-            # What is compared is at most the segment's length more than the distance to the first point.
-            x, y = ((cells.low + cells.high) / 2 - self.start[segment]).unbind(-1)
-            away = torch.hypot(x, y)
-            size_x, size_y = (cells.high - cells.low).unbind(-1)
-            radius = torch.hypot(size_x, size_y) / 2 + cells.slack
-            low, high = (away - radius).clamp_(min=0), away + radius
-            return low, high + torch.minimum(high, length[segment])
-
-        return bounds
+        """Index of the segment that the official scorer takes for the nearest; there must be one."""
+        # What is compared is never less than the distance to the first point of a segment.
+        places = shapely.points(points.double().numpy())
+        bound = self[torch.from_numpy(self._starts.nearest(places))].compared(points).double()
+        bound += 1e-3 + 1e-6 * points.abs().amax(-1)
+        row, segment = torch.from_numpy(self._starts.query(places, "dwithin", bound.numpy()))
+        return first_of_least(row, segment, self[segment].compared(points[row]), len(points))
 
 
 @dataclass(frozen=True)
@@ -120,24 +101,15 @@ class Signals:
     point: Float[Tensor, "Q T 2"]
 
     @classmethod
-    def of(
-        cls,
-        step: Int[Tensor, " M"],
-        lane: Int[Tensor, " M"],
-        state: Int[Tensor, " M"],
-        point: Float[Tensor, "M 2"],
-        steps: int,
-    ) -> Signals:
+    def of(cls, step: Any, lane: Any, state: Any, point: Any, steps: int) -> Signals:
         """Bring M observations into a table; of several for one lane and step, the last one counts."""
-        lanes, row = lane.unique(return_inverse=True)
-        cell = row * steps + step
-        last = torch.full((len(lanes) * steps,), -1, device=lane.device)
-        last = last.scatter_reduce(0, cell, torch.arange(len(cell), device=lane.device), "amax")
-        there = last >= 0
-        states, points = state.new_zeros(len(last)), torch.zeros(len(last), 2, device=point.device)
-        states[there], points[there] = state[last[there]], point[last[there]].float()
-        red = torch.isin(states, torch.tensor(RED, device=lane.device))
-        return cls(lanes, red.view(-1, steps), points.view(-1, steps, 2))
+        lanes, row = np.unique(lane, return_inverse=True)
+        # Of several numbers for one place NumPy keeps the last.
+        states = np.zeros((len(lanes), steps), np.int64)
+        states[row, step] = state
+        points = np.zeros((len(lanes), steps, 2), np.float32)
+        points[row, step] = point
+        return cls(*(torch.from_numpy(found) for found in (lanes, np.isin(states, RED), points)))
 
 
 def red_light_violations(
@@ -150,34 +122,14 @@ def red_light_violations(
     step itself.
     """
     result = torch.zeros_like(valid)
-    for lane, red, point in zip(*_on_lanes(signals, lanes), strict=True):
+    seen = torch.isin(signals.lane, lanes.lane) & signals.red.any(-1)
+    for lane, red, point in zip(signals.lane[seen], signals.red[seen], signals.point[seen], strict=True):
         own = lanes[lanes.lane == lane]
-        segment = own.nearest(point)
-        start, along, squared = own.start[segment], own.along[segment], own.squared[segment]
-        ahead = _share(position, start, along, squared) - _share(point, start, along, squared)
+        line = own[own.nearest(point)]
+        ahead = line.share(position) - line.share(point)
         passes = torch.zeros_like(valid)
         passes[..., 1:] = (ahead[..., :-1] < 0) & (ahead[..., 1:] > 0)
         passes &= valid & red
-        where = passes.nonzero(as_tuple=True)
-        there = position[where]
-        if len(there):
-            result[where] |= lanes.lane[lanes.nearest(there)] == lane
+        if passes.any():
+            result[passes] |= lanes.lane[lanes.nearest(position[passes])] == lane
     return result
-
-
-def _on_lanes(signals: Signals, lanes: Lanes) -> tuple[Tensor, Tensor, Tensor]:
-    """The signals whose lane is there, and that are red at all."""
-    kept = torch.isin(signals.lane, lanes.lane) & signals.red.any(-1)
-    return signals.lane[kept], signals.red[kept], signals.point[kept]
-
-
-def _share(points: Tensor, start: Tensor, along: Tensor, squared: Tensor) -> Tensor:
-    away = points - start
-    dot = away[..., 0] * along[..., 0] + away[..., 1] * along[..., 1]
-    return torch.where(squared == 0, 0.0, dot / torch.where(squared == 0, 1.0, squared))
-
-
-def surface_street_lanes(scenario: WosacScenario) -> Lanes:
-    """The lanes that count for traffic lights."""
-    street = scenario.lane_type == SURFACE_STREET
-    return Lanes.of(scenario.lanes.keep(street), scenario.lane_id[street])

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+import shapely
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.wosac.scorer.boxes import corners
-from symphony.wosac.scorer.cells import Bounds, Boxes, Measure, nearest
-from symphony.wosac.scorer.scenario import Lines
 
 NOWHERE = -1e10
 """Distance, in metres, of an object that is not valid."""
@@ -18,6 +20,10 @@ STRETCH = 3.0
 """Weight of height in choosing the nearest edge, so that one on another level is not taken."""
 CLOSED = 1.0
 """Square metres between the ends of a line below which it is closed."""
+_CELL = 1.0
+"""Metres. A choice of speed, as is the next one: results don't depend on them."""
+_TOGETHER = 1 << 16
+"""Points looked at together."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class Edges:
         squared: [S] squared length in the plane.
         previous: [S] the segment before on the same line, -1 for none.
         following: [S] the one after.
+        tree: of the segments in the plane.
     """
 
     start: Float[Tensor, "S 3"]
@@ -37,50 +44,91 @@ class Edges:
     squared: Float[Tensor, " S"]
     previous: Int[Tensor, " S"]
     following: Int[Tensor, " S"]
+    tree: shapely.STRtree
 
     @classmethod
-    def of(cls, lines: Lines) -> Edges:
-        """Cut lines into segments, float32; lines of one point have none.
+    def of(cls, lines: Sequence[Any]) -> Edges:
+        """Cut lines [P, 3] into segments, float32; lines of one point have none.
 
         A closed line's last segment is followed by its first one only if no line has more points, as in the official
         scorer, where padding separates the two otherwise.
         """
-        lines = lines.keep(lines.counts >= 2)
-        points, counts = lines.points.float(), lines.counts
-        line = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-        first = (line[1:] == line[:-1]).nonzero()[:, 0]
-        start, along = points[first], points[first + 1] - points[first]
-        line = line[first]
-        ends = (counts - 1).cumsum(0)
-        begins = ends - (counts - 1)
-        number = torch.arange(len(line), device=counts.device)
-        heads, tails = points[counts.cumsum(0) - counts], points[counts.cumsum(0) - 1]
-        closed = ((heads - tails).square().sum(-1) < CLOSED) & (counts == counts.max())
-        before, after = torch.where(closed, ends - 1, -1), torch.where(closed, begins, -1)
+        arrays = [np.asarray(line, np.float32) for line in lines if len(line) >= 2]
+        longest = max(map(len, arrays))
+        previous, following, first = [], [], 0
+        for line in arrays:
+            own = np.arange(first, first := first + len(line) - 1)
+            closed = len(line) == longest and np.square(line[0] - line[-1]).sum() < CLOSED
+            previous.append(np.append(own[-1] if closed else -1, own[:-1]))
+            following.append(np.append(own[1:], own[0] if closed else -1))
+        start = torch.from_numpy(np.concatenate([line[:-1] for line in arrays]))
+        along = torch.from_numpy(np.concatenate([line[1:] - line[:-1] for line in arrays]))
+        ends = torch.stack([start, start + along], 1)[..., :2].double()
         return cls(
             start,
             along,
             along[:, 0] * along[:, 0] + along[:, 1] * along[:, 1],
-            torch.where(number == begins[line], before[line], number - 1),
-            torch.where(number == ends[line] - 1, after[line], number + 1),
+            torch.from_numpy(np.concatenate(previous)),
+            torch.from_numpy(np.concatenate(following)),
+            shapely.STRtree(shapely.linestrings(ends.numpy())),
         )
 
-    def fraction(self, away: Float[Tensor, "M 3"], segment: Int[Tensor, " M"]) -> Float[Tensor, " M"]:
-        """Where along each segment a point is nearest in the plane: 0 at the first point, 1 at the last.
-
-        Args:
-            away: from the segment's first point to the point.
-            segment: index of the segment.
+    def offset(
+        self, points: Float[Tensor, "M 3"], segment: Int[Tensor, " M"]
+    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
+        """From the nearest place of a segment, in the plane, to each point; and where along the segment's line the
+        point is, 0 at the first point and 1 at the last.
         """
-        along, squared = self.along[segment], self.squared[segment]
-        share = (away[:, 0] * along[:, 0] + away[:, 1] * along[:, 1]) / torch.where(
-            squared == 0, 1.0, squared
-        )
-        return torch.where(squared == 0, 0.0, share)
+        away, along, squared = points - self.start[segment], self.along[segment], self.squared[segment]
+        share = away[:, 0] * along[:, 0] + away[:, 1] * along[:, 1]
+        share = torch.where(squared == 0, 0.0, share / torch.where(squared == 0, 1.0, squared))
+        return away - share.clamp(0, 1)[:, None] * along, share
+
+    def distance(
+        self, points: Float[Tensor, "M 3"], segment: Int[Tensor, " M"], stretch: float
+    ) -> Float[Tensor, " M"]:
+        """Distance that decides which segment is nearest, with heights multiplied by ``stretch``."""
+        x, y, z = self.offset(points, segment)[0].unbind(-1)
+        z = z * stretch
+        return (x * x + y * y + z * z).sqrt()
+
+    def nearest(self, points: Float[Tensor, "M 3"], stretch: float) -> Int[Tensor, " M"]:
+        """Index of the nearest segment to each point; of several, the first one.
+
+        Points share a cell. The segment that is nearest to one of them in the plane gives a bound for all of them;
+        only segments within it, and within the cell's size more, are measured for each point.
+        """
+        index = (points[:, :2] / _CELL).floor().long()
+        key, cell = torch.unique((index[:, 0] << 32) + index[:, 1], return_inverse=True)
+        rows = torch.arange(len(points))
+        member = points[torch.zeros_like(key).scatter_(0, cell, rows), :2].double()
+        centres = shapely.points(member.numpy())
+        guess = torch.from_numpy(self.tree.nearest(centres))[cell]
+        bound = self.distance(points, guess, stretch).double()
+        bound = torch.zeros(len(key), dtype=bound.dtype).scatter_reduce_(0, cell, bound, "amax")
+        # Between points of a cell there is at most its diagonal; the rest is for rounding.
+        bound += _CELL * 2**0.5 + 1e-3 + 1e-6 * member.abs().amax(-1)
+        owner, near = torch.from_numpy(self.tree.query(centres, "dwithin", bound.numpy()))
+        count = owner.bincount(minlength=len(key))
+        # Every point with all that may be nearest in its cell, one after the other.
+        row = rows.repeat_interleave(count[cell])
+        begin = (count.cumsum(0) - count)[cell] - (count[cell].cumsum(0) - count[cell])
+        segment = near[torch.arange(len(row)) + begin[row]]
+        return first_of_least(row, segment, self.distance(points[row], segment, stretch), len(points))
 
     def side(self, points: Float[Tensor, "M 3"], segment: Int[Tensor, " M"]) -> Float[Tensor, " M"]:
         """1 to the right of the line through the segment, -1 to its left, 0 on it."""
         return cross(points - self.start[segment], self.along[segment]).sign()
+
+
+def first_of_least(
+    row: Int[Tensor, " Q"], segment: Int[Tensor, " Q"], distance: Float[Tensor, " Q"], count: int
+) -> Int[Tensor, " M"]:
+    """The segment at the smallest distance in each of M rows, the first of several."""
+    least = torch.full((count,), torch.inf).scatter_reduce_(0, row, distance, "amin")
+    tied = distance == least[row]
+    found = torch.full((count,), torch.iinfo(torch.int64).max)
+    return found.scatter_reduce_(0, row[tied], segment[tied], "amin")
 
 
 def cross(a: Float[Tensor, "*shape 3"], b: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
@@ -96,14 +144,12 @@ def signed_distance_to_edges(
     The nearest is chosen with heights multiplied by ``stretch``. Where the nearest place is an end that two segments
     share, the side is that of both: right of either where the line turns left, of both where it turns right.
     """
-    end = edges.start + edges.along
-    boxes = Boxes(torch.minimum(edges.start, end), torch.maximum(edges.start, end))
-    weights = points.new_tensor([1.0, 1.0, stretch])
-    bounds, measure = _bounds(edges, boxes, stretch), _measure(points, edges, stretch)
-    segment = nearest(points, boxes, weights, bounds, measure)
-    away = points - edges.start[segment]
-    fraction = edges.fraction(away, segment)
-    offset = away - fraction.clamp(0, 1)[:, None] * edges.along[segment]
+    return torch.cat([_signed_distance(part, edges, stretch) for part in points.split(_TOGETHER)])
+
+
+def _signed_distance(points: Tensor, edges: Edges, stretch: float) -> Tensor:
+    segment = edges.nearest(points, stretch)
+    offset, fraction = edges.offset(points, segment)
     distance = (offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1]).sqrt()
     own = edges.side(points, segment)
     before, after = edges.previous[segment], edges.following[segment]
@@ -115,41 +161,6 @@ def signed_distance_to_edges(
     left = torch.where(ahead, turn, -turn) > 0
     both = torch.where(left, torch.maximum(own, theirs), torch.minimum(own, theirs))
     return torch.where(neighbour >= 0, both, own) * distance
-
-
-def _measure(points: Tensor, edges: Edges, stretch: float) -> Measure:
-    def measure(point: Tensor, segment: Tensor) -> Tensor:
-        away = points[point] - edges.start[segment]
-        offset = away - edges.fraction(away, segment).clamp(0, 1)[:, None] * edges.along[segment]
-        x, y, z = offset.unbind(-1)
-        z = z * stretch
-        return (x * x + y * y + z * z).sqrt()
-
-    return measure
-
-
-def _bounds(edges: Edges, boxes: Boxes, stretch: float) -> Bounds:
-    inverse = torch.where(edges.squared > 0, edges.squared, 1.0).reciprocal()
-
-    def bounds(cells: Boxes, segment: Tensor) -> tuple[Tensor, Tensor]:
-        x, y, _ = ((cells.low + cells.high) / 2 - edges.start[segment]).unbind(-1)
-        along_x, along_y, _ = edges.along[segment].unbind(-1)
-        fraction = ((x * along_x + y * along_y) * inverse[segment]).clamp_(0, 1)
-        away = torch.hypot(x - fraction * along_x, y - fraction * along_y)
-        size_x, size_y, _ = (cells.high - cells.low).unbind(-1)
-        radius = torch.hypot(size_x, size_y) / 2 + cells.slack
-        below = boxes.low[segment, 2] - cells.high[:, 2]
-        above = cells.low[:, 2] - boxes.high[segment, 2]
-        apart = torch.maximum(below, above).clamp_(min=0)
-        far = torch.maximum(
-            boxes.high[segment, 2] - cells.low[:, 2], cells.high[:, 2] - boxes.low[segment, 2]
-        )
-        return (
-            torch.hypot((away - radius).clamp_(min=0), apart * stretch),
-            torch.hypot(away + radius, far * stretch),
-        )
-
-    return bounds
 
 
 def distance_to_road_edge(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from numpy.typing import NDArray
 
 from symphony.errors import DataError
 from symphony.wosac.scorer.config import CURRENT, FUTURE
@@ -18,36 +16,12 @@ VEHICLE = 1
 """Object type of vehicles."""
 SURFACE_STREET = 2
 """Type of the lanes that count for traffic lights."""
+STATES = ("x", "y", "z", "heading")
 _NAMED = 10
 """Agents named in an error."""
 
-
-@dataclass(frozen=True)
-class Lines:
-    """Polylines of unequal length, one after the other.
-
-    Attributes:
-        points: [P, 3] metres.
-        counts: [K] points of each line.
-    """
-
-    points: Float[Tensor, "P 3"]
-    counts: Int[Tensor, " K"]
-
-    @classmethod
-    def of(cls, lines: Sequence[Any]) -> Lines:
-        """From arrays [P_k, 3]."""
-        arrays = [np.asarray(line, np.float64).reshape(-1, 3) for line in lines]
-        points = np.concatenate([np.zeros((0, 3)), *arrays])
-        return cls(torch.from_numpy(points), torch.tensor([len(array) for array in arrays], dtype=torch.long))
-
-    def keep(self, kept: Bool[Tensor, " K"]) -> Lines:
-        """Some of the lines."""
-        return Lines(self.points[kept.repeat_interleave(self.counts)], self.counts[kept])
-
-    def to(self, device: torch.device | str) -> Lines:
-        """On another device."""
-        return Lines(self.points.to(device), self.counts.to(device))
+Ints = NDArray[np.integer[Any]]
+Reals = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -66,8 +40,8 @@ class WosacScenario:
         size: [A, 3] length, width and height at step 10, metres.
         valid: [A, 91].
         evaluated: [E] ids of the objects that are scored: the recording vehicle and those to predict.
-        road_edges: boundaries of the drivable area, which is on their left.
-        lanes: centre lines.
+        road_edges: arrays [P, 3], metres: boundaries of the drivable area, which is on their left.
+        lanes: arrays [P, 3], metres: centre lines of K lanes.
         lane_id: [K].
         lane_type: [K] 2 is a lane of a surface street.
         signal_step: [M] step of each observation of a traffic light.
@@ -76,142 +50,56 @@ class WosacScenario:
         signal_point: [M, 2] where to stop, metres.
         future: steps after step 10, all of which are simulated and scored; the challenge's 80, or fewer for logs that
             are shorter. "91" above and in what is made of a scenario is 11 more than this.
+
+    Raises:
+        DataError: it can't be scored; names scenario, field and agent.
     """
 
     scenario_id: str
-    object_id: Int[Tensor, " A"]
-    object_type: Int[Tensor, " A"]
-    position: Float[Tensor, "A 91 3"]
-    heading: Float[Tensor, "A 91"]
-    size: Float[Tensor, "A 3"]
-    valid: Bool[Tensor, "A 91"]
-    evaluated: Int[Tensor, " E"]
-    road_edges: Lines
-    lanes: Lines
-    lane_id: Int[Tensor, " K"]
-    lane_type: Int[Tensor, " K"]
-    signal_step: Int[Tensor, " M"]
-    signal_lane: Int[Tensor, " M"]
-    signal_state: Int[Tensor, " M"]
-    signal_point: Float[Tensor, "M 2"]
+    object_id: Ints
+    object_type: Ints
+    position: Reals
+    heading: Reals
+    size: Reals
+    valid: NDArray[np.bool_]
+    evaluated: Ints
+    road_edges: Sequence[Reals]
+    lanes: Sequence[Reals]
+    lane_id: Ints
+    lane_type: Ints
+    signal_step: Ints
+    signal_lane: Ints
+    signal_state: Ints
+    signal_point: Reals
     future: int = FUTURE
 
-    @classmethod
-    def of(
-        cls,
-        scenario_id: str,
-        *,
-        road_edges: Sequence[Any],
-        lanes: Sequence[Any],
-        future: int = FUTURE,
-        **arrays: Any,
-    ) -> Self:
-        """From anything numpy understands, checked.
+    def __post_init__(self) -> None:
+        def demand(good: Any, field: str, message: str) -> None:
+            if not np.all(good):
+                raise DataError(message, segment=self.scenario_id, field=field)
 
-        Args:
-            scenario_id: its id.
-            road_edges: arrays [P_k, 3].
-            lanes: likewise.
-            future: steps that are simulated and scored.
-            arrays: the other attributes.
-
-        Raises:
-            DataError: naming scenario, field and agent.
-        """
-        tensors = {name: torch.as_tensor(np.asarray(array)) for name, array in arrays.items()}
-        edges, centres = Lines.of(road_edges), Lines.of(lanes)
-        scenario = cls(scenario_id, road_edges=edges, lanes=centres, future=future, **tensors)
-        scenario.check()
-        return scenario
+        ids, count = np.unique(self.object_id, return_counts=True)
+        demand(count == 1, "object_id", f"{_agents(ids[count > 1])} more than once")
+        demand(len(self.evaluated), "evaluated", "no object to score")
+        strange = np.setdiff1d(self.evaluated, self.sim_agents)
+        message = f"{_agents(strange)} to be scored, but not valid at step {CURRENT}"
+        demand(len(strange) == 0, "tracks_to_predict", message)
+        edges = any(len(edge) >= 2 for edge in self.road_edges)
+        demand(edges, "road_edge", "no road edge of two or more points, without which nothing is off-road")
+        now = self.valid[:, CURRENT]
+        for name in ("position", "heading", "size"):
+            bad = now & ~_finite(getattr(self, name)).reshape(len(now), -1).all(1)
+            demand(~bad, name, f"{_agents(self.object_id[bad])} not finite")
+        flat = now & (self.size[:, :2] <= 0).any(1)
+        demand(~flat, "size", f"{_agents(self.object_id[flat])} without length or width")
+        for name, lines in (("road_edge", self.road_edges), ("lane", self.lanes)):
+            demand([_finite(line).all() for line in lines], name, "not finite")
+        demand(_finite(self.signal_point), "signal_point", "not finite")
 
     @property
-    def sim_agents(self) -> Int[Tensor, " n"]:
-        """Ids of the objects that a rollout must hold: all that are valid at step 10."""
+    def sim_agents(self) -> Ints:
+        """[n] ids of the objects that a rollout must hold: all that are valid at step 10."""
         return self.object_id[self.valid[:, CURRENT]]
-
-    @property
-    def steps(self) -> int:
-        """All there are: the history's and the future's."""
-        return CURRENT + 1 + self.future
-
-    def to(self, device: torch.device | str) -> Self:
-        """On another device."""
-        return replace(
-            self,
-            **{
-                f.name: getattr(self, f.name).to(device)
-                for f in fields(self)
-                if f.name not in {"scenario_id", "future"}
-            },
-        )
-
-    def check(self) -> None:
-        """Raise a DataError where something can't be scored."""
-        agents = len(self.object_id)
-        signals = len(self.signal_step)
-        expected = {
-            "object_id": (agents,),
-            "object_type": (agents,),
-            "position": (agents, self.steps, 3),
-            "heading": (agents, self.steps),
-            "size": (agents, 3),
-            "valid": (agents, self.steps),
-            "lane_id": self.lanes.counts.shape,
-            "lane_type": self.lanes.counts.shape,
-            "signal_lane": (signals,),
-            "signal_state": (signals,),
-            "signal_point": (signals, 2),
-        }
-        for name, shape in expected.items():
-            found = tuple(getattr(self, name).shape)
-            if found != tuple(shape):
-                raise self._error(f"has shape {found}, expected {tuple(shape)}", name)
-        self._check_ids()
-        self._check_numbers()
-
-    def _check_ids(self) -> None:
-        ids, count = self.object_id.unique(return_counts=True)
-        if (count > 1).any():
-            raise self._error(f"{_agents(ids[count > 1])} more than once", "object_id")
-        if len(self.evaluated) == 0:
-            raise self._error("no object to score", "evaluated")
-        strange = self.evaluated[~torch.isin(self.evaluated, self.sim_agents)]
-        if len(strange):
-            raise self._error(
-                f"{_agents(strange)} to be scored, but not valid at step {CURRENT}", "tracks_to_predict"
-            )
-        if not (self.road_edges.counts >= 2).any():
-            raise self._error(
-                "no road edge of two or more points, without which nothing is off-road", "road_edge"
-            )
-        steps = self.signal_step
-        if ((steps < 0) | (steps >= self.steps)).any():
-            raise self._error(f"outside the {self.steps} steps", "signal_step")
-
-    def _check_numbers(self) -> None:
-        agents = self.valid[:, CURRENT]
-        numbers = {
-            "position": (self.position, agents),
-            "heading": (self.heading, agents),
-            "size": (self.size, agents),
-        }
-        for name, (values, which) in numbers.items():
-            bad = ~values.float().isfinite().flatten(1).all(1) & which
-            if bad.any():
-                raise self._error(f"{_agents(self.object_id[bad])} not finite", name)
-        flat = (self.size[:, :2] <= 0).any(1) & agents
-        if flat.any():
-            raise self._error(f"{_agents(self.object_id[flat])} without length or width", "size")
-        for name, points in (
-            ("road_edge", self.road_edges.points),
-            ("lane", self.lanes.points),
-            ("signal_point", self.signal_point),
-        ):
-            if not points.float().isfinite().all():
-                raise self._error("not finite", name)
-
-    def _error(self, message: str, field: str) -> DataError:
-        return DataError(message, segment=self.scenario_id, field=field)
 
 
 @dataclass(frozen=True)
@@ -220,71 +108,64 @@ class SimulatedRollouts:
 
     Attributes:
         object_id: [n].
-        x, y, z: [R, n, 80] box centres in the scenario's frame, metres.
+        x, y, z: [R, n, 80] box centres in the world frame of the log, metres.
         heading: [R, n, 80] radians.
     """
 
-    object_id: Int[Tensor, " n"]
-    x: Float[Tensor, "R n 80"]
-    y: Float[Tensor, "R n 80"]
-    z: Float[Tensor, "R n 80"]
-    heading: Float[Tensor, "R n 80"]
+    object_id: Ints
+    x: Reals
+    y: Reals
+    z: Reals
+    heading: Reals
 
-    @classmethod
-    def of(cls, object_id: Any, x: Any, y: Any, z: Any, heading: Any) -> Self:
-        """From anything numpy understands; :meth:`check` is for the scorer, which knows the scenario."""
-        states = (torch.as_tensor(np.asarray(array)) for array in (x, y, z, heading))
-        return cls(torch.as_tensor(np.asarray(object_id)), *states)
-
-    def to(self, device: torch.device | str) -> Self:
-        """On another device."""
-        return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
-    def check(self, scenario: WosacScenario, count: int | None = None) -> None:
-        """Compare with the scenario.
+    def check(self, agents: Ints | None = None, future: int = FUTURE, count: int | None = None) -> None:
+        """See that all is there and finite.
 
         Args:
-            scenario: what was simulated.
+            agents: ids of the agents that there must be, where that is known.
+            future: steps there must be.
             count: rollouts there must be, where that is prescribed.
 
         Raises:
-            DataError: naming scenario, field and agent.
+            DataError: naming field and agent.
         """
-
-        def error(message: str, field: str) -> DataError:
-            return DataError(message, segment=scenario.scenario_id, field=field)
-
-        if self.object_id.ndim != 1 or self.object_id.is_floating_point():
-            raise error("must be a list of whole numbers", "object_id")
-        ids, repeats = self.object_id.unique(return_counts=True)
-        if (repeats > 1).any():
-            raise error(f"{_agents(ids[repeats > 1])} more than once", "object_id")
-        needed = scenario.sim_agents.to(ids.device)
-        for who, what in (
-            (needed[~torch.isin(needed, ids)], "missing from the rollouts"),
-            (
-                ids[~torch.isin(ids, needed)],
-                f"in the rollouts, but not valid at step {CURRENT} of the scenario",
-            ),
-        ):
-            if len(who):
-                raise error(f"{_agents(who)} {what}", "object_id")
+        if self.object_id.ndim != 1:
+            raise DataError(f"has shape {self.object_id.shape}, expected (agents,)", field="object_id")
+        check_agents(self.object_id, self.object_id if agents is None else agents)
         rollouts = (len(self.x) if self.x.ndim else 0) if count is None else count
         if rollouts == 0:
-            raise error("no rollouts", "x")
-        shape = rollouts, len(ids), scenario.future
-        for name in ("x", "y", "z", "heading"):
-            values: Tensor = getattr(self, name)
-            if tuple(values.shape) != shape:
-                wanted = f"{shape} (rollouts, agents, steps)"
-                raise error(f"has shape {tuple(values.shape)}, expected {wanted}", name)
-            if not values.is_floating_point():
-                raise error(f"must hold floating-point numbers, not {values.dtype}", name)
-            bad = ~values.float().isfinite()
-            if bad.any():
-                rollout, agent, step = bad.nonzero()[0].tolist()
+            raise DataError("no rollouts", field="x")
+        shape = rollouts, len(self.object_id), future
+        for name in STATES:
+            values: Reals = getattr(self, name)
+            if values.shape != shape:
+                message = f"has shape {values.shape}, expected {shape} (rollouts, agents, steps)"
+                raise DataError(message, field=name)
+            if not (good := _finite(values)).all():
+                rollout, agent, step = np.argwhere(~good)[0]
                 where = f"rollout {rollout}, step {CURRENT + 1 + step}"
-                raise error(f"agent {int(self.object_id[agent])}, {where}: not finite", name)
+                raise DataError(f"agent {self.object_id[agent]}, {where}: not finite", field=name)
+
+
+def check_agents(found: Ints, wanted: Ints) -> None:
+    """See that rollouts hold just the wanted agents.
+
+    Raises:
+        DataError: an agent is missing, there more than once, or not one of those to simulate.
+    """
+    ids, counts = np.unique(found, return_counts=True)
+    for who, problem in (
+        (ids[counts > 1], "more than once"),
+        (np.setdiff1d(wanted, ids), "missing from the rollouts"),
+        (np.setdiff1d(ids, wanted), f"in the rollouts, but not valid at step {CURRENT} of the scenario"),
+    ):
+        if len(who):
+            raise DataError(f"{_agents(who)} {problem}", field="object_id")
+
+
+def _finite(values: Any) -> NDArray[np.bool_]:
+    """Whether numbers are finite in float32, in which all is scored."""
+    return np.asarray(np.abs(values) <= np.finfo(np.float32).max)
 
 
 def _agents(ids: Iterable[Any]) -> str:

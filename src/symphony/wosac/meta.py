@@ -1,7 +1,4 @@
-"""What a submission to the Waymo Open Sim Agents Challenge says about itself.
-
-Imports nothing heavy, so that the command line can ask for it.
-"""
+"""What a submission to the challenge says about itself; imports nothing heavy, so that ``--help`` can ask for it."""
 
 from __future__ import annotations
 
