@@ -125,7 +125,8 @@ def assert_same_until_done(env: Callable[[], EnvBase], policy: Any, **kwargs: An
     [
         (e, t)
         for e, t in itertools.product(ENVIRONMENTS, TRANSFORMS)
-        if (t == "statistics") == (e == "endless")
+        # TorchRL's CatFrames takes no reset of each agent apart.
+        if (t == "statistics") == (e == "endless") and (e, t) != ("agents", "frames")
     ],
 )
 def test_one_branch_is_torchrls_collector(env: str, transforms: str, inside: bool) -> None:
@@ -140,8 +141,6 @@ def test_one_branch_is_torchrls_collector(env: str, transforms: str, inside: boo
             return with_rows(TransformedEnv(base, Compose(*TRANSFORMS[transforms](key))), [ROWS])
         return TransformedEnv(ENVIRONMENTS[env](), Compose(*TRANSFORMS[transforms](key)))
 
-    if env == "agents" and transforms == "frames":
-        pytest.skip("TorchRL's CatFrames takes no reset of each agent apart")
     reward = "reward" if isinstance(key, str) else ("agents", "reward")
     found = assert_same_until_done(make, acting(key, 6 if transforms == "frames" else 2), key=reward)
     if env == "rows" and transforms == "none":
