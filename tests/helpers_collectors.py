@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 STREAM, X, ACTION, LOG_PROB = "stream", ("agents", "x"), ("agents", "action"), ("agents", "log_prob")
@@ -122,3 +122,74 @@ class Weighted(nn.Module):
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         return self.weight * distance(tensordict)
+
+
+class Mass(EnvBase):
+    """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in.
+
+    Args:
+        batch_size: of the environment itself.
+        agents: None for one point; else N, which end apart.
+        sticky: an episode that is over stays so.
+    """
+
+    batch_locked = False
+
+    def __init__(
+        self,
+        batch_size: tuple[int, ...] = (),
+        agents: int | None = None,
+        *,
+        sticky: bool = False,
+        limit: float = 1.5,
+    ) -> None:
+        super().__init__(batch_size=torch.Size(batch_size))
+        self.sticky, self.limit = sticky, limit
+        self.group = None if agents is None else "agents"
+        each = (*self.batch_size, *(() if agents is None else (agents,)))
+
+        def spec(**entries: Any) -> Composite:
+            found = Composite(**entries, shape=each)
+            return found if agents is None else Composite(agents=found, shape=self.batch_size)
+
+        self.observation_spec = spec(**{name: Unbounded((*each, 2)) for name in ("place", "observation")})
+        self.state_spec = spec(place=Unbounded((*each, 2)))
+        self.action_spec = spec(action=Bounded(-1, 1, (*each, 1)))
+        self.reward_spec = spec(reward=Unbounded((*each, 1)))
+        self.done_spec = spec(
+            **{name: Binary(1, shape=(*each, 1), dtype=torch.bool) for name in ("done", "terminated")}
+        )
+        self.shape_of_one = each[len(self.batch_size) :]
+        self.rng = torch.Generator()
+        self.set_seed(0)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.rng.manual_seed(0 if seed is None else seed)
+
+    def _made(self, seen: Tensor, over: Tensor, **more: Tensor) -> TensorDict:
+        entries = {
+            "place": seen,
+            "observation": seen.clone(),
+            "done": over,
+            "terminated": over.clone(),
+            **more,
+        }
+        shape = seen.shape[: -1 - len(self.shape_of_one)]
+        found = TensorDict(entries, seen.shape[:-1])
+        return found if self.group is None else TensorDict({self.group: found}, shape)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        # Many environments take an empty TensorDict for none.
+        shape = self.batch_size if tensordict is None or tensordict.is_empty() else tensordict.shape
+        seen = torch.randn(*shape, *self.shape_of_one, 2, generator=self.rng) * 0.5
+        return self._made(seen, torch.zeros_like(seen[..., :1], dtype=torch.bool))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        now = tensordict if self.group is None else tensordict.get(self.group)
+        x, v = now.get("place").unbind(-1)
+        v = v + 0.5 * now.get("action").squeeze(-1)
+        x = x + 0.5 * v
+        seen = torch.stack([x, v], -1)
+        over = (x.abs() > self.limit)[..., None]
+        over = over | now.get("done") if self.sticky else over
+        return self._made(seen, over, reward=1.0 - seen[..., :1].abs())

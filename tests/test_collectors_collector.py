@@ -26,7 +26,6 @@ from symphony.collectors import (
     branch,
     with_rows,
 )
-from symphony.errors import ConfigError
 
 ROWS, STEPS, FRAMES = 3, 8, 3 * 8
 
@@ -298,13 +297,13 @@ def test_impossible_options_are_errors():
         ({"split_trajs": True}, "split_trajs"),
         ({"extend_buffer": False}, "extend_buffer"),
     ):
-        with pytest.raises(ConfigError, match=message):
+        with pytest.raises(ValueError, match=message):
             make(**options)
 
     class Locked(Walk):
         batch_locked = True
 
-    with pytest.raises(ConfigError, match="Locked can't be branched: it is batch-locked"):
+    with pytest.raises(ValueError, match="Locked can't be branched: it is batch-locked"):
         make(Locked)
     with pytest.raises(TypeError, match="unknown"):
         make(tree=3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import pickle
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from torchrl.collectors import Collector
 
 import symphony.collectors
 from helpers_collectors import ACTION, Policy, Walk, distance
-from symphony.collectors import BeamSearchCollector, _torchrl
+from symphony.collectors import BeamSearchCollector
 
 SOURCES = sorted(Path(symphony.collectors.__file__).parent.glob("*.py"))
 
@@ -41,10 +42,9 @@ def read_of_self(name: str) -> set[str]:
 
 def test_every_member_the_collector_reads_is_there(plain):
     read = read_of_self("BeamSearchCollector")
-    assert {"env", "policy", "postproc", "storing_device", "set_truncated"} <= read
-    private = {name for name in read if name.startswith("_")}
-    assert not private, f"private members belong into _torchrl.PRIVATE: {private}"
-    missing = sorted(name for name in {*read, *_torchrl.PRIVATE} if not hasattr(plain, name))
+    assert {"env", "policy_device", "postproc", "storing_device", "set_truncated"} <= read
+    assert {name for name in read if name.startswith("_")} == {"_wrapped_policy", "_traj_pool"}
+    missing = sorted(name for name in read if not hasattr(plain, name))
     assert not missing, f"TorchRL's Collector no longer has {missing}"
 
 
@@ -57,19 +57,11 @@ def test_nothing_private_of_torchrl_is_imported():
 
 
 def test_private_members_do_what_is_asked_of_them(plain):
-    policy = _torchrl.policy_of(plain)
     state = plain.env.reset()
-    assert policy(state.copy()).get(ACTION).shape == (2, 1)
-    first, second = (_torchrl.new_trajectories(plain, 3, torch.device("cpu")) for _ in range(2))
+    assert plain._wrapped_policy(state.copy()).get(ACTION).shape == (2, 1)
+    first, second = (plain._traj_pool.get_traj_and_increment(3, device=torch.device("cpu")) for _ in range(2))
     assert first.dtype == torch.int64
     assert len(torch.cat([first, second]).unique()) == 6
-
-
-def test_what_is_gone_is_named(plain, monkeypatch):
-    for name in list(_torchrl.PRIVATE):
-        monkeypatch.setitem(_torchrl.PRIVATE, f"{name}_gone", "a test")
-        with pytest.raises(RuntimeError, match=rf"TorchRL 0\.\d+.* has no Collector.{name}_gone \(a test\)"):
-            _torchrl._member(plain, f"{name}_gone")
 
 
 def test_what_the_base_class_calls_is_still_called_so(plain):
@@ -103,3 +95,17 @@ def test_bound_classes_are_classes_that_can_be_pickled():
     assert more(Walk(), Policy(), frames_per_batch=8).leaves == 2
     # The settings of one subclass do not reach another.
     assert not hasattr(BeamSearchCollector, "settings")
+
+
+def test_collectors_and_objectives_stand_alone() -> None:
+    """They import TorchRL, jaxtyping and each their own, and nothing else of this package."""
+    room = Path(symphony.collectors.__file__).parents[1]
+    allowed = {"torch", "tensordict", "torchrl", "jaxtyping", *sys.stdlib_module_names}
+    for package in ("collectors", "objectives"):
+        for source in (room / package).glob("*.py"):
+            for node in ast.walk(ast.parse(source.read_text())):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                for name in names:
+                    own = name.startswith(f"symphony.{package}")
+                    assert own or name.split(".")[0] in allowed, (source.name, name)

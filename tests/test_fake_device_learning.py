@@ -22,7 +22,7 @@ from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
-from symphony.collectors.rules import group_members, prune
+from symphony.collectors.pruning import checked
 from symphony.envs import DrivingEnv, ObservationConfig
 from symphony.modules import SeededNoise
 from symphony.rollouts.background import CarFollower
@@ -79,13 +79,11 @@ def test_searches_stay_on_the_device() -> None:
 
 
 @pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6), KeepAll(), ReplaceBad(0.0)], ids=repr)
-@pytest.mark.parametrize("grouped", [False, True])
-def test_rules_stay_on_the_device(rule: PruningRule, grouped: bool) -> None:
+def test_rules_stay_on_the_device(rule: PruningRule) -> None:
     groups = torch.arange(8).expand(2, 3, 8) % 2
-    members = group_members(groups)  # looked at once before a search
     with pretend() as device:
         totals, noise = torch.zeros(2, 3, 8, device=device.device), torch.zeros(2, 3, device=device.device)
-        parents = prune(rule, totals, noise, on(device, members) if grouped else None, on(device, groups))
+        parents = checked(rule, totals, noise, on(device, groups))
         assert parents.device.type == NAME
         assert device.waits == []
 

@@ -15,18 +15,19 @@ from tensordict.nn import (
 from tensordict.nn.distributions import NormalParamExtractor
 from torch import nn
 from torch.distributions import Normal
+from torchrl.modules import IndependentNormal
 
-from helpers_collectors import STREAM, Walk, X, starts
+from helpers_collectors import STREAM, Mass, Walk, X, starts
 from helpers_collectors import noise as hashed
 from helpers_objectives import check_contract
 from helpers_segments import crossing, straight_road
-from symphony.collectors import KeepAll, KeepBest
+from symphony.collectors import KeepAll, KeepBest, with_rows
 from symphony.envs import Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES
 from symphony.keys import ACTION, NOISE, OBJECTS, OWN, POINTS, SCORE, STATE, VALID
 from symphony.modules import NoiseSampler, discriminator, displacement_policy
 from symphony.objectives import MGAILLoss
-from symphony.rollouts.search import ENDED, search
+from symphony.rollouts.search import search
 from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]
@@ -197,7 +198,7 @@ def test_the_gradient_is_that_through_the_surviving_branches(env, rule):
     result = search(env, policy, network, start.copy(), seed=5, rule=rule, prune_every=2)
     forked = not torch.equal(result.slots[:, 0], branch)
     assert forked == isinstance(rule, KeepBest)
-    counted = result.scores != ENDED
+    counted = result.alive[..., None].expand_as(result.scores)
     assert counted[0].all()
     assert not counted[1].all()
     total = result.scores[counted].mean()
@@ -358,3 +359,26 @@ def test_a_logit_without_agents_is_one_entry(reduction):
         with pytest.raises(ValueError, match="shape"):
             loss(start.copy().set("mask", torch.ones(5, 3, dtype=torch.bool)))
     torch.testing.assert_close(found[0], found[1])
+
+
+def test_an_episode_ends_once():
+    """An environment that comes back into its bounds is scored like one that stays out."""
+    net = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
+    policy = ProbabilisticTensorDictSequential(
+        TensorDictModule(net, ["place"], ["loc", "scale"]),
+        ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=IndependentNormal),
+    )
+    far = TensorDictModule(lambda place: place[..., 0].abs(), ["place"], ["score"])
+    start = with_rows(Mass(), [30]).reset()
+    values = []
+    for sticky in (True, False):
+        torch.manual_seed(0)
+        loss = MGAILLoss(
+            policy, far, Mass(sticky=sticky), horizon=12, reduction="none", use_mask=False, cost="logit"
+        )
+        loss.set_keys(score="score")
+        values.append(loss(start)["loss_mgail"].detach())
+    assert torch.equal(*values)
+    assert (values[0] > 1.5).any()
+    over = (values[0] > 1.5).cumsum(-1)
+    assert (values[0][over > 1] == 0).all()

@@ -1,4 +1,4 @@
-"""Beam search over simulated futures, and backtracking in them, as a function and as a TorchRL collector.
+"""Beam search over simulated futures, and backtracking in them, as a function, a TorchRL collector and a planner.
 
 Works with environments that keep all of their state in the TensorDict, whatever they simulate; not with those that
 wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (ParallelEnv).
@@ -7,24 +7,36 @@ wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (Paralle
 from __future__ import annotations
 
 from symphony.collectors.backtracking import Backtrack
-from symphony.collectors.beam_search import beam_search
+from symphony.collectors.beam_search import BeamSearchResult, beam_search, lineage
 from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
-from symphony.collectors.result import BeamSearchResult, lineage
-from symphony.collectors.rules import GroupRule, KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
+from symphony.collectors.planner import BeamSearchPlanner
+from symphony.collectors.rules import (
+    KeepAll,
+    KeepBest,
+    PruningRule,
+    ReplaceBad,
+    Resampling,
+    Residual,
+    Stratified,
+    Systematic,
+)
 from symphony.collectors.scores import Aggregate, KeyScore, max_then_sum, mean_then_sum
 
 __all__ = [
     "Aggregate",
     "Backtrack",
     "BeamSearchCollector",
+    "BeamSearchPlanner",
     "BeamSearchResult",
-    "GroupRule",
     "KeepAll",
     "KeepBest",
     "KeyScore",
     "PruningRule",
     "ReplaceBad",
+    "Resampling",
+    "Residual",
+    "Stratified",
     "Systematic",
     "beam_search",
     "branch",

@@ -12,18 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Int
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from symphony.collectors._rows import take, take_values
-from symphony.errors import ConfigError
-
-if TYPE_CHECKING:
-    from tensordict import NestedKey
+from symphony.collectors.branching import take, take_values
 
 Renew = Callable[[TensorDictBase, Tensor], TensorDictBase]
 
@@ -56,11 +52,11 @@ class Backtrack:
 
     def __post_init__(self) -> None:
         if not self.back or min(self.back) < 0 or self.back[0] < 1:
-            raise ConfigError(f"back is periods, the first at least 1, is {self.back}")
+            raise ValueError(f"back is periods, the first at least 1, is {self.back}")
         if self.width is not None and self.width < 1:
-            raise ConfigError(f"width must be at least 1 line, is {self.width}")
+            raise ValueError(f"width must be at least 1 line, is {self.width}")
         if not self.cap >= 0 or self.threshold != self.threshold:  # NaN
-            raise ConfigError(f"cap and threshold must be numbers, are {self.cap} and {self.threshold}")
+            raise ValueError(f"cap and threshold must be numbers, are {self.cap} and {self.threshold}")
 
 
 class Course:
@@ -96,87 +92,101 @@ class Course:
         return goes
 
 
-class Lines(NamedTuple):
-    """What became of the lines [*b, S] in T steps.
+class Run(NamedTuple):
+    """A period of branches [*b, S] (of lines [R, 1]) as simulated.
 
     Attributes:
-        steps: [*b, S, T] kept entries.
-        scores: [*b, S, T, N].
-        totals: [*b, P, S].
-        simulated: line-steps, those that were done again included.
+        records: T_p steps, kept entries.
+        scores: [*b, S, T_p, N], 0 after the end of an episode.
+        alive: [*b, S, T_p, K] steps before (and with) the end of the episode of each agent, or of all (K = 1).
+        ended: [*b, S, K] whose episodes have ended.
+        after: the last states.
     """
 
-    steps: TensorDictBase
+    records: list[TensorDictBase]
     scores: Tensor
-    totals: Tensor
-    simulated: int
+    alive: Tensor
+    ended: Tensor
+    after: TensorDictBase
 
 
 @torch.no_grad()
 def follow(
-    simulate: Callable[[TensorDictBase, int], tuple[list[TensorDictBase], Tensor, Tensor, TensorDictBase]],
-    aggregate: Callable[[Tensor], Tensor],
+    simulate: Callable[[TensorDictBase, Tensor, int], Run],
+    total: Callable[..., Tensor],
     start: TensorDictBase,
+    ended: Bool[Tensor, "*b S K"],
     rule: Backtrack,
     steps: int,
     every: int,
-) -> Lines:
+) -> tuple[TensorDictBase, Tensor, Tensor, Tensor, int]:
     """Simulate lines [*b, S] until all have come to their ends.
 
+    Returns their kept entries and scores [*b, S, T, N], which steps counted [*b, S, T], totals [*b, P, S], and how
+    many line-steps were simulated, those that were done again included.
+
     Args:
-        simulate: steps of lines [R, 1]: their records, scores [R, 1, T_p, N], totals [R, 1] and the last states.
-        aggregate: of scores, for a last period that is shorter.
+        simulate: steps of lines [R, 1] that may have ended [R, 1, K].
+        total: of a run [R, 1], or of its first steps alone.
         start: [*b, S].
+        ended: whose episodes have ended before they begin.
         rule: when lines go back, and how far.
         steps: T.
         every: T_p.
     """
-    lines, device = start.numel(), start.get(next(iter(start.keys(True, True)))).device
+    lines, device = start.numel(), ended.device
     periods, short = -(-steps // every), steps % every
     entries, length = list(start.keys(True, True)), periods * every
     course = Course(rule, lines, periods, device)
     everyone = torch.arange(lines, device=device)
     line = everyone[: rule.width]
-    now, simulated = take(start, line[:, None]), line.new_zeros(())
-    begun = len(line)
+    now, over = take(start, line[:, None]), take_values(ended, line[:, None], start.ndim)
+    simulated, begun = line.new_zeros(()), len(line)
     history: TensorDictBase | None = None
     while len(line):
         at = course.at[line]
-        records, scores, totals, after = simulate(now, every)
+        run = simulate(now, over, every)
+        totals = total(run)[:, 0]
         ending = (at == periods - 1) & (short > 0)
         if short:
             # The last period is simulated as long as the others: what lies past its end is neither counted nor kept.
-            totals = torch.where(ending[:, None], aggregate(scores[..., :short, :].contiguous()), totals)
+            totals = torch.where(ending, total(run, short)[:, 0], totals)
         simulated = simulated + every * len(line) - ending.sum() * (every - short)
+        alive = run.alive.any(-1)
         if history is None:
             nowhere = line.new_zeros(lines * length)
-            history = take(records[0], nowhere)
-            all_scores, all_totals = scores[:, 0, 0][nowhere], totals[:, 0][nowhere[: lines * periods]]
+            history = take(run.records[0], nowhere)
+            all_scores, all_totals = run.scores[:, 0, 0][nowhere], totals[nowhere[: lines * periods]]
+            all_alive = alive[:, 0, 0][nowhere]
         place = (line * periods + at) * every
-        for k, record in enumerate(records):
+        for k, record in enumerate(run.records):
             _write(history, place + k, record)
-            all_scores.index_copy_(0, place + k, scores[:, 0, k])
-        all_totals.index_copy_(0, line * periods + at, totals[:, 0])
-        goes = course.judge(line, ~(totals[:, 0] <= rule.threshold)).nonzero().squeeze(-1)
-        now = after.select(*entries)
+            all_scores.index_copy_(0, place + k, run.scores[:, 0, k])
+            all_alive.index_copy_(0, place + k, alive[:, 0, k])
+        all_totals.index_copy_(0, line * periods + at, totals)
+        # An episode that has ended can't be bad any more; who goes back goes to before its end.
+        goes = course.judge(line, ~(totals <= rule.threshold) & alive[:, 0, 0]).nonzero().squeeze(-1)
+        now, over = run.after.select(*entries), run.ended.index_fill(0, goes, False)
         if len(goes):
             who = line[goes]
             root = take(history.exclude("next"), ((who * periods + course.at[who]) * every)[:, None])
             root = root if rule.renew is None else rule.renew(root, course.times[who])
             now = _with_rows(now, goes, root, entries)
         on = (course.at[line] < periods).nonzero().squeeze(-1)
-        ended = len(line) - len(on)
-        if ended:
-            line, now = line[on], take(now, on[:, None])
-        if ended and begun < lines:
-            others = everyone[begun : begun + ended]
+        finished = len(line) - len(on)
+        if finished:
+            line, now, over = line[on], take(now, on[:, None]), over[on]
+        if finished and begun < lines:
+            others = everyone[begun : begun + finished]
             line, begun = torch.cat([line, others]), begun + len(others)
             now = torch.cat([now, take(start, others[:, None]).select(*entries)])
+            over = torch.cat([over, take_values(ended, others[:, None], start.ndim)])
     assert history is not None  # noqa: S101  (a search has a line and a step)
     order = torch.arange(lines * length, device=device).reshape(*start.shape, length)[..., :steps]
-    return Lines(
+    return (
         take(history, order),
         take_values(all_scores, order, 1),
+        take_values(all_alive, order, 1),
         all_totals.reshape(*start.shape, periods).transpose(-1, -2),
         int(simulated),
     )
@@ -198,9 +208,7 @@ def _with_rows(
     for key in entries:
         value = other.get(key, None)
         if value is None:
-            raise ConfigError(
-                f"lines can't go back: their kept states have no {key!r}, and `renew` gave none"
-            )
+            raise ValueError(f"lines can't go back: their kept states have no {key!r}, and `renew` gave none")
         # Not in place: an environment may hand out one tensor for several states.
         state.set(key, state.get(key).index_copy(0, rows, value))
     return state

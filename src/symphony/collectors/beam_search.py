@@ -9,33 +9,92 @@ environment that can be branched, see :func:`symphony.collectors.branching.check
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from symphony.collectors._rows import take, take_values
-from symphony.collectors.backtracking import Backtrack, Lines, follow
-from symphony.collectors.branching import check_branching
-from symphony.collectors.result import BeamSearchResult, lineage, ranking
-from symphony.collectors.rules import (
-    GroupRule,
-    KeepBest,
-    PruningRule,
-    group_members,
-    prune,
-    takes_groups,
+from symphony.collectors.backtracking import Backtrack, Run, follow
+from symphony.collectors.branching import (
+    below,
+    branched_env,
+    branched_specs,
+    check_branching,
+    last_name,
+    recall,
+    take,
+    take_values,
 )
-from symphony.collectors.scores import max_then_sum
-from symphony.errors import ConfigError
+from symphony.collectors.pruning import Pruning
+from symphony.collectors.rules import KeepBest, PruningRule, sample_size
+from symphony.collectors.scores import Aggregate, max_then_sum
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Score = Callable[[TensorDictBase], Tensor]
 Aggregation = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class BeamSearchResult:
+    """What a search found: *b rows, S branches, L leaves, T steps in P periods, N agents.
+
+    A *leaf* is what a slot holds at the end; its history was simulated in other slots before each fork. All S
+    leaves come in the order of their slots: with :class:`KeepBest`, slot 0 holds the best of the last period.
+
+    Attributes:
+        trajectories: [*b, L, T] of the leaves, laid out and named as by ``env.rollout``, kept entries only.
+        scores: [*b, L, T, N] of the leaves' histories; `scores[..., t, :]` is of ``("next", ...)`` of step t, 0 after
+            the end of an episode.
+        alive: [*b, L, T] steps before (and with) the end of their episodes.
+        slots: [*b, P, L] int64, the slot in which each period of each leaf's history was simulated.
+        totals: [*b, P, S] aggregate of each period, by the slot that simulated it.
+        parents: [*b, P, S] int64; after period p slot s was continued from slot `parents[..., p, s]`. The last
+            row is the identity if the last period was not pruned.
+        simulated_scores: [*b, S, T, N] by the slot that simulated the step, the pruned ones included.
+        tree: [*b, S, T] all simulated steps by slot, if asked for.
+        prune_every: T_p; the last period may be shorter.
+        simulated_steps: branch-steps that were simulated.
+        leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended.
+        log_weights: [*b, P, S] of a :class:`Resampling` rule, before each pruning: minus the totals since the row was
+            last resampled, by the temperature; None with other rules, like the following.
+        leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 where it resampled.
+        log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
+            bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
+    """
+
+    trajectories: TensorDictBase
+    scores: Float[Tensor, "*b L T N"]
+    alive: Bool[Tensor, "*b L T"]
+    slots: Int[Tensor, "*b P L"]
+    totals: Float[Tensor, "*b P S"]
+    parents: Int[Tensor, "*b P S"]
+    simulated_scores: Float[Tensor, "*b S T N"]
+    tree: TensorDictBase | None
+    prune_every: int
+    simulated_steps: int
+    leaf_costs: Float[Tensor, "*b L"] | None = None
+    log_weights: Float[Tensor, "*b P S"] | None = None
+    leaf_log_weights: Float[Tensor, "*b L"] | None = None
+    log_evidence: Float[Tensor, "*b"] | None = None
+
+    @property
+    def leaf_totals(self) -> Float[Tensor, "*b P L"]:
+        """Totals of the periods of each leaf's history."""
+        return self.totals.gather(-1, self.slots)
+
+    @property
+    def sample_size(self) -> Float[Tensor, "*b P"] | None:
+        """Effective sample size before each pruning, between 1 and S."""
+        return None if self.log_weights is None else sample_size(self.log_weights)
+
+    @property
+    def descendants(self) -> Int[Tensor, "*b P S"]:
+        """How many of the leaves have what a slot simulated in a period in their history."""
+        return torch.zeros_like(self.parents).scatter_add(-1, self.slots, torch.ones_like(self.slots))
 
 
 def beam_search(
@@ -46,16 +105,18 @@ def beam_search(
     *,
     steps: int,
     prune_every: int = 10,
-    rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
+    rule: PruningRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
     aggregate: Aggregation = max_then_sum,
+    value: Score | None = None,
+    accumulate: bool = False,
     prune_last: bool = True,
-    noise: Float[Tensor, "*b P"] | None = None,
+    until_done: bool = True,
+    noise: Float[Tensor, "*b P"] | Float[Tensor, "*b P S"] | None = None,
     slot_keys: Sequence[NestedKey] = (),
     group_key: NestedKey | None = None,
     keep: Sequence[NestedKey] | None = None,
     keep_tree: bool = False,
     leaves: int | None = None,
-    last_period: Int[Tensor, "*b"] | None = None,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
     """Search an environment whose whole state is in the TensorDict (no GymEnv, VmasEnv, SerialEnv or ParallelEnv).
@@ -63,12 +124,13 @@ def beam_search(
     S branches are simulated per row, and those with high scores make room for copies of the others.
 
     Gradients flow through environment, policy and scores unless the caller turns them off, along the history of
-    each leaf; no tensor is changed in place. The end of an episode changes nothing: every branch runs for
-    `steps` steps, and a score that should not count what follows the end must be 0 there.
+    each leaf; no tensor is changed in place. An episode ends once, with the first ``done`` (terminated or truncated):
+    its branch is simulated on, since all have one length, but later steps have a score of 0, count in no maximum or
+    mean, and rows whose branches have all ended are pruned no more.
 
     Args:
-        env: accepts any batch shape (``batch_size=[]``, ``batch_locked=False``); random numbers of its own are
-            allowed, memory is not.
+        env: accepts any batch shape, or any that begins with its own; random numbers of its own are allowed, memory
+            is not. Its transforms are applied to the branches.
         policy: writes the action into the TensorDict it is given.
         score: of the state after a step, [*b, S, N] or [*b, S]; high is bad, padded agents 0. It gets the next
             state with reward and action, and must not write into it.
@@ -77,84 +139,83 @@ def beam_search(
         prune_every: T_p, steps per period.
         rule: which branches go on, see :mod:`symphony.collectors.rules`; or :class:`Backtrack`, with which nothing is
             copied: branches are independent lines that go back where they are bad. That takes no gradients and gives
-            all leaves, and what is said below of slots, groups and noise has no meaning for it.
-        aggregate: any function of the scores of a period [*b, S, T_p, N] that gives totals [*b, S], e.g.
-            ``lambda scores: scores.amax((-1, -2))``; see :class:`symphony.collectors.Aggregate`.
+            all leaves, and what is said below of slots, groups, values and noise has no meaning for it.
+        aggregate: of the scores of a period [*b, S, T_p, N] to totals [*b, S]: an :class:`Aggregate`, which leaves
+            out steps after an end, or any function, e.g. ``lambda scores: scores.amax((-1, -2))``.
+        value: of the state after a period, [*b, S] in the units of the totals and high where much is still to come
+            that is bad; added to what the rule sees of branches whose episode goes on.
+        accumulate: the rule sees the sum of the totals of a branch's whole history, not those of the period alone.
         prune_last: prune after the last period too.
-        noise: numbers in [0, 1) for rules that draw, one per row and period.
+        until_done: False if ends of episodes are to change nothing at all.
+        noise: numbers in [0, 1) for rules that draw, one per row and period, or for each slot where a rule says
+            ``noise_per_slot``.
         slot_keys: entries that stay in their slot when a branch is copied, such as the identity of a stream of
             random numbers: otherwise copies of one branch that draw from it would all do the same.
-        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree; branches compete only with those
-            of the same group. A :class:`GroupRule` may mix groups; a copy is then of its parent's group.
+        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree, for a rule that
+            takes groups. A copy is
+            of its parent's group.
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
-        leaves: return only so many, the best of the last period first; default all, in the order of their slots.
-        last_period: [*b] number of the period that is the last for `leaves`, where rows end sooner than others.
+        leaves: return only so many, the best of the last period in which the row had not ended first; default all,
+            in the order of their slots.
         exploration_type: under which the policy runs.
 
     Raises:
-        ConfigError: for an environment that can't be branched, arguments that contradict each other or shapes that
+        ValueError: for an environment that can't be branched, arguments that contradict each other or shapes that
             do not fit.
     """
     _check(start, steps, prune_every, leaves)
-    if last_period is not None and last_period.shape != start.shape[:-1]:
-        raise ConfigError(f"last_period is {list(last_period.shape)}, rows are {list(start.shape[:-1])}")
     check_branching(env, start)
-    if isinstance(rule, Backtrack):
-        if leaves not in (None, start.shape[-1]):
-            raise ConfigError("rule Backtrack gives all branches as leaves")
-        with set_exploration_type(exploration_type):
-            lines = follow(
-                lambda now, length: _simulate(env, policy, score, now, length, aggregate, keep),
-                aggregate,
-                start,
-                rule,
-                steps,
-                prune_every,
-            )
-        return _independent(lines, prune_every, keep_tree)
-    groups = None if group_key is None else _groups(start, group_key)
-    members = None if groups is None or takes_groups(rule) else group_members(groups)
-    periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
-    noises = _noises(noise, start, len(periods))
+    branches = branched_env(env, start.shape)
 
-    now = start
-    records: list[TensorDictBase] = []
-    scores, totals, parents = [], [], []
-    simulated = 0
-    with set_exploration_type(exploration_type):
+    def simulate(now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
+        there = branches if now.shape == start.shape else branched_env(env, now.shape)
+        return _simulate(there, policy, score, now, ended, length, keep, until_done)
+
+    def total(run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
+        return _total(aggregate, run.scores[..., :length, :], run.alive[..., :length, :])
+
+    ended = _ended(env, start, start.ndim)
+    with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
+        if isinstance(rule, Backtrack):
+            if leaves not in (None, start.shape[-1]):
+                raise ValueError("rule Backtrack gives all branches as leaves")
+            return _independent(
+                follow(simulate, total, start, ended, rule, steps, prune_every), prune_every, keep_tree
+            )
+        periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
+        pruning = Pruning(start, rule, len(periods), group_key=group_key, noise=noise, accumulate=accumulate)
+        now, records, scores, alive = start, [], [], []
         for period, length in enumerate(periods):
-            run = _simulate(env, policy, score, now, length, aggregate, keep)
-            simulated += length * start.numel()
+            run = simulate(now, ended, length)
             records += run.records
             scores.append(run.scores)
-            totals.append(run.totals)
+            alive.append(run.alive)
+            worth = None if value is None else torch.where(run.ended.all(-1), 0.0, value(run.after)).detach()
             last = period == len(periods) - 1
-            if last and not prune_last:
-                parents.append(torch.arange(start.shape[-1], device=run.totals.device).expand(start.shape))
-                break
-            parents.append(prune(rule, run.totals.detach(), noises[period], members, groups))
-            groups = None if groups is None else groups.gather(-1, parents[-1])
+            active = run.alive[..., 0, :].any(-1).any(-1)
+            parents = pruning.prune(total(run), active, worth, keep_all=last and not prune_last)
             if not last:
-                now = _fork(run.after, parents[-1], slot_keys)
+                now, ended = _fork(run.after, run.ended, parents, slot_keys)
+            del run  # or its last states live through the next period
 
     tree = TensorDict.stack(records, -1)
     del records
-    simulated_scores, all_totals, all_parents = (
-        torch.cat(scores, -2),
-        torch.stack(totals, -2),
-        torch.stack(parents, -2),
+    simulated_scores, counted = torch.cat(scores, -2), torch.cat(alive, -2).any(-1)
+    totals, seen, parents = (
+        torch.stack(part, -2) for part in (pruning.totals, pruning.seen, pruning.parents)
     )
-    slots = lineage(all_parents)
+    slots, weights = lineage(parents), pruning.last_weights()
+    log_weight, evidence = weights if weights is not None else (None, None)
+    # In later periods all branches of a row that has ended are equal.
+    last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)
+    costs, named = (_period(part, last_period) for part in (seen, slots))
+    costs = costs.gather(-1, named)
     if leaves is not None:
-        ended = (
-            torch.full(start.shape[:-1], len(periods) - 1, device=slots.device)
-            if last_period is None
-            else last_period
-        )
-        last_totals, last_slots = (_period(part, ended) for part in (all_totals.detach(), slots))
-        best = ranking(last_totals, last_slots)[..., :leaves]
+        best = ranking(costs, named)[..., :leaves]
         slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
+        costs = costs.gather(-1, best)
+        log_weight = None if log_weight is None else log_weight.gather(-1, best)
     steps_at = _step_rows(slots, start.shape[-1], periods)
     trajectories = take(tree, steps_at)
     trajectories.refine_names(..., "time")
@@ -162,31 +223,30 @@ def beam_search(
     return BeamSearchResult(
         trajectories=trajectories,
         scores=take_values(simulated_scores, steps_at, tree.batch_dims),
+        alive=take_values(counted, steps_at, tree.batch_dims),
         slots=slots,
-        totals=all_totals,
-        parents=all_parents,
+        totals=totals,
+        parents=parents,
         simulated_scores=simulated_scores,
         tree=tree if keep_tree else None,
         prune_every=prune_every,
-        simulated_steps=simulated,
+        simulated_steps=start.numel() * steps,
+        leaf_costs=costs,
+        log_weights=torch.stack(pruning.log_weights, -2) if pruning.log_weights else None,
+        leaf_log_weights=log_weight,
+        log_evidence=evidence,
     )
 
 
-def _independent(lines: Lines, prune_every: int, keep_tree: bool) -> BeamSearchResult:
+def _independent(
+    lines: tuple[TensorDictBase, Tensor, Tensor, Tensor, int], prune_every: int, keep_tree: bool
+) -> BeamSearchResult:
     """Lines as the leaves of a search in which every branch goes on from itself."""
-    slots = torch.arange(lines.totals.shape[-1], device=lines.totals.device).expand(lines.totals.shape)
-    lines.steps.refine_names(..., "time")
-    return BeamSearchResult(
-        trajectories=lines.steps,
-        scores=lines.scores,
-        slots=slots,
-        totals=lines.totals,
-        parents=slots,
-        simulated_scores=lines.scores,
-        tree=lines.steps.copy() if keep_tree else None,
-        prune_every=prune_every,
-        simulated_steps=lines.simulated,
-    )
+    steps, scores, alive, totals, simulated = lines
+    slots = torch.arange(totals.shape[-1], device=totals.device).expand(totals.shape)
+    steps.refine_names(..., "time")
+    tree = steps.copy() if keep_tree else None
+    return BeamSearchResult(steps, scores, alive, slots, totals, slots, scores, tree, prune_every, simulated)
 
 
 def _period(values: Shaped[Tensor, "*b P S"], number: Int[Tensor, "*b"]) -> Shaped[Tensor, "*b S"]:
@@ -204,22 +264,13 @@ def score_state(
     """
     seen = now.copy()
     for key in env.reward_keys:
-        seen.set(key, stepped.get(("next", key) if isinstance(key, str) else ("next", *key)))
+        seen.set(key, stepped.get(below(key)))
     values = score(seen)
     values = values.unsqueeze(-1) if values.shape == now.shape else values
     if values.ndim != now.ndim + 1 or values.shape[:-1] != now.shape:
         expected = ", ".join(map(str, now.shape))
-        raise ConfigError(f"scores must be [{expected}] or [{expected}, agents], are {list(values.shape)}")
+        raise ValueError(f"scores must be [{expected}] or [{expected}, agents], are {list(values.shape)}")
     return values if values.is_floating_point() else values.float()
-
-
-class _Run(NamedTuple):
-    """A period of length T_p as simulated, by slot."""
-
-    records: list[TensorDictBase]
-    scores: Float[Tensor, "*b S T N"]
-    totals: Float[Tensor, "*b S"]
-    after: TensorDictBase
 
 
 def _simulate(
@@ -227,39 +278,71 @@ def _simulate(
     policy: Policy,
     score: Score,
     now: TensorDictBase,
+    ended: Bool[Tensor, "*b S K"],
     length: int,
-    aggregate: Aggregation,
     keep: Sequence[NestedKey] | None,
-) -> _Run:
+    until_done: bool,
+) -> Run:
+    recall(env, now)
     # Policy and environment write into the TensorDict they are given.
-    now, records, scores = now.copy(), [], []
+    now, records, scores, ends = now.copy(), [], [], [ended]
     for _ in range(length):
         stepped = env.step(policy(now))
         now = env.step_mdp(stepped)
         records.append(stepped if keep is None else stepped.select(*keep))
         scores.append(score_state(env, score, stepped, now))
+        ends.append(_ended(env, stepped.get("next"), now.ndim))
         del stepped  # or one more set of observations lives through the next step
     joined = torch.stack(scores, -2)
-    totals = aggregate(joined)
-    if totals.shape != now.shape:
-        raise ConfigError(f"the aggregate must be {tuple(now.shape)}, is {tuple(totals.shape)}")
-    return _Run(records, joined, totals, now)
+    if not until_done:
+        alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
+        return Run(records, joined, alive, ended, now)
+    over = torch.stack(ends, -2).cumsum(-2) > 0
+    alive = ~over[..., :-1, :]
+    if alive.shape[-1] not in (1, joined.shape[-1]):
+        alive = alive.any(-1, keepdim=True)
+    return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now)
+
+
+def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b S K"]:
+    """Whether the episode is done, for each of K agents where they end apart and for all (K = 1) where together."""
+    names = [key if isinstance(key, tuple) else (key,) for key in env.done_keys if last_name(key) == "done"]
+    # As TorchRL has it, the end of a group is that of all that is nested in it.
+    outer = [
+        key for key in names if not any(len(o) < len(key) and key[: len(o) - 1] == o[:-1] for o in names)
+    ]
+    flags = [state.get(key).flatten(batch) for key in outer if state.get(key, None) is not None]
+    if not flags:
+        return torch.zeros(*state.shape[:batch], 1, dtype=torch.bool, device=state.device)
+    if len({flag.shape for flag in flags}) > 1:
+        flags = [flag.any(-1, keepdim=True) for flag in flags]
+    return torch.stack(flags).any(0)
+
+
+def _total(
+    aggregate: Aggregation, scores: Float[Tensor, "*b S T N"], alive: Bool[Tensor, "*b S T K"]
+) -> Float[Tensor, "*b S"]:
+    found = aggregate(scores, alive) if isinstance(aggregate, Aggregate) else aggregate(scores)
+    if found.shape != scores.shape[:-2]:
+        raise ValueError(f"the aggregate must be {tuple(scores.shape[:-2])}, is {tuple(found.shape)}")
+    return torch.where(alive[..., 0, :].any(-1), found, 0.0)
 
 
 def _fork(
-    state: TensorDictBase, parents: Int[Tensor, "*b S"], slot_keys: Sequence[NestedKey]
-) -> TensorDictBase:
+    state: TensorDictBase,
+    ended: Bool[Tensor, "*b S K"],
+    parents: Int[Tensor, "*b S"],
+    slot_keys: Sequence[NestedKey],
+) -> tuple[TensorDictBase, Bool[Tensor, "*b S K"]]:
+    """The states of the parents, but for entries that stay in their slots, and whether they have ended."""
     branches = parents.shape[-1]
     # Places in the flattened [*b, S]: of the first branch of each row, and of the parents beside it.
     first = torch.arange(0, parents.numel(), branches, device=parents.device)
     rows = first.reshape(*parents.shape[:-1], 1) + parents
-    return _set_slots(take(state, rows), state, slot_keys)
-
-
-def _set_slots(state: TensorDictBase, slots: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
-    for key in keys:
-        state.set(key, slots.get(key))
-    return state
+    forked = take(state, rows)
+    for key in slot_keys:
+        forked.set(key, state.get(key))
+    return forked, take_values(ended, rows, parents.ndim)
 
 
 def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) -> Int[Tensor, "*b L T"]:
@@ -272,37 +355,26 @@ def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) 
     return (row * branches + slot) * steps + torch.arange(steps, device=device)
 
 
-def _groups(start: TensorDictBase, key: NestedKey) -> Int[Tensor, "*b S"]:
-    """The group of each branch: its number, or the first branch that agrees with it in all of its numbers."""
-    value = start.get(key)
-    if value is None:
-        raise ConfigError(f"the start state has no entry {key!r}")
-    if value.is_floating_point() or value.shape[: start.ndim] != start.shape or value.ndim > start.ndim + 1:
-        raise ConfigError(f"{key!r} must hold integers, one or some per branch, is {list(value.shape)}")
-    if value.ndim == start.ndim:
-        return value
-    return (value[..., :, None, :] == value[..., None, :, :]).all(-1).int().argmax(-1)
-
-
-def _noises(
-    noise: Float[Tensor, "*b P"] | None, start: TensorDictBase, periods: int
-) -> Sequence[Float[Tensor, "*b"] | None]:
-    if noise is None:
-        return [None] * periods
-    if noise.shape != (*start.shape[:-1], periods):
-        raise ConfigError(f"noise must be {[*start.shape[:-1], periods]}, is {list(noise.shape)}")
-    return noise.unbind(-1)
-
-
-def _check(
-    start: TensorDictBase,
-    steps: int,
-    prune_every: int,
-    leaves: int | None,
-) -> None:
+def _check(start: TensorDictBase, steps: int, prune_every: int, leaves: int | None) -> None:
     if not start.batch_dims or not start.numel():
-        raise ConfigError(f"the start state must have rows and branches, its batch is {list(start.shape)}")
+        raise ValueError(f"the start state must have rows and branches, its batch is {list(start.shape)}")
     if steps < 1 or prune_every < 1:
-        raise ConfigError(f"steps and prune_every must be positive, are {steps} and {prune_every}")
+        raise ValueError(f"steps and prune_every must be positive, are {steps} and {prune_every}")
     if leaves is not None and not 1 <= leaves <= start.shape[-1]:
-        raise ConfigError(f"leaves must be 1 ... {start.shape[-1]} branches, is {leaves}")
+        raise ValueError(f"leaves must be 1 ... {start.shape[-1]} branches, is {leaves}")
+
+
+def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
+    """The slot that held, during each of the P periods, what each of the S slots holds after the last pruning."""
+    slots = [parents[..., -1, :]]
+    for period in reversed(range(parents.shape[-2] - 1)):
+        slots.append(parents[..., period, :].gather(-1, slots[-1]))
+    return torch.stack(slots[::-1], -2)
+
+
+def ranking(costs: Float[Tensor, "*b L"], slots: Int[Tensor, "*b L"]) -> Int[Tensor, "*b L"]:
+    """Leaves from best to worst by their costs, repeated copies of one slot after all others."""
+    # Two stable sorts: by cost, then by how many copies of the same history come before.
+    copies = (slots[..., :, None] == slots[..., None, :]).tril(-1).sum(-1)
+    order = costs.argsort(dim=-1, stable=True)
+    return order.gather(-1, copies.gather(-1, order).argsort(dim=-1, stable=True))

@@ -1,19 +1,30 @@
-"""Which environments can be branched, and how a batch of rows and branches is made of one."""
+"""Environments in several copies: which can be branched, in which batch shape they are, and rows of their states."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 from weakref import WeakSet
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.envs import BatchSizeTransform, Compose, EnvBase, TransformedEnv
-
-from symphony.errors import ConfigError
+from jaxtyping import Int, Shaped
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Composite
+from torchrl.envs import (
+    BatchSizeTransform,
+    CatFrames,
+    Compose,
+    EnvBase,
+    TensorDictPrimer,
+    Transform,
+    TransformedEnv,
+    VecNormV2,
+)
 
 _PASSED: WeakSet[EnvBase] = WeakSet()
+"""Environments that have been tried and found to remember nothing."""
 
 
 def branch(tensordict: TensorDictBase, branches: int) -> TensorDictBase:
@@ -21,47 +32,227 @@ def branch(tensordict: TensorDictBase, branches: int) -> TensorDictBase:
     return tensordict.unsqueeze(-1).expand(*tensordict.batch_size, branches)
 
 
+class BatchedEnv(EnvBase):
+    """A view of an environment in which its specs have a batch size; the environment itself is left as it is.
+
+    Args:
+        env: steps any batch shape that begins with its own batch size.
+        batch_size: of the view, with the environment's own in front.
+    """
+
+    # Or TorchRL would step some rows alone, where others have ended, and take their specs for those of all.
+    batch_locked = True
+
+    def __init__(self, env: EnvBase, batch_size: Sequence[int]) -> None:
+        super().__init__(device=env.device, batch_size=torch.Size(batch_size))
+        self.inner = env
+        self._supports_set_state = env._supports_set_state
+        own, shape = env.batch_size, self.batch_size
+        self.observation_spec = expanded_spec(env.full_observation_spec, own, shape)
+        self.state_spec = expanded_spec(env.full_state_spec, own, shape)
+        self.action_spec = expanded_spec(env.full_action_spec, own, shape)
+        self.reward_spec = expanded_spec(env.full_reward_spec, own, shape)
+        self.done_spec = expanded_spec(env.full_done_spec, own, shape)
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if name == "inner" or name.startswith("_"):
+                raise
+            return getattr(self.inner, name)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if tensordict is None:
+            # Thrown away. BatchSizeTransform resets once for nothing, too, and seeds are to mean what they meant.
+            self.inner._reset(None, **kwargs)
+            tensordict = TensorDict({}, self.batch_size, device=self.device)
+        found = self.inner._reset(tensordict, **kwargs)
+        if found.batch_size != self.batch_size:
+            # It looks at nothing but its own batch size, or takes an empty TensorDict for none.
+            more = self.batch_size[len(self.inner.batch_size) :].numel()
+            each = [found, *(self.inner._reset(None, **kwargs) for _ in range(more - 1))]
+            dim = self.inner.batch_dims
+            found = torch.stack(each, dim).reshape(self.batch_size)
+        return found
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.inner._step(tensordict)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.inner._set_seed(seed)
+
+    def to(self, device: torch.device | str | int) -> BatchedEnv:
+        """Move the environment, too."""
+        self.inner = self.inner.to(device)
+        return super().to(device)
+
+
+def expanded_spec(spec: Composite, own: torch.Size, shape: torch.Size) -> Composite:
+    """A spec of batch size `own` with the batch size `shape`, which begins with `own`."""
+    if spec.shape != own:
+        spec = spec.clone()
+        spec.shape = own
+    if own:
+        for _ in range(len(shape) - len(own)):
+            spec = spec.unsqueeze(len(own))
+    return spec.expand(*shape) if shape else spec.clone()
+
+
+def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
+    """Give an environment that accepts any batch shape a fixed one, each row with a start of its own.
+
+    Transforms of the environment are applied to the batch; others may be appended. (A bare
+    ``BatchSizeTransform(batch_size=...)`` resets once and starts all rows from the same state.)
+    """
+    base, transforms = _parts(env)
+    _check_shape(base, torch.Size(batch_size))
+    rows = BatchedEnv(base, batch_size)
+    return TransformedEnv(rows, Compose(*(transform.clone() for transform in transforms)))
+
+
+def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> EnvBase:
+    """The environment for states of a batch shape [*b, S], its transforms included.
+
+    Args:
+        env: with rows [*b], or for any batch shape.
+        shape: of the states.
+        share: what its transforms learn, such as the statistics of VecNorm, is one with the environment's; else it is
+            a copy of its own, and frozen.
+
+    Raises:
+        ValueError: if it can't be branched.
+    """
+    base, transforms = _parts(env)
+    _check_shape(base, torch.Size(shape))
+    if not transforms and not base.batch_size:
+        return base
+    copies = []
+    for number, transform in enumerate(transforms):
+        _check_transform(transform, transforms[number + 1 :])
+        copy = Transform.clone(transform) if share else transform.clone()
+        if isinstance(copy, TensorDictPrimer) and copy.primers.shape == env.batch_size:
+            # It adds the batch of its environment to its specs, but can't replace another one.
+            copy.primers = (
+                copy.primers[(0,) * len(env.batch_size)] if env.batch_size else copy.primers.clone()
+            )
+        if isinstance(copy, VecNormV2) and not share:
+            copy.freeze()
+        copies.append(copy)
+    return TransformedEnv(BatchedEnv(base, shape), Compose(*copies))
+
+
+def _parts(env: EnvBase) -> tuple[EnvBase, list[Transform]]:
+    """The innermost environment and the transforms around it, those that only give it a batch size left out."""
+    transforms: list[Transform] = []
+    while isinstance(env, TransformedEnv):
+        transforms = [*_flat(env.transform), *transforms]
+        env = env.base_env
+    env = env.inner if isinstance(env, BatchedEnv) else env
+    return env, [one for one in transforms if not isinstance(one, BatchSizeTransform)]
+
+
+def innermost(env: EnvBase) -> EnvBase:
+    """The environment without transforms and rows."""
+    return _parts(env)[0]
+
+
+def _flat(transform: Transform) -> list[Transform]:
+    if isinstance(transform, Compose):
+        return [part for one in transform for part in _flat(one)]
+    return [transform]
+
+
+def _check_shape(base: EnvBase, shape: torch.Size) -> None:
+    if base.batch_locked:
+        raise ValueError(_refusal(base, "is batch-locked"))
+    own = base.batch_size
+    if shape[: len(own)] != own:
+        raise ValueError(
+            _refusal(base, f"has a batch size, {list(own)}, which {list(shape)} does not begin with")
+        )
+
+
+def _check_transform(transform: Transform, later: Sequence[Transform]) -> None:
+    if isinstance(transform, VecNormV2) and not transform.reduce_batch_dims:
+        raise ValueError("VecNormV2 needs reduce_batch_dims=True: its statistics are those of all branches")
+    if isinstance(transform, CatFrames):
+        written = {key for other in later for key in other.out_keys or ()}
+        if written & set(transform.out_keys):
+            raise ValueError("CatFrames must come after other transforms of the entries that it writes")
+
+
+def recall(env: EnvBase, state: TensorDictBase) -> None:
+    """Let transforms that keep frames of their own go on from those in a state."""
+    for transform in _parts(env)[1]:
+        if isinstance(transform, CatFrames):
+            for into, key in zip(transform.in_keys, transform.out_keys, strict=True):
+                setattr(transform, f"_cat_buffers_{into}", state.get(key).clone())
+
+
+@contextmanager
+def branched_specs(policy: Any, own: torch.Size, shape: torch.Size) -> Iterator[None]:
+    """Expand the specs of exploration modules, which are made for rows [*b], to the branches [*b, S] of a search."""
+    changed = []
+    for module in policy.modules() if isinstance(policy, nn.Module) else ():
+        spec = vars(module).get("_spec")
+        if own and isinstance(spec, Composite) and spec.shape[: len(own)] == own:
+            changed.append((module, spec))
+            # The spec of an action alone has all dimensions but the last for a batch.
+            spec = spec.clone()
+            spec.shape = own
+            module._spec = expanded_spec(spec, own, shape)
+    try:
+        yield
+    finally:
+        for module, spec in changed:
+            module._spec = spec
+
+
 def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     """Refuse an environment that keeps anything outside of the TensorDict: copies of its branches would share it.
 
-    That rules out GymEnv, VmasEnv, SerialEnv, ParallelEnv and whatever wraps a simulator of its own. Environments
-    with a batch size of their own are refused at once. Given a state, the environment is also stepped from it twice
-    by the same random numbers, once in its lifetime: if the results differ, it remembers something. One whose class
-    says ``branchable = True`` is spared that trial, which waits for the device.
+    That rules out GymEnv, VmasEnv, SerialEnv, ParallelEnv and whatever wraps a simulator of its own. Given a state,
+    the environment is also stepped from it twice by the same random numbers, once in its lifetime: if the results
+    differ, it remembers something. One whose class says ``branchable = True`` is spared that trial, which waits for
+    the device.
 
     Args:
         env: to be branched.
-        state: [...], from which it can be stepped.
+        state: [*b, S], from which it can be stepped.
 
     Raises:
-        ConfigError: if it can't be branched.
+        ValueError: if it can't be branched.
     """
-    if env.batch_locked or env.batch_size:
-        kind = "is batch-locked" if env.batch_locked else f"has a batch size, {list(env.batch_size)}"
-        raise ConfigError(_refusal(env, kind))
-    if state is None or env in _PASSED or getattr(env, "branchable", False):
+    base, transforms = _parts(env)
+    _check_shape(base, base.batch_size if state is None else state.shape)
+    if state is None or base in _PASSED or (getattr(base, "branchable", False) and not transforms):
         return
-    one = state[(0,) * state.ndim].unsqueeze(0)
+    one = state[..., :1]
+    trial = branched_env(env, one.shape, share=False)
     with torch.no_grad():
-        with _same_numbers(env):
-            acting = env.rand_action(one.copy())
+        with _same_numbers(trial):
+            acting = trial.rand_action(one.copy())
         results = []
         for _ in range(2):
-            with _same_numbers(env):
-                results.append(env.step(acting.copy()).get("next"))
-    changed = [key for key, value in results[0].items(True, True) if not _same(value, results[1].get(key))]
-    if changed:
-        raise ConfigError(
-            _refusal(env, f"gave another {changed[0]!r} when stepped from the same state again")
-        )
-    _PASSED.add(env)
+            with _same_numbers(trial):
+                recall(trial, one)
+                results.append(trial.step(acting.copy()).get("next"))
+    for key, value in results[0].items(True, True):
+        try:  # a device may add up in another order each time
+            torch.testing.assert_close(results[1].get(key), value, rtol=1e-4, atol=1e-5, equal_nan=True)
+        except AssertionError as error:
+            raise ValueError(
+                _refusal(env, f"gave another {key!r} when stepped from the same state again")
+            ) from error
+    _PASSED.add(base)
 
 
 def _refusal(env: EnvBase, why: str) -> str:
     return (
         f"{type(env).__name__} can't be branched: it {why}. A search copies branches by copying TensorDicts, so the "
-        "environment must keep all of its state there (batch_locked = False, an empty batch size); rows come from "
-        "with_rows(env, [B]). GymEnv, VmasEnv, SerialEnv and ParallelEnv can't be branched"
+        "environment must keep all of its state there and step any batch shape (batch_locked = False). GymEnv, "
+        "VmasEnv, SerialEnv and ParallelEnv can't be branched"
     )
 
 
@@ -79,44 +270,28 @@ def _same_numbers(env: EnvBase) -> Iterator[None]:
         generator.set_state(before)
 
 
-def _same(one: Tensor, other: Tensor | None) -> bool:
-    if not isinstance(one, Tensor):
-        return True
-    if other is None or other.shape != one.shape:
-        return False
-    if one.is_floating_point():  # a device may add up in another order each time
-        return torch.allclose(one, other, rtol=1e-4, atol=1e-5, equal_nan=True)
-    return torch.equal(one, other)
+def take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None = None) -> TensorDictBase:
+    """Rows of the flattened batch, or of its first `dims` dimensions, in a batch of the shape of `rows`."""
+    dims = tensordict.batch_dims if dims is None else dims
+    taken = {
+        key: take(value, rows, dims) if isinstance(value, TensorDictBase) else take_values(value, rows, dims)
+        for key, value in tensordict.items()
+    }
+    return TensorDict(taken, [*rows.shape, *tensordict.batch_size[dims:]], device=tensordict.device)
 
 
-def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
-    """Give an environment that accepts any batch shape a fixed one, each row with a start of its own.
-
-    A bare ``BatchSizeTransform(batch_size=...)`` resets once and starts all rows from the same state.
-    """
-    transform = BatchSizeTransform(batch_size=torch.Size(batch_size), reset_func=_reset_rows, env_kwarg=True)
-    return TransformedEnv(env, transform)
+def take_values(values: Shaped[Tensor, "*_"], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*_"]:
+    """Rows of the first `dims` dimensions, flattened, in the shape of `rows`."""
+    # index_select on whole rows is many times faster than gather or advanced indexing on wide entries.
+    taken = values.flatten(0, dims - 1).index_select(0, rows.flatten())
+    return taken.reshape(*rows.shape, *values.shape[dims:])
 
 
-def _reset_rows(
-    tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase, env: TransformedEnv
-) -> TensorDictBase:
-    if tensordict_reset.batch_size == env.batch_size:  # rows were named, or only some are reset
-        return tensordict_reset
-    return env.base_env.reset(TensorDict({}, env.batch_size, device=env.device))
+def below(key: NestedKey) -> tuple[str, ...]:
+    """The key under ``"next"``."""
+    return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
-def branched_env(env: EnvBase) -> EnvBase:
-    """The environment without a fixed batch size, for any number of branches.
-
-    Raises:
-        ConfigError: if it can only be stepped with its own batch size.
-    """
-    found = env
-    if isinstance(env, TransformedEnv):
-        chain = env.transform if isinstance(env.transform, Compose) else [env.transform]
-        others = [transform.clone() for transform in chain if not isinstance(transform, BatchSizeTransform)]
-        found = branched_env(env.base_env)
-        found = TransformedEnv(found, Compose(*others)) if others else found
-    check_branching(found)
-    return found
+def last_name(key: NestedKey) -> str:
+    """The last part of a key."""
+    return key if isinstance(key, str) else key[-1]

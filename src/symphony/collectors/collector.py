@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import functools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -15,14 +16,17 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import RandomPolicy
 
-from symphony.collectors._torchrl import bind, new_trajectories, policy_of, seed_worker
 from symphony.collectors.backtracking import Backtrack
-from symphony.collectors.beam_search import Aggregation, Policy, Score, beam_search, score_state
-from symphony.collectors.branching import branch, branched_env
-from symphony.collectors.result import BeamSearchResult
-from symphony.collectors.rules import GroupRule, KeepBest, PruningRule
+from symphony.collectors.beam_search import Aggregation, BeamSearchResult, Policy, Score, beam_search
+from symphony.collectors.branching import (
+    below,
+    branch,
+    branched_env,
+    check_branching,
+    last_name,
+)
+from symphony.collectors.rules import KeepBest, PruningRule
 from symphony.collectors.scores import max_then_sum
-from symphony.errors import ConfigError
 
 
 class BeamSearchCollector(Collector):
@@ -41,16 +45,17 @@ class BeamSearchCollector(Collector):
     - ``("collector", "beam_slot")`` [..., T] int64: slot in which the step was simulated,
     - ``("collector", "mask")`` [..., T] bool: False after the end of an episode that did not last T steps;
       TorchRL's losses leave such steps out. With ``trajs_per_batch`` they are dropped.
-    - with `keep_tree`, ``("collector", "beam_rank")`` [..., T] int64: place of the leaf among those of its tree by
-      the aggregate of their whole histories, 0 for the best; and ``"tree"``, a TensorDict [*env.batch_size, S, T]
-      of all that was simulated, by slot, pruned branches included, with their ``("collector", "beam_score")``.
+    - with a :class:`Resampling` rule, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
+      weight of its tree; 0 where the last pruning resampled. Losses may weigh leaves by its exponential.
+    - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all that was simulated, by slot, pruned
+      branches included, with their ``("collector", "beam_score")``.
 
     Frames are counted as returned; `simulated_frames` counts what was simulated for them, about S / L times as
     many.
 
     Args:
-        create_env_fn: environment that can be branched, see :func:`check_branching`; for more than one row
-            ``with_rows(env, [B])``. Other transforms are applied to the branches as well.
+        create_env_fn: environment that can be branched, see :func:`check_branching`; for more than one row one with
+            a batch size, such as ``with_rows(env, [B])``. Its transforms are applied to the branches as well.
         policy: as for :class:`Collector`; random actions by default.
         score: of the state after a step, see :func:`beam_search`.
         branches: S.
@@ -58,15 +63,15 @@ class BeamSearchCollector(Collector):
         prepare: called on the branched start state [*env.batch_size, S]; e.g. to give each branch a stream of
             random numbers or a group.
         keep_tree: also return what was pruned; with ``leaves=branches`` only.
-        rule_noise: ``rule_noise(start, periods) -> [*env.batch_size, periods]``, numbers in [0, 1) for rules that
-            draw, from the branched start state; by default from a generator that :meth:`set_seed` sets.
-        prune_every, rule, aggregate, prune_last, slot_keys, group_key, keep: as for
+        rule_noise: ``rule_noise(start, periods)`` gives numbers in [0, 1) for rules that draw, as `noise` of
+            :func:`beam_search`; by default from a generator that :meth:`set_seed` sets.
+        prune_every, rule, aggregate, value, accumulate, prune_last, until_done, slot_keys, group_key, keep: as for
             :func:`beam_search`.
         kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T. Batches are never cut short by an
             interruptor, and trajectories all have one length, so `split_trajs` is not available.
 
     Raises:
-        ConfigError: if the environment can't be branched, or for options that need single steps.
+        ValueError: if the environment can't be branched, or for options that need single steps.
     """
 
     def __init__(
@@ -78,9 +83,12 @@ class BeamSearchCollector(Collector):
         branches: int,
         leaves: int | None = None,
         prune_every: int = 10,
-        rule: PruningRule | GroupRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
+        rule: PruningRule | Backtrack = KeepBest(0.5),  # noqa: B008  (frozen)
         aggregate: Aggregation = max_then_sum,
+        value: Score | None = None,
+        accumulate: bool = False,
         prune_last: bool = True,
+        until_done: bool = True,
         prepare: Callable[[TensorDictBase], TensorDictBase] | None = None,
         slot_keys: Sequence[NestedKey] = (),
         group_key: NestedKey | None = None,
@@ -90,19 +98,23 @@ class BeamSearchCollector(Collector):
         **kwargs: Any,
     ) -> None:
         if keep_tree and leaves != branches:
-            raise ConfigError(f"keep_tree needs leaves={branches}, as many as branches; leaves is {leaves}")
+            raise ValueError(f"keep_tree needs leaves={branches}, as many as branches; leaves is {leaves}")
         if leaves is not None and not 1 <= leaves <= branches:
-            raise ConfigError(f"leaves must be 1 ... {branches} branches, is {leaves}")
+            raise ValueError(f"leaves must be 1 ... {branches} branches, is {leaves}")
         if kwargs.get("split_trajs"):
-            raise ConfigError("split_trajs: the trajectories of a search all have one length")
+            raise ValueError("split_trajs: the trajectories of a search all have one length")
         if not kwargs.get("extend_buffer", True):
-            raise ConfigError("extend_buffer=False: a search has no single steps to write before it ends")
+            raise ValueError("extend_buffer=False: a search has no single steps to write before it ends")
         # Multi-process collectors pass their own choice; here each batch is made anew, from a reset.
         kwargs["use_buffers"], kwargs["reset_at_each_iter"] = False, True
         if kwargs.get("auto_register_policy_transforms") is None:
             # What TorchRL 0.14 does when left unset, minus its warning about any policy that is a module.
             kwargs["auto_register_policy_transforms"] = False
-        seed_worker(kwargs.get("worker_idx"))
+        if kwargs.get("worker_idx") is not None:
+            # The global generators of worker processes all begin alike.
+            torch.manual_seed(
+                (torch.initial_seed() + (kwargs["worker_idx"] + 1) * 0x9E3779B97F4A7C15) % (1 << 63)
+            )
         super().__init__(create_env_fn, policy, **kwargs)
         self.branches = branches
         self.leaves = leaves
@@ -110,13 +122,15 @@ class BeamSearchCollector(Collector):
         self.prepare = prepare
         self.simulated_frames = 0
         self._score = score
-        self._aggregate = aggregate
         self._search = functools.partial(
             beam_search,
             prune_every=prune_every,
             rule=rule,
             aggregate=aggregate,
+            value=value,
+            accumulate=accumulate,
             prune_last=prune_last,
+            until_done=until_done,
             slot_keys=slot_keys,
             group_key=group_key,
             # The leaves of a whole tree stay in the order of their slots.
@@ -125,8 +139,9 @@ class BeamSearchCollector(Collector):
         )
         self._rule_noise = rule_noise
         self._rng = torch.Generator().manual_seed(torch.initial_seed() % (1 << 63))
-        self._branched_env = branched_env(self.env)
-        self._done = [_next(key) for key in self.env.done_keys]
+        self._rule = rule
+        check_branching(self.env)
+        self._done = [below(key) for key in self.env.done_keys]
         self._keep = None if keep is None else list(dict.fromkeys([*keep, *self._done]))
         rows = self.n_env * (leaves or 1)
         self.frames_per_batch = -(-kwargs["frames_per_batch"] // rows)
@@ -147,11 +162,16 @@ class BeamSearchCollector(Collector):
         """One search from a reset: the leaves, [*env.batch_size, T] or [*env.batch_size, L, T]."""
         if self.pre_collect_hook is not None:
             self.pre_collect_hook()
-        start = branch(self.env.reset(), self.branches)
+        found = self._searched(self.env.reset())
+        self.simulated_frames += found.simulated_steps
+        return self._finish(found)
+
+    def _searched(self, rows: TensorDictBase) -> BeamSearchResult:
+        start = branch(rows, self.branches)
         if self.prepare is not None:
             start = self.prepare(start.copy())
-        found = self._search(
-            self._branched_env,
+        return self._search(
+            self.env,
             self._acting(),
             self._score,
             start,
@@ -160,10 +180,8 @@ class BeamSearchCollector(Collector):
             keep=self._keep,
             exploration_type=self.exploration_type,
         )
-        self.simulated_frames += found.simulated_steps
-        return self._finish(found)
 
-    def _finish(self, found: BeamSearchResult) -> TensorDictBase:
+    def _finish(self, found: BeamSearchResult, *, fake: bool = False) -> TensorDictBase:
         leaves, totals = found.trajectories, found.leaf_totals
         period = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
         if self.compact_obs:
@@ -172,17 +190,18 @@ class BeamSearchCollector(Collector):
         leaves.set(("collector", "beam_total"), totals.transpose(-1, -2)[..., period])
         leaves.set(("collector", "beam_slot"), found.slots.transpose(-1, -2)[..., period])
         if found.tree is not None:
-            # The last period alone would say nothing of how a leaf came there.
-            order = self._aggregate(found.scores).argsort(dim=-1, stable=True)
-            rank = order.argsort(dim=-1, stable=True)
-            leaves.set(("collector", "beam_rank"), rank[..., None].expand(leaves.shape).clone())
             found.tree.set(("collector", "beam_score"), found.simulated_scores)
             leaves.set("tree", found.tree)
         ended = torch.stack([_per_entry(leaves.get(key), leaves.ndim) for key in self._done]).any(0)
         mask = ended.cumsum(-1) - ended.long() == 0
         leaves.set(("collector", "mask"), mask)
+        if found.leaf_log_weights is not None:
+            weight = found.leaf_log_weights.float()[..., None]
+            leaves.set(("collector", "log_weight"), weight.expand(leaves.shape).clone())
         if self.track_traj_ids:
-            ids = new_trajectories(self, leaves.shape[:-1].numel(), mask.device)
+            number = leaves.shape[:-1].numel()
+            ids = torch.zeros(number, dtype=torch.int64, device=mask.device)
+            ids = ids if fake else self._traj_pool.get_traj_and_increment(number, device=mask.device)
             leaves.set(
                 ("collector", "traj_ids"), ids.reshape(*leaves.shape[:-1], 1).expand(leaves.shape).clone()
             )
@@ -207,7 +226,7 @@ class BeamSearchCollector(Collector):
     def _truncate(self, leaves: TensorDictBase) -> TensorDictBase:
         """Declare the last step truncated, if asked for."""
         for key in self._done if self.set_truncated else ():
-            if _last(key) == "truncated":
+            if last_name(key) == "truncated":
                 last = torch.zeros_like(leaves.get(("collector", "mask")))
                 last[..., -1] = True
                 for name in (key, (*key[:-1], "done")):
@@ -216,17 +235,17 @@ class BeamSearchCollector(Collector):
         return leaves
 
     def _next_states(self) -> list[NestedKey]:
-        return [_next(key) for key in (*self.env.observation_keys, *self.env.state_keys)]
+        return [below(key) for key in (*self.env.observation_keys, *self.env.state_keys)]
 
     def _acting(self) -> Policy:
         """The policy of one search; until `init_random_frames` are collected, random actions."""
         first = self.init_random_frames or 0
         buffer = self.replay_buffer
         seen = self.stats()["frames"] if buffer is None else buffer.write_count
-        if isinstance(self.policy, RandomPolicy) or seen < first:
+        policy = self._wrapped_policy
+        if isinstance(policy, RandomPolicy) or seen < first:
             # The specs of a random policy have the rows of the collector's environment, but no branches.
-            return self._branched_env.rand_action
-        policy = policy_of(self)
+            return branched_env(self.env, (*self.env.batch_size, self.branches)).rand_action
         if self.policy_device is None or self.policy_device == self.env_device:
             return policy
 
@@ -239,12 +258,13 @@ class BeamSearchCollector(Collector):
 
         return elsewhere
 
-    def rule_noise(self, start: TensorDictBase) -> Float[Tensor, "*b P"]:
-        """Numbers [*env.batch_size, P] in [0, 1) for the pruning rule, from a branched start state."""
+    def rule_noise(self, start: TensorDictBase) -> Float[Tensor, "*_"]:
+        """Numbers in [0, 1) for the pruning rule [*env.batch_size, P] (or [..., P, S]), from a branched start."""
         periods = -(-self.frames_per_batch // self.prune_every)
         if self._rule_noise is not None:
             return self._rule_noise(start, periods)
-        return torch.rand((*start.shape[:-1], periods), generator=self._rng).to(self.env_device)
+        slots = start.shape[-1:] if getattr(self._rule, "noise_per_slot", False) else ()
+        return torch.rand((*start.shape[:-1], periods, *slots), generator=self._rng).to(self.env_device)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the environment and the noise of the pruning rule; returns the next seed."""
@@ -254,40 +274,14 @@ class BeamSearchCollector(Collector):
     @torch.no_grad()
     def fake_tensordict(self) -> TensorDictBase:
         """Zeros in the shape and with the entries of a batch."""
-        plain = self.env.fake_tensordict()
-        if self.compact_obs:
-            plain = plain.exclude(*self._next_states())
-        first = branch(plain, self.branches).clone()
-        state = first.exclude("next", *self.env.action_keys)
-        # The actor's own entries are found by letting it act.
-        acted = self._acting()(state if self.prepare is None else self.prepare(state.copy()))
-        score = score_state(self._branched_env, self._score, first.update(acted), first.exclude("next"))
-        total = self._aggregate(score.unsqueeze(-2))
-        plain = first[..., 0].unsqueeze(-1).expand(*plain.shape, self.frames_per_batch).clone().zero_()
-        if self.track_traj_ids:
-            plain.set(
-                ("collector", "traj_ids"), torch.zeros(plain.shape, dtype=torch.int64, device=score.device)
-            )
-        if self.leaves is not None:
-            plain = plain.unsqueeze(-2).expand(*plain.shape[:-1], self.leaves, plain.shape[-1]).clone()
-        if self._keep is not None:
-            plain = plain.select(*self._keep, "collector", strict=False)
-        plain.set(("collector", "beam_score"), score.new_zeros(*plain.shape, score.shape[-1]))
-        plain.set(("collector", "beam_total"), total.new_zeros(plain.shape))
-        for name, dtype in (("beam_slot", torch.int64), ("mask", torch.bool)):
-            plain.set(("collector", name), torch.zeros(plain.shape, dtype=dtype, device=score.device))
-        if self._search.keywords["keep_tree"]:
-            tree = plain.exclude("collector").clone()
-            plain.set(
-                ("collector", "beam_rank"), torch.zeros(plain.shape, dtype=torch.int64, device=score.device)
-            )
-            plain.set(
-                "tree", tree.set(("collector", "beam_score"), plain.get(("collector", "beam_score")).clone())
-            )
-        plain.refine_names(..., "time")
-        plain = self._truncate(plain)
-        plain = plain if self.postproc is None else self.postproc(plain)
-        return plain.exclude(*(key for key in plain.keys(True) if _last(key).startswith("_")))
+        rng = self._rng.get_state()
+        start = self.env.fake_tensordict().exclude("next", *self.env.action_keys)
+        with torch.random.fork_rng([]):
+            batch = self._finish(self._searched(start), fake=True)
+        self._rng.set_state(rng)
+        batch = batch if self.postproc is None else self.postproc(batch)
+        batch = batch.exclude(*(key for key in batch.keys(True) if last_name(key).startswith("_")))
+        return self._truncate(batch.apply(torch.zeros_like))
 
     def state_dict(self) -> OrderedDict:
         """State of the collector (policy, environment, counters) and of the search."""
@@ -308,14 +302,30 @@ class BeamSearchCollector(Collector):
         return {**super().stats(), "simulated_frames": self.simulated_frames}
 
 
-def _next(key: NestedKey) -> tuple[str, ...]:
-    return ("next", key) if isinstance(key, str) else ("next", *key)
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]
-
-
 def _per_entry(flag: Bool[Tensor, "*e"], batch_dims: int) -> Bool[Tensor, "*_"]:
     """Whether any of the flags [*b, ...] of an entry [*b] is set."""
     return flag.reshape(*flag.shape[:batch_dims], -1).any(-1)
+
+
+class BoundType(type(Collector)):  # type: ignore[misc]  # TorchRL's metaclass has no public name
+    """Of classes made at run time, which are pickled as their base and the arguments bound."""
+
+    settings: dict[str, Any]
+
+
+def bind(base: type[Collector], settings: dict[str, Any]) -> type[Collector]:
+    """A subclass with arguments given; those of a call take precedence."""
+
+    def __init__(self: Any, create_env_fn: Any, policy: Any = None, **kwargs: Any) -> None:  # noqa: N807
+        base.__init__(self, create_env_fn, policy, **{**settings, **kwargs})
+
+    members = {"__init__": __init__, "__module__": base.__module__, "settings": settings}
+    return BoundType(base.__name__, (base,), members)
+
+
+def _reduced(bound: BoundType) -> tuple[Any, ...]:
+    return bind, (bound.__base__, bound.settings)
+
+
+# pickle would look for a class in its module, unless its type has a reduction.
+copyreg.pickle(BoundType, _reduced)

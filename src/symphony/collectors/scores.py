@@ -6,19 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from symphony.errors import ConfigError
 
-# Added one by one: how many padded agents follow would change the last bit of `Tensor.sum`.
-_REDUCTIONS: dict[str, Callable[[Tensor, int], Tensor]] = {
-    "max": lambda x, dim: x.amax(dim),
-    "mean": lambda x, dim: x.cumsum(dim).select(dim, -1) / x.shape[dim],
-    "sum": lambda x, dim: x.cumsum(dim).select(dim, -1),
-    "last": lambda x, dim: x.select(dim, -1),
-}
+def _sum(values: Float[Tensor, "*_"], dim: int) -> Float[Tensor, "*_"]:
+    # Added one by one: how many padded agents follow would change the last bit of `Tensor.sum`.
+    return values.cumsum(dim).select(dim, -1)
 
 
 @dataclass(frozen=True)
@@ -26,7 +22,7 @@ class Aggregate:
     """Scores of a period [*b, S, T_p, N] to totals [*b, S]: first over time, then over agents.
 
     Args:
-        time: how the T_p steps are joined.
+        time: how the T_p steps are joined, those before the end of an episode alone.
         agents: how the N agents are joined. Scores of padded agents are 0: a sum does not change with how many there
             are, a maximum or a mean does.
     """
@@ -35,14 +31,40 @@ class Aggregate:
     agents: Literal["sum", "max", "mean"] = "sum"
 
     def __post_init__(self) -> None:
-        if self.time not in _REDUCTIONS:
-            raise ConfigError(f"time is one of {', '.join(_REDUCTIONS)}, not {self.time!r}")
+        if self.time not in ("max", "mean", "sum", "last"):
+            raise ValueError(f"time is one of max, mean, sum, last, not {self.time!r}")
         if self.agents not in ("sum", "max", "mean"):
-            raise ConfigError(f"agents is one of sum, max, mean, not {self.agents!r}")
+            raise ValueError(f"agents is one of sum, max, mean, not {self.agents!r}")
 
-    def __call__(self, scores: Float[Tensor, "*b S T N"]) -> Float[Tensor, "*b S"]:
-        """The totals."""
-        return _REDUCTIONS[self.agents](_REDUCTIONS[self.time](scores, -2), -1)
+    def __call__(
+        self, scores: Float[Tensor, "*b S T N"], alive: Bool[Tensor, "*b S T _"] | None = None
+    ) -> Float[Tensor, "*b S"]:
+        """The totals; an agent none of whose steps counts has 0.
+
+        Args:
+            scores: of all steps.
+            alive: which of them count; all of them if None. They are the first ones.
+        """
+        joined = self._over_time(scores, alive)
+        if self.agents == "max":
+            return joined.amax(-1)
+        total = _sum(joined, -1)
+        return total / joined.shape[-1] if self.agents == "mean" else total
+
+    def _over_time(self, scores: Tensor, alive: Tensor | None) -> Tensor:
+        if alive is None:
+            alive = torch.ones_like(scores[..., :1], dtype=torch.bool)
+        if self.time == "max":
+            found = scores.masked_fill(~alive, -torch.inf).amax(-2)
+            return torch.where(alive[..., 0, :], found, 0.0)
+        scores = torch.where(alive, scores, 0.0)
+        if self.time == "sum":
+            return _sum(scores, -2)
+        number = alive.sum(-2)
+        if self.time == "mean":
+            return _sum(scores, -2) / number.clamp_min(1)
+        last = (number - 1).clamp_min(0).expand(scores.select(-2, 0).shape)
+        return scores.gather(-2, last.unsqueeze(-2)).squeeze(-2)
 
 
 max_then_sum = Aggregate("max", "sum")
@@ -68,7 +90,7 @@ class KeyScore:
     valid_key: NestedKey | None = None
 
     def __call__(self, tensordict: TensorDictBase) -> Float[Tensor, "*b S N"]:
-        """The scores; KeyError if an entry is absent, ConfigError if the mask is not one of these agents."""
+        """The scores; KeyError if an entry is absent, ValueError if the mask is not one of these agents."""
         if self.module is not None:
             # Modules write into what they are given, and whatever is in the state is carried to the next step.
             tensordict = self.module(tensordict.copy())
@@ -86,7 +108,7 @@ class KeyScore:
                 raise KeyError(f"no entry {self.valid_key!r} to mask the score with")
             if valid.shape != score.shape:
                 # Broadcast, the score of a branch would count for each of its agents.
-                raise ConfigError(
+                raise ValueError(
                     f"{self.valid_key!r} is {list(valid.shape)}, scores of agents are {list(score.shape)}"
                 )
             # not a product: a padded agent may hold NaN

@@ -314,9 +314,11 @@ class DrivingEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=[], device=self.device)
-        if kwargs.get("set_state"):
-            return self._from_state(self._read(tensordict))
         partial = tensordict.get("_reset", None)
+        # Unless told otherwise, TorchRL takes whatever names a scene, or is reset in part, for a state to begin from.
+        whole = partial is None and tensordict.get(keys.STATE, None) is not None
+        if kwargs.get("set_state") and whole:
+            return self._from_state(self._read(tensordict))
         named = tensordict.get(keys.SCENE, None)
         if named is not None and partial is None:
             scene = named.squeeze(-1)

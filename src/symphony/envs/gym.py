@@ -200,5 +200,6 @@ def _whole(value: Any) -> int | None:
 
 def _space(value: NDArray[Any]) -> spaces.Space[Any]:
     if value.dtype == np.int8:
-        return spaces.MultiBinary(value.shape)
+        # TorchRL reads the number, not a shape of one.
+        return spaces.MultiBinary(value.shape[0] if value.ndim == 1 else value.shape)
     return spaces.Box(-BOUND, BOUND, value.shape, np.float32)

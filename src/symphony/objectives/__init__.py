@@ -1,10 +1,12 @@
-"""Losses as TorchRL loss modules."""
+"""Losses as TorchRL loss modules: imitation, a discriminator, and adversarial imitation through a model.
+
+Each takes the entries it reads as settable keys. By default they lie under ``"agents"``, one entry per agent.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from symphony.imports import lazily
+import importlib
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from symphony.objectives.bc import BCLoss
@@ -16,4 +18,14 @@ if TYPE_CHECKING:
 
 __all__ = ["BCLoss", "DiscriminatorLoss", "DistillationLoss", "GoalLoss", "MGAILLoss", "auc"]
 
-__getattr__, __dir__ = lazily(__name__)
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, and no other loss."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    room = "statistics" if name == "auc" else name.removesuffix("Loss").lower()
+    return getattr(importlib.import_module(f"{__name__}.{room}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

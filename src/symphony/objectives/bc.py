@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, dispatch
 
-from symphony import keys
 from symphony.objectives.base import ActorLoss, Reduction
 
 
@@ -38,12 +37,12 @@ class BCLoss(ActorLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            action (NestedKey): the expert's action. Defaults to `symphony.keys.ACTION`.
-            valid (NestedKey): bool mask, True where an agent counts. Defaults to `symphony.keys.VALID`.
+            action (NestedKey): the expert's action.
+            valid (NestedKey): bool mask, True where an agent counts.
         """
 
-        action: NestedKey = keys.ACTION
-        valid: NestedKey = keys.VALID
+        action: NestedKey = ("agents", "action")
+        valid: NestedKey = ("agents", "valid")
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

@@ -12,7 +12,6 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional
 
-from symphony import keys
 from symphony.objectives.base import MaskedLoss, Reduction
 from symphony.objectives.statistics import auc
 
@@ -50,16 +49,14 @@ class DiscriminatorLoss(MaskedLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            score (NestedKey): float `[..., N]`, the logit the discriminator writes. Defaults to
-                `symphony.keys.SCORE`.
+            score (NestedKey): float `[..., N]`, the logit the discriminator writes.
             simulated (NestedKey): bool `[..., N]`, True where the state is simulated, False where it is data.
-                Defaults to `symphony.keys.SIMULATED`.
-            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `symphony.keys.VALID`.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts.
         """
 
-        score: NestedKey = keys.SCORE
-        simulated: NestedKey = keys.SIMULATED
-        valid: NestedKey = keys.VALID
+        score: NestedKey = ("agents", "score")
+        simulated: NestedKey = ("agents", "simulated")
+        valid: NestedKey = ("agents", "valid")
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, dispatch
 
-from symphony import keys
 from symphony.objectives.base import ActorLoss, Reduction
 
 
@@ -39,15 +38,14 @@ class DistillationLoss(ActorLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            action (NestedKey): the action to imitate. Defaults to `symphony.keys.ACTION`.
-            valid (NestedKey): bool mask, True where an agent counts. Defaults to `symphony.keys.VALID`.
+            action (NestedKey): the action to imitate.
+            valid (NestedKey): bool mask, True where an agent counts.
             rollout (NestedKey): bool, True where the action comes from a rollout, False where from an expert.
-                Defaults to `symphony.keys.ROLLOUT`.
         """
 
-        action: NestedKey = keys.ACTION
-        valid: NestedKey = keys.VALID
-        rollout: NestedKey = keys.ROLLOUT
+        action: NestedKey = ("agents", "action")
+        valid: NestedKey = ("agents", "valid")
+        rollout: NestedKey = ("agents", "rollout")
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

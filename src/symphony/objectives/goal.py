@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torch.nn import functional
 
-from symphony import keys
 from symphony.objectives.base import MaskedLoss, Reduction
 
 
@@ -45,21 +44,19 @@ class GoalLoss(MaskedLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            logits (NestedKey): float `[..., N, G]`, as the network writes them. Defaults to
-                `symphony.keys.GOAL_LOGITS`.
-            mask (NestedKey): bool `[..., N, G]`, True where a goal is feasible. Defaults to
-                `symphony.keys.ROUTES_MASK`.
-            label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none. Defaults to `symphony.keys.GOAL`.
+            logits (NestedKey): float `[..., N, G]`, as the network writes them.
+            mask (NestedKey): bool `[..., N, G]`, True where a goal is feasible.
+            label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none.
             label_set (NestedKey): bool `[..., N, G]`, optional: equally right goals; where it is present, the label
-                is not read. Defaults to `symphony.keys.GOAL_SET`.
-            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `symphony.keys.VALID`.
+                is not read.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts.
         """
 
-        logits: NestedKey = keys.GOAL_LOGITS
-        mask: NestedKey = keys.ROUTES_MASK
-        label: NestedKey = keys.GOAL
-        label_set: NestedKey = keys.GOAL_SET
-        valid: NestedKey = keys.VALID
+        logits: NestedKey = ("agents", "goal_logits")
+        mask: NestedKey = ("agents", "routes_mask")
+        label: NestedKey = ("agents", "goal")
+        label_set: NestedKey = ("agents", "goal_set")
+        valid: NestedKey = ("agents", "valid")
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

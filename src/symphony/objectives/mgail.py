@@ -16,7 +16,6 @@ from torch.nn import functional
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from symphony import keys
 from symphony.objectives.base import MaskedLoss, Reduction
 
 Cost = Literal["log_d", "non_saturating", "logit"]
@@ -51,7 +50,7 @@ class MGAILLoss(MaskedLoss):
         reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
-    Writes `loss_mgail` and, detached, the mean logit `mgail_score`. Steps after the end of an episode do not count.
+    Writes `loss_mgail` and, detached, the mean logit `mgail_score`. Steps after the first `done` do not count.
 
     Raises:
         KeyError: at the call, if the mask, `done` or the score is missing.
@@ -63,19 +62,17 @@ class MGAILLoss(MaskedLoss):
         """Keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
-            score (NestedKey): float `[..., N]`, the logit the discriminator writes. Defaults to
-                `symphony.keys.SCORE`.
-            noise (NestedKey): numbers `[..., N, *]` that the actor draws by. Defaults to `symphony.keys.NOISE`.
-            plan (NestedKey): the same for all steps, `[..., T, N, *]`, optional in the start states. Defaults to
-                `symphony.keys.NOISE_PLAN`.
-            valid (NestedKey): bool `[..., N]`, True where an agent counts. Defaults to `symphony.keys.VALID`.
-            done (NestedKey): bool `[..., 1]`, True where the episode has ended. Defaults to `"done"`.
+            score (NestedKey): float `[..., N]`, the logit the discriminator writes.
+            noise (NestedKey): numbers `[..., N, *]` that the actor draws by.
+            plan (NestedKey): the same for all steps, `[..., T, N, *]`, optional in the start states.
+            valid (NestedKey): bool `[..., N]`, True where an agent counts.
+            done (NestedKey): bool `[..., 1]`, True where the episode has ended.
         """
 
-        score: NestedKey = keys.SCORE
-        noise: NestedKey = keys.NOISE
-        plan: NestedKey = keys.NOISE_PLAN
-        valid: NestedKey = keys.VALID
+        score: NestedKey = ("agents", "score")
+        noise: NestedKey = ("agents", "noise")
+        plan: NestedKey = "noise_plan"
+        valid: NestedKey = ("agents", "valid")
         done: NestedKey = "done"
 
     tensor_keys: _AcceptedKeys
@@ -179,6 +176,7 @@ class MGAILLoss(MaskedLoss):
     ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"]]:
         """Logits and whether the episode still ran, `[..., steps, N]`."""
         batch, scores, going = now.batch_dims, [], []
+        alive = torch.ones_like(now.get(self.tensor_keys.done))
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
         with (
             self.actor_network_params.to_module(self.actor_network),
@@ -196,7 +194,8 @@ class MGAILLoss(MaskedLoss):
                 drawn = now.copy()
                 for key in env.action_keys:
                     drawn.set(key, acting.get(key))
-                alive = ~now.get(self.tensor_keys.done)
+                # An environment may go on after an end, and a later state of it be none.
+                alive = alive & ~now.get(self.tensor_keys.done)
                 now = env.step_mdp(env.step(drawn))
                 scored = functional_call(self.discriminator, frozen, (now.copy(),))
                 score = scored.get(self.tensor_keys.score, default=None)

@@ -168,11 +168,13 @@ def simulation(
     # The rollouts [B, trees, taken] that count, of all branches.
     chosen = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1)
     if kind == "best" and result is not None:
-        chosen = max_then_sum(result.scores).argsort(dim=-1, stable=True)[..., :1]
+        chosen = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[..., :1]
     goal = ends.get(keys.GOAL)
     if kind == "backtrack" and result is not None:
         # Lines are trees of one branch each; to be filled from each other they are the branches of one.
-        chosen = filled_lines(result.totals.squeeze(-1), settings.threshold)[:, None]
+        begun = result.alive.squeeze(-2)[..., :: result.prune_every]
+        totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)  # what follows an end is never bad
+        chosen = filled_lines(totals, settings.threshold)[:, None]
         found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
     rollouts = Rollouts(*(_branches(part, chosen).flatten(1, 2) for part in found))
     goal = _branches(goal, chosen).flatten(1, 2)

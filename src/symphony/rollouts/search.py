@@ -34,8 +34,6 @@ from symphony.modules import SeededNoise
 from symphony.rollouts.unroll import draw_goals
 from symphony.streams import Stream, fold_in, uniform
 
-ENDED = -100.0
-"""Score past a scene's last logged step, below all others: it decides no maximum, and other totals leave it out."""
 FILL, FEW = 4, 256
 """Lines that go back: those of so many times the usual run segments are simulated one after the other, as many at a
 time as usual, at least so many: else the last steps of every batch would be of few lines.
@@ -107,7 +105,7 @@ def realism_score(
     score: Score = "discriminator",
     ego: bool = True,
 ) -> Callable[[TensorDictBase], Tensor]:
-    """Scores [..., N] of states up to their scene's last logged step, :data:`ENDED` beyond.
+    """Scores [..., N] of states.
 
     Args:
         env: whose states are scored.
@@ -121,13 +119,11 @@ def realism_score(
     else:
         of_states = flag_score if score == "flags" else partial(rule_score, env)
 
-    def until_the_end(state: TensorDictBase) -> Float[Tensor, "*b N"]:
-        going = state.get(keys.STEP) <= env.scenes.last_step[state.get(keys.SCENE)]
-        found = torch.where(going, of_states(state), ENDED)
-        found = found.masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
+    def of_scored(state: TensorDictBase) -> Float[Tensor, "*b N"]:
+        found = of_states(state).masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
         return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
 
-    return until_the_end
+    return of_scored
 
 
 def branched_streams(start: TensorDictBase) -> TensorDictBase:
@@ -226,7 +222,7 @@ def search(
         ego: whether the first agent is scored, too.
         also: what is kept of every step beside :data:`KEPT`.
     """
-    steps, scene = env.decisions, start.get(keys.SCENE)[..., 0, 0]
+    steps = env.decisions
     return beam_search(
         env,
         TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
@@ -237,8 +233,6 @@ def search(
         rule=rule,
         noise=pruning_noise(seed)(start, -(-steps // prune_every)),
         leaves=leaves,
-        # In the last period of all, branches of a shorter scene are equal.
-        last_period=(-(-env.scenes.last_step[scene] // prune_every) - 1).clamp_min(0),
         keep_tree=keep_tree,
         **_settings(env, rule, also),
     )

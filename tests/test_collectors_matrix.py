@@ -1,0 +1,231 @@
+"""Environments, transforms and policies as TorchRL's users have them: with one branch the collector is TorchRL's."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    EnvBase,
+    InitTracker,
+    ObservationNorm,
+    PendulumEnv,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+    VecNormV2,
+)
+from torchrl.envs.utils import check_env_specs
+from torchrl.modules import (
+    AdditiveGaussianModule,
+    EGreedyModule,
+    GRUModule,
+    ProbabilisticActor,
+    TanhNormal,
+    set_recurrent_mode,
+)
+
+from helpers_collectors import Mass
+from symphony.collectors import BeamSearchCollector, KeyScore, with_rows
+
+ROWS, STEPS = 3, 8
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+ENVIRONMENTS: dict[str, Callable[[], EnvBase]] = {
+    "rows": lambda: with_rows(Mass(), [ROWS]),
+    "sticky": lambda: with_rows(Mass(sticky=True), [ROWS]),
+    "own batch": lambda: Mass((ROWS,)),
+    "agents": lambda: with_rows(Mass(agents=2), [ROWS]),
+    "one": Mass,
+    "endless": lambda: with_rows(Mass(limit=99.0), [ROWS]),
+}
+OBSERVED = {"agents": ("agents", "observation")}
+TRANSFORMS: dict[str, Callable[[Any], list[Transform]]] = {
+    "none": lambda key: [],
+    "counters": lambda key: [StepCounter(6), RewardSum()],
+    "init": lambda key: [InitTracker()],
+    "norm": lambda key: [ObservationNorm(0.1, 2.0, in_keys=[key], standard_normal=True)],
+    "frames": lambda key: [CatFrames(3, -1, in_keys=[key], padding="same")],
+    "statistics": lambda key: [VecNormV2(in_keys=[key], reduce_batch_dims=True)],
+}
+
+
+def acting(key: Any, features: int) -> TensorDictModule:
+    torch.manual_seed(0)
+    action = "action" if isinstance(key, str) else (*key[:-1], "action")
+    return TensorDictModule(nn.Sequential(nn.Linear(features, 1), nn.Tanh()), [key], [action])
+
+
+def recurrent() -> tuple[GRUModule, TensorDictSequential]:
+    torch.manual_seed(0)
+    memory = GRUModule(input_size=2, hidden_size=4, in_key="observation", out_key="embedding")
+    head = TensorDictModule(
+        nn.Sequential(nn.Linear(4, 2), NormalParamExtractor()), ["embedding"], ["loc", "scale"]
+    )
+    actor = ProbabilisticActor(
+        TensorDictSequential(memory, head), ["loc", "scale"], distribution_class=TanhNormal
+    )
+    return memory, actor
+
+
+def beams(
+    env: EnvBase, policy: Any, *, key: Any = "reward", branches: int = 1, **kwargs: Any
+) -> BeamSearchCollector:
+    return BeamSearchCollector(
+        env,
+        policy,
+        score=KeyScore(key, negate=True),
+        branches=branches,
+        prune_every=4,
+        frames_per_batch=env.batch_size.numel() * STEPS,
+        total_frames=env.batch_size.numel() * STEPS,
+        **kwargs,
+    )
+
+
+def assert_same_until_done(env: Callable[[], EnvBase], policy: Any, **kwargs: Any) -> TensorDictBase:
+    """The first batches of both collectors have the same entries, the same up to the first end of an episode."""
+    one = env()
+    plain = Collector(
+        one,
+        policy,
+        frames_per_batch=one.batch_size.numel() * STEPS,
+        total_frames=one.batch_size.numel() * STEPS,
+        reset_at_each_iter=True,
+        auto_register_policy_transforms=False,
+    )
+    ours = beams(env(), policy, **kwargs)
+    for collector in (plain, ours):
+        collector.set_seed(1)
+    expected, found = plain.next(), ours.next()
+    own = {key for key in found.keys(True, True) if key[0] == "collector"}
+    assert set(found.keys(True, True)) - own == {
+        key for key in expected.keys(True, True) if key[0] != "collector"
+    }
+    mask = found["collector", "mask"]
+    assert mask[..., 0].all()
+    for entry in set(found.keys(True, True)) - own:
+        torch.testing.assert_close(found[entry][mask], expected[entry][mask], msg=f"{entry}")
+    return found
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["rows first", "rows last"])
+@pytest.mark.parametrize(
+    ("env", "transforms"),
+    [
+        (e, t)
+        for e, t in itertools.product(ENVIRONMENTS, TRANSFORMS)
+        # TorchRL's CatFrames takes no reset of each agent apart.
+        if (t == "statistics") == (e == "endless") and (e, t) != ("agents", "frames")
+    ],
+)
+def test_one_branch_is_torchrls_collector(env: str, transforms: str, inside: bool) -> None:
+    # Statistics are of all rows, also of those that are reset: here no row is.
+    key = OBSERVED.get(env, "observation")
+
+    def make() -> EnvBase:
+        torch.manual_seed(0)
+        if inside and env not in ("one", "own batch"):
+            limit = 99.0 if env == "endless" else 1.5
+            base = Mass(agents=2 if env == "agents" else None, sticky=env == "sticky", limit=limit)
+            return with_rows(TransformedEnv(base, Compose(*TRANSFORMS[transforms](key))), [ROWS])
+        return TransformedEnv(ENVIRONMENTS[env](), Compose(*TRANSFORMS[transforms](key)))
+
+    reward = "reward" if isinstance(key, str) else ("agents", "reward")
+    found = assert_same_until_done(make, acting(key, 6 if transforms == "frames" else 2), key=reward)
+    if env == "rows" and transforms == "none":
+        assert not found["collector", "mask"].all()
+
+
+@pytest.mark.parametrize("env", ["rows", "own batch", "one"])
+@pytest.mark.parametrize("register", [False, True])
+def test_hidden_states_are_copied_with_a_branch(env: str, register: bool) -> None:
+    """Along each leaf they are those that recurrent mode computes from its observations alone."""
+    memory, policy = recurrent()
+    made = ENVIRONMENTS[env]()
+    if not register:
+        made = TransformedEnv(made, Compose(InitTracker(), memory.make_tensordict_primer()))
+    collector = beams(made, policy, branches=4, leaves=4, auto_register_policy_transforms=register)
+    collector.frames_per_batch = STEPS
+    batch = collector.rollout()
+    assert batch.shape == (*made.batch_size, 4, STEPS)
+    assert bool((batch["collector", "beam_slot"] != torch.arange(4)[:, None]).any()), "nothing was copied"
+    for row in batch.reshape(-1, STEPS):
+        with torch.no_grad(), set_recurrent_mode(True):
+            again = memory(row[None].select(*memory.in_keys).clone())["embedding"]
+        torch.testing.assert_close(again[0], row["embedding"])
+
+
+@pytest.mark.parametrize("module", ["gaussian", "greedy", "random"])
+def test_exploration_takes_the_specs_of_the_environment(module: str) -> None:
+    env = ENVIRONMENTS["rows"]()
+    wrap = {
+        "gaussian": lambda: AdditiveGaussianModule(spec=env.action_spec, sigma_init=0.3, sigma_end=0.3),
+        "greedy": lambda: EGreedyModule(spec=env.action_spec, eps_init=1.0, eps_end=1.0),
+    }
+    policy = None if module == "random" else TensorDictSequential(acting("observation", 2), wrap[module]())
+    before = None if policy is None else policy[-1].spec.shape
+    batch = beams(env, policy, branches=4, leaves=4, auto_register_policy_transforms=False).next()
+    action = batch["action"]
+    assert action.abs().max() <= 1
+    assert len(action.flatten().unique()) > action.numel() / 4
+    assert policy is None or policy[-1].spec.shape == before
+
+
+def test_rows_are_a_batch_of_an_environment() -> None:
+    """In both orders with transforms; several rows are reset apart, and rollouts go on until all have ended."""
+    for env in (
+        with_rows(TransformedEnv(Mass(), StepCounter()), [ROWS]),
+        TransformedEnv(with_rows(Mass(), [ROWS]), StepCounter()),
+    ):
+        check_env_specs(env)
+        assert len(env.reset()["observation"].unique(dim=0)) == ROWS
+        assert env.rollout(5, break_when_any_done=False).shape == (ROWS, 5)
+        assert env.rollout(50, break_when_all_done=True).shape[0] == ROWS
+    with pytest.raises(ValueError, match=r"has a batch size, \[3\]"):
+        with_rows(Mass((ROWS,)), [2])
+
+
+def test_what_can_not_be_right_is_refused() -> None:
+    twice = Compose(
+        CatFrames(2, -1, in_keys=["observation"]), ObservationNorm(0.0, 1.0, in_keys=["observation"])
+    )
+    for transform, why in (
+        (VecNormV2(in_keys=["observation"]), "reduce_batch_dims"),
+        (twice, "must come after"),
+    ):
+        env = TransformedEnv(with_rows(Mass(), [ROWS]), transform)
+        with pytest.raises(ValueError, match=why):
+            beams(env, None, branches=2).next()
+
+
+def rows_of_pendulum() -> EnvBase:
+    return with_rows(PendulumEnv(seed=0), [ROWS])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_started_quickly")
+def test_random_actions_in_other_processes() -> None:
+    collector = MultiSyncCollector(
+        [rows_of_pendulum],
+        None,
+        collector_class=BeamSearchCollector.bind(score=KeyScore("reward", negate=True), branches=2),
+        frames_per_batch=ROWS * STEPS,
+        total_frames=ROWS * STEPS,
+        use_buffers=False,
+        cat_results="stack",
+    )
+    try:
+        assert [batch.shape for batch in collector] == [(1, ROWS, STEPS)]
+    finally:
+        collector.shutdown()
