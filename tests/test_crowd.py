@@ -265,12 +265,11 @@ def test_batch_and_padding_change_nothing(store: SegmentStore, search: Any, othe
 
 def test_fewer_agents_than_asked_for(store: SegmentStore) -> None:
     found = evaluate(tiny(), store, EvaluateConfig(rollouts=2, interactive=8))
+    assert sorted(found.metrics.segments) == sorted(store.ids)
     driven = [int(crowd_dataset(store, tiny(), EvaluateConfig(interactive=8)).scene(i).interactive.shape[1])
               for i in range(4)]  # fmt: skip
-    agents = [found.metrics.segments[name].single.agents for name in store.ids]
     # Of those who move and are there at the first step, everyone.
     assert driven == [3, 3, 3, 4]
-    assert agents == [2 * n for n in driven]
 
 
 def test_who_is_driven_is_a_matter_of_choice() -> None:
@@ -295,7 +294,7 @@ def test_who_is_driven_is_a_matter_of_choice() -> None:
 def test_others_are_driven_but_not_evaluated(store: SegmentStore, others: Any, tmp_path: Path) -> None:
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
     found = evaluate(tiny(), store, config)
-    assert [found.metrics.segments[name].single.agents for name in store.ids] == [4] * 4
+    assert sorted(found.metrics.segments) == sorted(store.ids)
     saved = next(iter(save_simulation(tmp_path, tiny(), crowd_dataset(store, tiny(), config, [2]), config)))
     assert len(saved.agents) > 2
     assert saved.evaluated.tolist() == [0, 1]
@@ -383,7 +382,6 @@ def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
 def test_the_baseline_is_the_planner_for_everyone(store: SegmentStore) -> None:
     config = EvaluateConfig(rollouts=1, interactive=2)
     found = evaluate("idm", store, config, baselines=True)
-    assert [found.metrics.segments[name].single.agents for name in store.ids] == [2] * 4
     assert {other.agent for other in found.baselines} == {"playback", "constant_velocity"}
     # Whoever is driven follows the route of the log by the rule, the ego and others alike.
     scenes = crowd_dataset(store, load_agent("idm"), config).scenes([2])

@@ -21,7 +21,7 @@ LONGEST = 80
 MAY_NAME_METHODS = ("recipes", "cli", "config")
 OTHER_WORDS = {"data/sources/scenarionet.py": {"ts"}}
 """Fields of formats that only look like a part of such a name."""
-ROWS_OF_TABLES = ("comparison.py", "entries.py", "formats.py", "paired.py", "paper.py", "relations.py")
+ROWS_OF_TABLES = ("formats.py", "paper.py", "relations.py", "table.py")
 """Of ``evaluation``: methods are rows there."""
 NAMES = re.compile(rf"(?<!\w)(?:{'|'.join(METHODS)})(?!\w)")
 PARTS = re.compile(r"_?(bc|mgail|ts|ts_h)_?|_h|h_")

@@ -173,7 +173,8 @@ class Hardest:
             found = [one for _, one in hardest(SegmentStore(self.data), self.count, progress=advance)]
         write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
         if self.ids:
-            say("\n".join(one.segment for one in found))
+            for one in found:
+                say(one.segment)
         elif str(self.json) != "-":
             table = Table("segment", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m")
             for one in found:

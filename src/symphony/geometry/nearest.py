@@ -31,12 +31,13 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     if values.shape[1] <= count:
         return np.arange(values.size)
     cut = np.partition(values, count - 1, axis=1)[:, count - 1 : count]
+    if not np.isfinite(cut).all():
+        values, cut = (np.where(np.isnan(part), np.inf, part) for part in (values, cut))
     chosen = values <= cut
-    # Ties, and rows with fewer numbers than are wanted, are rare: only then rows are looked at one by one.
-    if np.count_nonzero(chosen) != count * len(values) or np.isnan(cut).any():
+    # Ties are rare: only then rows are looked at one by one.
+    if np.count_nonzero(chosen) != count * len(values):
         odd = np.flatnonzero(np.count_nonzero(chosen, axis=1) != count)
-        given, last = (np.where(np.isnan(part[odd]), np.inf, part[odd]) for part in (values, cut))
-        less, equal = given < last, given == last
+        less, equal = values[odd] < cut[odd], values[odd] == cut[odd]
         room = count - np.count_nonzero(less, axis=1)[:, None]
         chosen[odd] = less | (equal & (equal.cumsum(1) <= room))
     return np.flatnonzero(chosen)

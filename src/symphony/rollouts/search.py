@@ -28,6 +28,7 @@ from symphony.collectors.rules import takes_groups
 from symphony.config import Score, SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.flags import collision_flags
+from symphony.errors import ConfigError
 from symphony.imports import build_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
@@ -223,19 +224,22 @@ def search(
         also: what is kept of every step beside :data:`KEPT`.
     """
     steps = env.decisions
-    return beam_search(
-        env,
-        TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
-        realism_score(env, discriminator, score=score, ego=ego),
-        start,
-        steps=steps,
-        prune_every=prune_every,
-        rule=rule,
-        noise=pruning_noise(seed)(start, -(-steps // prune_every)),
-        leaves=leaves,
-        keep_tree=keep_tree,
-        **_settings(env, rule, also),
-    )
+    try:
+        return beam_search(
+            env,
+            TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
+            realism_score(env, discriminator, score=score, ego=ego),
+            start,
+            steps=steps,
+            prune_every=prune_every,
+            rule=rule,
+            noise=pruning_noise(seed)(start, -(-steps // prune_every)),
+            leaves=leaves,
+            keep_tree=keep_tree,
+            **_settings(env, rule, also),
+        )
+    except ValueError as error:  # of a rule or a score of the user
+        raise ConfigError(str(error)) from error
 
 
 def going_back(
