@@ -100,3 +100,4 @@ class Demo:
         )
         show({"your BC+H": str(run)}, self.out / "rollouts.png")
         say(f"numbers: {numbers}\nagent:   {run}")
+        say("next:    symphony test examples/suite.toml holds a planner among such agents to thresholds")

@@ -116,8 +116,8 @@ def progress(description: str, unit: str = "segments") -> Iterator[Callable[...,
 
 
 def say(text: str) -> None:
-    """Print a line as it is, neither wrapped nor coloured."""
-    print(printable(text))  # noqa: T201
+    """Print lines as they are, neither wrapped nor coloured."""
+    print(printable(text, keep="\n"))  # noqa: T201
 
 
 def warn(text: str) -> None:
