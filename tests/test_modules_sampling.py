@@ -74,6 +74,7 @@ def test_streams_keep_the_numbers_that_rollouts_were_made_with():
         "PRUNING": 1,
         "PLANNERS": 3,
         "PERSONAS": 4,
+        "WALKS": 5,
         "BACKTRACKING": first,
     }
 

@@ -288,6 +288,8 @@ def skeleton(root: Path) -> Path:
             (package / path.name / "__init__.py").write_text("")
         elif path.suffix == ".py":
             (package / path.name).write_text("")
+    (package / "wosac" / "scorer").mkdir()  # a contract of its own
+    (package / "wosac" / "scorer" / "__init__.py").write_text("")
     shutil.copyfile(ROOT / ".importlinter", root / ".importlinter")
     return package
 
@@ -314,6 +316,8 @@ IMPORTS = [
     ("render/b.py", "import symphony.metrics", False),
     ("training/a.py", "import symphony.metrics, symphony.modules, symphony.render, symphony.config", True),
     ("training/b.py", "import symphony.cli", False),
+    ("wosac/scorer/a.py", "import symphony.errors", True),
+    ("wosac/scorer/b.py", "import symphony.data", False),
     ("unplaced.py", "", False),
 ]
 
