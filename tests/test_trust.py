@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import os
 import shutil
 import sys
+import tarfile
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -23,6 +25,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.npz import read_npz
 from symphony.errors import ConfigError, DataError, DataWarning, SymphonyError
 from symphony.wosac.files import read_rollouts
+from symphony.wosac.submission import check_submission
 
 NOTES = """
 from pathlib import Path
@@ -143,6 +146,21 @@ def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
                     part.write(bytes(min(1 << 24, size - begin)))
 
 
+def shard(path: Path, size: int, tag: bytes = b"\x0a", kind: bytes = tarfile.REGTYPE) -> None:
+    """A submission with one member: a message of so many bytes of zeros, or a header of the archive's own."""
+    length = bytes(
+        (size >> 7 * k & 0x7F) | (0x80 if size >> 7 * (k + 1) else 0) for k in range(5) if size >> 7 * k
+    )
+    head = tag + length if kind == tarfile.REGTYPE else b""
+    member = tarfile.TarInfo("a.binproto-00000-of-00001")
+    member.size, member.type = len(head) + size, kind
+    path.write_bytes(gzip.compress(member.tobuf(tarfile.GNU_FORMAT) + head + bytes(size + 10_240), 1))
+
+
+def check(path: Path) -> None:
+    raise check_submission(path).problems[0]
+
+
 MIB = 1 << 20
 BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]] = {
     "an array by its header": (
@@ -160,6 +178,14 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]]
         lambda of: read_npz(of, most=30 * MIB),
         "field b",
     ),
+    "a scenario": (lambda to: shard(to, 130 * MIB), check, "a scenario of 136314880 bytes"),
+    "another message": (lambda to: shard(to, 50 * MIB, b"\x12"), check, "more than 65536 bytes"),
+    "a long name": (
+        lambda to: shard(to, 50 * MIB, kind=tarfile.GNUTYPE_LONGNAME),
+        check,
+        "52428800 bytes of a header",
+    ),
+    "a header": (lambda to: shard(to, 50 * MIB, kind=tarfile.XHDTYPE), check, "52428800 bytes of a header"),
 }
 
 

@@ -40,7 +40,25 @@ _SCENARIO_TAG = b"\x0a"
 """What comes before a scenario on the wire of a shard: field 1, of a length that follows."""
 _LARGEST = 128 << 20
 """Bytes of the rollouts of a scenario: of more than 3 000 agents."""
+_MAX_REST = 1 << 16
+"""Bytes of a shard beside the scenarios, and of a member of the archive beside its content: some lines of text."""
 _DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError)
+
+
+class _Member(tarfile.TarInfo):
+    """A member of an archive; what is read into memory to know it, such as a long name, is small."""
+
+    def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
+        beside = self.type in (
+            *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.GNUTYPE_SPARSE),
+            *(tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE),
+        )
+        if beside and self.size > _MAX_REST:
+            raise tarfile.ReadError(f"{self.size} bytes of a header")
+        return super()._proc_member(archive)  # type: ignore[misc]
+
+    def _proc_gnusparse_10(self, *_: object) -> None:
+        raise tarfile.ReadError("a sparse file")  # whose map is as long as it says
 
 
 def meta_message(meta: SubmissionMeta) -> pb.SimAgentsChallengeSubmission:
@@ -210,7 +228,7 @@ def check_submission(path: Path, required: Mapping[str, list[int]] | None = None
     report, metas = Report(), set[bytes]()
     try:
         with gzip.open(path) as unzipped:
-            with tarfile.open(fileobj=unzipped, mode="r|") as archive:
+            with tarfile.open(fileobj=unzipped, mode="r|", tarinfo=_Member) as archive:
                 for member in archive:
                     if (stream := archive.extractfile(member)) is not None:
                         name = member.name.removeprefix("./")
@@ -269,7 +287,10 @@ def _messages(stream: IO[bytes]) -> Iterator[pb.SimAgentsChallengeSubmission]:
         if length > _LARGEST:
             raise DecodeError(f"a scenario of {length} bytes, at most {_LARGEST} are read")
         yield pb.SimAgentsChallengeSubmission.FromString(tag + head + stream.read(length))
-    yield pb.SimAgentsChallengeSubmission.FromString(tag + stream.read())
+    rest = stream.read(_MAX_REST)
+    if stream.read(1):
+        raise DecodeError(f"more than {_MAX_REST} bytes after the scenarios, which come first")
+    yield pb.SimAgentsChallengeSubmission.FromString(tag + rest)
 
 
 def _names_problem(names: list[str]) -> list[str]:
