@@ -146,6 +146,7 @@ def test_as_many_groups_as_needed_and_no_more(limit: float, confidence: float) -
         ("at_most = 80", "at_most = 1", 19, "at_most", "at least 230 independent groups"),
         ("at_most = 80", "at_most = 0", 19, "at_most", "confidence = false"),
         ("at_most = 80", "at_most = 80\nat_least = 1", 18, "metric", "one of"),
+        ("at_most = 80", "at_most = nan", 19, "at_most", "not nan"),
         ("at_most = 80", "at_most = true", 19, "at_most", "True"),
         ("at_most = 80", "at_most = 80\ncompared = true", 20, "compared", "no baseline"),
         ('planners = ["log"]', 'planners = ["logs"]', 25, "planners", "logs"),
@@ -189,8 +190,7 @@ def test_log_playback_passes_and_a_wild_planner_is_judged(suite: Path, tmp_path:
     assert "http" not in page.replace("https://", "")
     # Once more: what was simulated is there, and nothing else is found.
     assert main(["test", str(suite), "--out", str(out)]) == 0
-    again = json.loads((out / "result.json").read_text())
-    assert again["verdicts"] == found["verdicts"]
+    assert json.loads((out / "result.json").read_text())["verdicts"] == found["verdicts"]
 
 
 def test_a_suite_of_the_hardest_segments(suite: Path) -> None:

@@ -165,16 +165,12 @@ def needed_groups(limit: float, confidence: float) -> int:
 
 def paired(
     runs: Sequence[Run], others: Sequence[Run], of: Callable[[Run], float | None]
-) -> tuple[list[float | None], list[str], NDArray[np.int64]]:
-    """Differences of a number between the runs of two planners in the same segment and rollout.
-
-    Returns:
-        The differences, the groups of their segments, and the places of their runs among the first.
-    """
+) -> tuple[list[float | None], list[str]]:
+    """Differences of a number between the runs of two planners in the same segment and rollout, and their groups."""
     base = {(run["segment"], run["rollout"]): of(run) for run in others}
+    both = [run for run in runs if (run["segment"], run["rollout"]) in base]
     values: list[float | None] = []
-    places = [k for k, run in enumerate(runs) if (run["segment"], run["rollout"]) in base]
-    for k in places:
-        here, there = of(runs[k]), base[runs[k]["segment"], runs[k]["rollout"]]
+    for run in both:
+        here, there = of(run), base[run["segment"], run["rollout"]]
         values.append(None if here is None or there is None else here - there)
-    return values, [runs[k]["group"] for k in places], np.array(places, np.int64)
+    return values, [run["group"] for run in both]

@@ -174,8 +174,7 @@ def run_suite(
                     out / planner.name / crowd.name,
                 )
                 pairs[planner.name, crowd.name] = pair
-                base = _base(suite, pairs, earlier, pair)
-                _drive(suite, pair, base, progress)
+                _drive(suite, pair, progress)
         ordered = [pairs[one.name, crowd.name] for crowd in suite.crowds for one in suite.planners]
         if all(run["failed"] for pair in ordered for run in pair.runs):
             why = next(run["failed"] for pair in ordered for run in pair.runs)
@@ -195,7 +194,6 @@ def run_suite(
 def _drive(
     suite: Suite,
     pair: Pair,
-    base: Sequence[dict[str, Any]] | None,
     progress: Callable[[str, int, int], None] | None,
 ) -> None:
     """Simulate a pair part by part, until its verdict is clear."""
@@ -292,7 +290,7 @@ def judged(suite: Suite, pair: Pair, base: Sequence[dict[str, Any]] | None) -> l
     for one in _thresholds(suite, pair):
         measure = MEASURES[one.metric]
         if one.compared:
-            values, groups, _ = paired(pair.runs, base or (), measure.of)
+            values, groups = paired(pair.runs, base or (), measure.of)
             known = estimate(values, groups, one.confidence or 0.95)
         else:
             values = [measure.of(run) for run in pair.runs]

@@ -5,6 +5,7 @@ The format is TOML; ``docs/test-bench.md`` describes it. Everything in it is che
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -226,6 +227,8 @@ class _Reader:
             sides = [side for side in ("at_most", "at_least") if side in entry]
             if len(sides) != 1:
                 raise self._wrong("threshold", k, "metric", "has one of at_most and at_least")
+            if not math.isfinite(entry[sides[0]]):
+                raise self._wrong("threshold", k, sides[0], f"is a number, not {entry[sides[0]]}")
             confidence = entry.get("confidence", sure)
             if confidence is not False:
                 self._confidence(confidence, "threshold", k)
