@@ -85,20 +85,17 @@ def test_rates_of_independent_runs_are_binomial(hits: list[bool], confidence: fl
         assert (found.low, found.high) == pytest.approx((100 * low, 100 * high))
 
 
-@pytest.mark.parametrize(("rate", "alike"), [(0.05, 0.0), (0.05, 0.6), (0.2, 0.0), (0.2, 0.6), (0.5, 0.9)])
+@pytest.mark.parametrize(("rate", "alike"), [(0.05, 0.6), (0.2, 0.0), (0.5, 0.9)])
 def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float) -> None:
     """Also where the runs of a group share their fate; as runs of their own they would not."""
     rng = np.random.default_rng(0)
     groups = np.repeat(np.arange(20), 5)
     held = 0
-    for _ in range(300):
-        shared = rng.random(20)[groups] < rate
-        own = rng.random(100) < rate
+    for _ in range(200):
+        shared, own = rng.random(20)[groups] < rate, rng.random(100) < rate
         hit = np.where(rng.random(20)[groups] < alike, shared, own)
-        found = estimate((100.0 * hit).tolist(), groups.astype(str).tolist(), 0.95, "rate")
-        assert found.high is not None
-        held += found.high >= 100 * rate
-    assert held / 300 >= 0.93
+        held += estimate((100.0 * hit).tolist(), groups.astype(str).tolist(), 0.95, "rate").high >= 100 * rate
+    assert held / 200 >= 0.93
 
 
 @given(st.integers(2, 30), st.sampled_from([0.9, 0.95]))
@@ -193,14 +190,11 @@ def test_log_playback_passes_and_a_wild_planner_is_judged(suite: Path, tmp_path:
     assert json.loads((out / "result.json").read_text())["verdicts"] == found["verdicts"]
 
 
-def test_a_suite_of_the_hardest_segments(suite: Path) -> None:
-    suite.write_text(SUITE.replace("rollouts = 2", "rollouts = 2\nhardest = 4"))
+def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:
+    text = SUITE.replace('planners = ["log"]', "").replace("rollouts = 2", "hardest = 4")
+    suite.write_text(text)
     chosen = read_suite(suite)
     assert list(chosen.items) == [row for row, _ in hardest(chosen.store, 4)]
-
-
-def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:
-    suite.write_text(SUITE.replace('planners = ["log"]', ""))
     assert main(["test", str(suite), "--out", str(tmp_path / "out"), "--no-view"]) == 1
     tree = ET.parse(tmp_path / "out" / "junit.xml")  # noqa: S314 - ours
     failures = [case.get("classname") for case in tree.iter("testcase") if case.find("failure") is not None]
@@ -257,7 +251,7 @@ def test_regressions_are_named_against_a_planner_and_an_earlier_result(suite: Pa
 
 @pytest.mark.parametrize(("name", "status"), [("suite.toml", 0), ("suite_fails.toml", 1)])
 def test_examples_end_as_they_say(tmp_path: Path, name: str, status: int) -> None:
-    text = (EXAMPLES / name).read_text().replace("rollouts = 2", "segments = 9\nrollouts = 1")
+    text = (EXAMPLES / name).read_text().replace("rollouts = 2", "segments = 5\nrollouts = 1")
     (tmp_path / name).write_text(re.sub(r"at_most = [1-9]\d", "at_most = 90", text))
     (tmp_path / "coast.py").write_bytes((EXAMPLES / "coast.py").read_bytes())
     assert main(["test", str(tmp_path / name), "--out", str(tmp_path / "out"), "--no-view"]) == status

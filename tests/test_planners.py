@@ -40,16 +40,14 @@ def states(segment: RunSegment, planner: str = "idm") -> Any:
     return found.rollouts.state[0, 0, :, 0].numpy()
 
 
-def in_a_row(
-    speeds: list[float], starts: list[float], steps: int = 151, lane: tuple[int, ...] = ()
-) -> RunSegment:
+def in_a_row(speeds: list[float], starts: list[float], steps: int = 131, lane: Any = 0) -> RunSegment:
     """Cars at constant speeds on a straight road of two lanes, by default all on the first one."""
-    time = 0.2 * np.arange(steps)
-    x = np.asarray(starts)[:, None] + np.asarray(speeds)[:, None] * time
-    y = LANE_WIDTH * np.asarray(lane or (0,) * len(speeds), float)[:, None] + 0 * x
+    speed, start = np.asarray(speeds, float)[:, None], np.asarray(starts, float)[:, None]
+    x = start + speed * 0.2 * np.arange(steps)
+    y = np.broadcast_to(LANE_WIDTH * np.reshape(lane, (-1, 1)), x.shape)
     line = np.arange(0.0, 1000.0, 2.0)
     road = make_road([np.stack([line, np.full_like(line, k * LANE_WIDTH)], -1) for k in (0, 1)])
-    velocity = np.stack([np.asarray(speeds)[:, None] + 0 * x, 0 * x], -1)
+    velocity = np.stack([speed + 0 * x, 0 * x], -1)
     return make_segment(road, np.stack([x, y], -1), 0 * x, velocity)
 
 
@@ -64,21 +62,19 @@ def test_idm_stops_behind_a_standing_car(speed: float) -> None:
     np.testing.assert_allclose(found[:, 1:3], 0, atol=1e-4)
 
 
-@pytest.mark.parametrize("dt", [2.0])
-def test_idm_keeps_its_place_where_steps_are_long(dt: float) -> None:
-    """Of more metres than are looked at around the last place."""
-    found = states(in_a_row([14, 0], [20, 180], steps=31).replace(dt=dt))
-    gap = 180 - found[:, 0] - LENGTH
+def test_idm_keeps_its_place_where_steps_are_long() -> None:
+    """Steps of more metres than are looked at around the last place."""
+    found = states(in_a_row([14, 0], [20, 180], steps=31).replace(dt=2.0))
     assert np.diff(found[:, 0]).max() > 20
-    assert gap.min() > 0
+    assert (180 - found[:, 0] - LENGTH).min() > 0
     assert found[-1, 3] < 0.5
 
 
 def test_idm_follows_at_its_headway() -> None:
     """Where nothing changes any more, s = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     leader = 8.0
-    found = states(in_a_row([12, leader], [20, 60], steps=251))
-    gap = 60 + leader * 50 - found[-1, 0] - LENGTH
+    found = states(in_a_row([12, leader], [20, 60], steps=201))
+    gap = 60 + leader * 40 - found[-1, 0] - LENGTH
     assert found[-1, 3] == pytest.approx(leader, abs=0.05)
     assert gap == pytest.approx((2 + 1.5 * leader) / np.sqrt(1 - (leader / LIMIT) ** 4), abs=0.3)
 
@@ -95,21 +91,16 @@ def test_idm_stops_behind_a_standing_car_where_its_route_comes_by_twice(gap: flo
     assert found[-1, 3] < 0.5
 
 
-def test_idm_alone_drives_at_the_limit() -> None:
-    found = states(in_a_row([5], [20], steps=151))
-    assert found[-1, 3] == pytest.approx(LIMIT, abs=0.1)
-    assert found[:, 3].max() <= LIMIT + 1e-3
-
-
 def test_a_car_in_the_next_lane_or_behind_is_nobody_to_follow() -> None:
-    alone = states(in_a_row([10], [60]))
-    with_others = states(in_a_row([10, 0, 0], [60, 100, 30], lane=(0, 1, 0)))
-    np.testing.assert_array_equal(alone, with_others)
+    alone = states(in_a_row([10], [60], steps=91))
+    assert alone[-1, 3] == pytest.approx(LIMIT, abs=0.2)
+    assert alone[:, 3].max() <= LIMIT + 1e-3
+    others = states(in_a_row([10, 0, 0], [60, 100, 30], lane=(0, 1, 0), steps=91))
+    np.testing.assert_allclose(alone, others, atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_idm_keeps_its_lane_in_turns(seed: int) -> None:
-    segment = crossing(1, steps=91, seed=seed).replace(
+def test_idm_keeps_its_lane_in_turns() -> None:
+    segment = crossing(1, steps=91, seed=1).replace(
         signal_lane=np.zeros(0, np.int32),
         signal_point=np.zeros((0, 3), np.float32),
         signal_state=np.zeros((0, 91), np.uint8),

@@ -1,4 +1,4 @@
-"""How critical logged driving is for the ego: which run segments are the hard ones.
+"""How critical driving is for the ego: which run segments, or which simulated runs of them, are the hard ones.
 
 Sources: least time to collision (Hayward 1972), post-encroachment time (Allen, Shin and Cooper 1978).
 """
@@ -33,7 +33,7 @@ NEAR_EDGE = 0.5
 
 @dataclass(frozen=True)
 class Criticality:
-    """Of the ego's log.
+    """How critical a drive of the ego is.
 
     Attributes:
         segment: id.
@@ -62,23 +62,26 @@ class Criticality:
         return sum(max(0.0, min(1.0, part)) for part in parts)
 
 
-def criticality(segment: RunSegment) -> Criticality:
-    """How critical a run segment is for its ego; others on another level do not count."""
-    heights = agent_heights(segment)
-    world = World(
-        segment.position[..., :2].astype(np.float64),
-        segment.heading.astype(np.float64),
-        segment.velocity.astype(np.float64),
-        segment.valid,
-        segment.size[:, :2].astype(np.float64),
-        heights.swapaxes(0, 1) if len(heights) else None,
-    )
-    seen = np.flatnonzero(segment.valid[segment.ego])
-    speed = world.speed[segment.ego, seen]
-    slower = np.diff(speed) / (np.diff(seen) * segment.dt)
-    ego = _boxes(world, segment.ego, seen)
-    edges = [shapely.LineString(line) for line in _lines(segment)]
-    margin = float(shapely.distance(shapely.union_all(edges), ego).min()) if edges and len(ego) else math.inf
+def criticality(segment: RunSegment, world: World | None = None) -> Criticality:
+    """How critical a run segment is for its ego, by the log or in a simulated world; others on another level do not
+    count.
+    """
+    if world is None:
+        heights = agent_heights(segment)
+        world = World(
+            segment.position[..., :2].astype(np.float64),
+            segment.heading.astype(np.float64),
+            segment.velocity.astype(np.float64),
+            segment.valid,
+            segment.size[:, :2].astype(np.float64),
+            heights.swapaxes(0, 1) if len(heights) else None,
+        )
+    seen = np.flatnonzero(world.valid[segment.ego])
+    slower = np.diff(world.speed[segment.ego, seen]) / (np.diff(seen) * segment.dt)
+    ego = _boxes(world, np.full(len(seen), segment.ego), seen)
+    boundary = segment.road.boundary
+    lines = [boundary[k][:, :2].astype(np.float64) for k in range(len(boundary)) if len(boundary[k]) > 1]
+    edges = shapely.union_all([shapely.LineString(line) for line in lines])
     ttc = time_to_collision(world, np.array([segment.ego]))
     return Criticality(
         segment.segment_id,
@@ -86,7 +89,7 @@ def criticality(segment: RunSegment) -> Criticality:
         float(ttc[ttc > 0].min(initial=math.inf)),
         _encroachment(world, segment, seen, ego),
         float(-slower.min(initial=0.0)) + 0.0,
-        margin,
+        float(shapely.distance(edges, ego).min(initial=math.inf)) if lines else math.inf,
     )
 
 
@@ -94,38 +97,33 @@ def _encroachment(
     world: World, segment: RunSegment, seen: NDArray[np.int64], ego: NDArray[np.object_]
 ) -> float:
     """Least seconds between the boxes of the ego and of one who crosses its way, at the same place at two steps."""
-    who, step = segment.valid.nonzero()
-    other = who != segment.ego
-    who, step = who[other], step[other]
+    who, step = world.valid.nonzero()
+    who, step = who[who != segment.ego], step[who != segment.ego]
     mine, theirs = shapely.STRtree(_boxes(world, who, step)).query(ego, predicate="intersects")
-    apart = np.abs(seen[mine] - step[theirs]) * segment.dt
+    mine, who, step = seen[mine], who[theirs], step[theirs]
+    apart = np.abs(mine - step) * segment.dt
     # Who follows in a lane comes to each place soon after: that is a headway.
-    turn = world.heading[segment.ego, seen[mine]] - world.heading[who, step][theirs]
+    turn = world.heading[segment.ego, mine] - world.heading[who, step]
     crosses = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) > CROSSING
     if world.height is not None:
-        one, two = world.height[segment.ego, seen[mine]], world.height[who[theirs], step[theirs]]
-        crosses &= ~levels_apart(torch.from_numpy(one), torch.from_numpy(two)).numpy()
-    apart = apart[crosses & (apart > 0)]
-    least = float(apart.min(initial=math.inf))
+        one, two = (
+            torch.from_numpy(world.height[segment.ego, mine]),
+            torch.from_numpy(world.height[who, step]),
+        )
+        crosses &= ~levels_apart(one, two).numpy()
+    least = float(apart[crosses & (apart > 0)].min(initial=math.inf))
     return least if least <= LONGEST else math.inf
 
 
-def _boxes(world: World, row: NDArray[np.int64] | int, step: NDArray[np.int64]) -> NDArray[np.object_]:
+def _boxes(world: World, row: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.object_]:
     """Boxes of agents at steps, as polygons."""
-    half = 0.5 * np.broadcast_to(world.size[row], (len(step), 2))
-    corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half[:, None]
-    heading = world.heading[row, step]
-    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    turned = np.stack(
-        [corner[..., 0] * cos - corner[..., 1] * sin, corner[..., 0] * sin + corner[..., 1] * cos], -1
+    x, y = (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.5 * world.size[row][:, None]).transpose(
+        2, 0, 1
     )
+    cos, sin = (part(world.heading[row, step])[:, None] for part in (np.cos, np.sin))
+    turned = np.stack([x * cos - y * sin, x * sin + y * cos], -1)
     polygons: NDArray[np.object_] = shapely.polygons(world.position[row, step][:, None] + turned)
     return polygons
-
-
-def _lines(segment: RunSegment) -> list[NDArray[np.float64]]:
-    boundary = segment.road.boundary
-    return [boundary[k][:, :2].astype(np.float64) for k in range(len(boundary)) if len(boundary[k]) > 1]
 
 
 def hardest(

@@ -24,13 +24,8 @@ Run = dict[str, Any]
 
 @dataclass(frozen=True)
 class Measure:
-    """A number of each run.
-
-    Attributes:
-        of: the number; None where it is not defined.
-        unit: of the number.
-        text: what it says, for people.
-        kind: whether it is a ``rate``, 100 for a run in which something happens and 0 for any other, or a ``mean``.
+    """A number of each run, None where it is not defined: a ``rate``, 100 for a run in which something happens and 0
+    for any other, or a ``mean``; with its unit and what it says, for people.
     """
 
     of: Callable[[Run], float | None]
@@ -39,51 +34,46 @@ class Measure:
     kind: Literal["rate", "mean"] = "mean"
 
 
-def _happens(name: str) -> Callable[[Run], float | None]:
-    return lambda run: None if run["failed"] or run[name] is None else 100.0 * bool(run[name])
+def _happens(name: str, text: str) -> Measure:
+    def of(run: Run) -> float | None:
+        return None if run["failed"] or run[name] is None else 100.0 * bool(run[name])
+
+    return Measure(of, "% of runs", text, "rate")
 
 
-def _number(name: str) -> Callable[[Run], float | None]:
-    return lambda run: None if run["failed"] else run[name]
+def _number(name: str, unit: str, text: str) -> Measure:
+    return Measure(lambda run: None if run["failed"] else run[name], unit, text)
 
 
 MEASURES: dict[str, Measure] = {
-    "at_fault_collision_rate": Measure(
-        _happens("at_fault_collision"), "% of runs", "collisions at fault", "rate"
-    ),
-    "collision_rate": Measure(_happens("collision"), "% of runs", "collisions", "rate"),
-    "red_light_rate": Measure(_happens("red_lights"), "% of runs", "runs of a red light", "rate"),
-    "offroad_rate": Measure(_happens("offroad_time"), "% of runs", "runs that leave the road", "rate"),
-    "wrong_way_rate": Measure(_happens("wrong_way_time"), "% of runs", "runs against the traffic", "rate"),
-    "blocking_rate": Measure(_happens("blocking_time"), "% of runs", "runs that block traffic", "rate"),
+    "at_fault_collision_rate": _happens("at_fault_collision", "collisions at fault"),
+    "collision_rate": _happens("collision", "collisions"),
+    "red_light_rate": _happens("red_lights", "runs of a red light"),
+    "offroad_rate": _happens("offroad_time", "runs that leave the road"),
+    "wrong_way_rate": _happens("wrong_way_time", "runs against the traffic"),
+    "blocking_rate": _happens("blocking_time", "runs that block traffic"),
     "failed_rate": Measure(lambda run: 100.0 * bool(run["failed"]), "% of runs", "runs that failed", "rate"),
     "score": Measure(run_score, "of 100", "score"),
     "pdm_score": Measure(lambda run: run["pdm_score"], "of 100", "PDM score"),
-    "progress_ratio": Measure(_number("progress_ratio"), "", "progress relative to the log's"),
-    "offroad_time": Measure(_number("offroad_time"), "% of time", "time off the road"),
-    "wrong_way_time": Measure(_number("wrong_way_time"), "% of time", "time against the traffic"),
-    "blocking_time": Measure(_number("blocking_time"), "% of time", "time that traffic is blocked"),
-    "low_ttc_time": Measure(_number("low_ttc_time"), "% of time", "time within 1 s of a collision"),
-    "log_distance": Measure(_number("log_distance"), "m", "distance to the log"),
-    "max_acceleration": Measure(_number("max_acceleration"), "m/s²", "peak acceleration"),
-    "max_braking": Measure(_number("max_braking"), "m/s²", "peak braking"),
-    "max_jerk": Measure(_number("max_jerk"), "m/s³", "peak jerk"),
-    "max_lateral_acceleration": Measure(
-        _number("max_lateral_acceleration"), "m/s²", "peak lateral acceleration"
-    ),
+    "progress_ratio": _number("progress_ratio", "", "progress relative to the log's"),
+    "offroad_time": _number("offroad_time", "% of time", "time off the road"),
+    "wrong_way_time": _number("wrong_way_time", "% of time", "time against the traffic"),
+    "blocking_time": _number("blocking_time", "% of time", "time that traffic is blocked"),
+    "low_ttc_time": _number("low_ttc_time", "% of time", "time within 1 s of a collision"),
+    "log_distance": _number("log_distance", "m", "distance to the log"),
+    "max_acceleration": _number("max_acceleration", "m/s²", "peak acceleration"),
+    "max_braking": _number("max_braking", "m/s²", "peak braking"),
+    "max_jerk": _number("max_jerk", "m/s³", "peak jerk"),
+    "max_lateral_acceleration": _number("max_lateral_acceleration", "m/s²", "peak lateral acceleration"),
 }
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over runs.
+    """A mean over runs that have such a number, None without any, and the groups of segments that they are of.
 
-    Attributes:
-        mean: None where no run has such a number.
-        low: the mean is not below this, with the confidence that was asked for; None where that is not known.
-        high: likewise, it is not above this.
-        runs: that have such a number.
-        groups: of segments that these runs are of.
+    With the confidence that was asked for the mean is not below ``low``, and with the same not above ``high``; None
+    where that is not known.
     """
 
     mean: float | None
@@ -126,6 +116,12 @@ def estimate(
     return Estimate(mean, mean - spread, mean + spread, len(value), count)
 
 
+def measured(runs: Sequence[Run], measure: Measure, confidence: float = 0.95) -> Estimate:
+    """The mean of a measure over runs, with its bounds."""
+    groups = [run["group"] for run in runs]
+    return estimate([measure.of(run) for run in runs], groups, confidence, measure.kind)
+
+
 def _rate_bound(
     value: NDArray[np.float64], group: NDArray[np.int64], groups: int, confidence: float
 ) -> float:
@@ -152,15 +148,8 @@ def _rate_bound(
 
 
 def needed_groups(limit: float, confidence: float) -> int:
-    """Groups of which none may show an event before a rate is known to be at most a limit.
-
-    Args:
-        limit: of the rate, in percent, above 0.
-        confidence: of the claim.
-    """
-    if limit >= 100:
-        return 1
-    return math.ceil(math.log(1 - confidence) / math.log1p(-limit / 100.0))
+    """Groups of which none may show an event before a rate is known to be at most a limit in percent, above 0."""
+    return 1 if limit >= 100 else math.ceil(math.log(1 - confidence) / math.log1p(-limit / 100.0))
 
 
 def paired(

@@ -36,14 +36,9 @@ _OBJECT_HIT = 0.5
 
 
 class PDM(NamedTuple):
-    """Terms of the score, each from 0 to 1.
-
-    Attributes:
-        no_collision: at fault; half for an object.
-        on_road: whether the whole box stays in the drivable area.
-        time_to_collision: whether enough is left at every step.
-        comfort: whether all limits are kept.
-        progress: relative to the log's.
+    """Terms of the score, each from 0 to 1: no collision at fault (half for one with an object), the whole box within
+    the drivable area, enough time to a collision at every step, all limits of comfort kept, and progress relative to
+    the log's.
     """
 
     no_collision: float
@@ -60,27 +55,20 @@ class PDM(NamedTuple):
 
 
 def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> PDM | None:
-    """The terms of one run of the ego.
+    """The terms of one run of the ego; None where it failed, or the road's boundary or its progress is not defined.
 
     Args:
         run: its row of :class:`symphony.evaluation.report.Report`.
         saved: the rollouts it is one of.
         collisions: rows of the agents that it ran into, at fault.
-
-    Returns:
-        None where the run failed, or the road's boundary or its progress is not defined.
     """
     if run["failed"] or run["offroad_time"] is None:
         return None
-    segment = saved.segment
-    if run["progress_ratio"] is None:
-        if run["beyond_route"] or run["no_route"]:
-            return None
-        progress = 1.0
-    else:
-        progress = min(max(float(run["progress_ratio"]), 0.0), 1.0)
-        if run["progress_ratio"] > 0 and abs(run["progress"] / run["progress_ratio"]) < STANDS:
-            progress = 1.0
+    segment, ratio = saved.segment, run["progress_ratio"]
+    if ratio is None and (run["beyond_route"] or run["no_route"]):
+        return None
+    # Where the log makes no progress there is none to make.
+    stands = ratio is None or (ratio > 0 and abs(run["progress"] / ratio) < STANDS)
     users = (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST)
     hits = [1.0 if segment.agent_type[row] in users else _OBJECT_HIT for row in collisions]
     ego = int(np.flatnonzero(saved.agents == segment.ego)[0])
@@ -91,18 +79,12 @@ def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> 
         on_road=float(not run["offroad_time"]),
         time_to_collision=float(run["min_ttc"] is None or run["min_ttc"] >= LEAST_TTC),
         comfort=float(comfortable(path[:, 2], path[:, 3], segment.dt)),
-        progress=progress,
+        progress=1.0 if stands else min(max(float(ratio), 0.0), 1.0),
     )
 
 
 def comfortable(heading: Reals, speed: Reals, dt: float) -> bool:
-    """Whether a drive keeps all limits.
-
-    Args:
-        heading: [U] radians.
-        speed: [U] m/s along the heading.
-        dt: seconds between states.
-    """
+    """Whether a drive of headings [U] (radians) and speeds [U] (m/s), dt seconds apart, keeps all limits."""
     if len(speed) < 3:
         return True
     turned = np.unwrap(heading)
@@ -111,25 +93,24 @@ def comfortable(heading: Reals, speed: Reals, dt: float) -> bool:
     # In the frame of the vehicle, which turns.
     jerk_along = derivative(speed, dt, 2) - across * yaw_rate
     jerk_across = derivative(across, dt, 1) + along * yaw_rate
-    kept = (
-        along.max() <= MOST_ACCELERATION,
-        along.min() >= -MOST_BRAKING,
-        np.abs(across).max() <= MOST_SIDEWAYS,
-        np.hypot(jerk_along, jerk_across).max() <= MOST_JERK,
-        np.abs(jerk_along).max() <= MOST_JERK_ALONG,
-        np.abs(yaw_rate).max() <= MOST_YAW_RATE,
-        np.abs(yaw_acceleration).max() <= MOST_YAW_ACCELERATION,
+    limited = (
+        (along, MOST_ACCELERATION),
+        (-along, MOST_BRAKING),
+        (np.abs(across), MOST_SIDEWAYS),
+        (np.hypot(jerk_along, jerk_across), MOST_JERK),
+        (np.abs(jerk_along), MOST_JERK_ALONG),
+        (np.abs(yaw_rate), MOST_YAW_RATE),
+        (np.abs(yaw_acceleration), MOST_YAW_ACCELERATION),
     )
-    return all(map(bool, kept))
+    return all(bool(values.max() <= most) for values, most in limited)
 
 
 def derivative(values: Reals, dt: float, order: int) -> Reals:
     """[U] derivative of [U] values: of the polynomial of second degree (third for a second derivative) that fits best
     within :data:`WINDOW` around each (Savitzky and Golay 1964); at the ends of that of the first and last window.
     """
-    degree = order + 1
-    width = min(len(values), max(degree + 1, 2 * round(0.5 * WINDOW / dt) + 1))
-    degree = min(degree, width - 1)
+    width = min(len(values), max(order + 2, 2 * round(0.5 * WINDOW / dt) + 1))
+    degree = min(order + 1, width - 1)
     if degree < order:
         return np.zeros(len(values))
     first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from symphony.agents.agent import load_agent
-from symphony.bench.measures import MEASURES, Estimate, estimate, paired
+from symphony.bench.measures import MEASURES, Estimate, Run, estimate, measured, paired
 from symphony.bench.published import pdm
 from symphony.bench.suite import Crowd, Suite, SuitePlanner, Threshold
 from symphony.errors import AllFailedError, DataError
@@ -39,6 +39,10 @@ EVENTS = {
 Status = Literal["passes", "fails", "undecided"]
 
 
+Progress = Callable[[str, int, int], None] | None
+"""Called with a pair's name, the runs done and their total."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether a planner keeps a threshold in a crowd.
@@ -59,13 +63,7 @@ class Verdict:
 
 @dataclass
 class Pair:
-    """A planner in a crowd.
-
-    Attributes:
-        report: its runs so far, and what happened in them.
-        planned: runs that the suite asks for.
-        folder: of its rollouts.
-    """
+    """A planner in a crowd: how many runs are planned, where they are kept, and what happened in them so far."""
 
     planner: SuitePlanner
     crowd: Crowd
@@ -75,7 +73,12 @@ class Pair:
     seconds: float = 0.0
 
     @property
-    def runs(self) -> list[dict[str, Any]]:
+    def name(self) -> str:
+        """Both names."""
+        return f"{self.planner.name} among {self.crowd.name}"
+
+    @property
+    def runs(self) -> list[Run]:
         """A row for each run."""
         return self.report.rows
 
@@ -102,51 +105,41 @@ class Result:
 
     def plain(self) -> dict[str, Any]:
         """All of it, as JSON can hold it."""
+
+        def verdict(one: Verdict) -> dict[str, Any]:
+            limit, found = one.threshold, one.found
+            return {
+                **{
+                    "planner": one.planner,
+                    "crowd": one.crowd,
+                    "threshold": str(limit),
+                    "metric": limit.metric,
+                },
+                **{"compared": limit.compared, "status": one.status, "value": found.mean, "bound": one.bound},
+                **{"limit": limit.limit, "runs": found.runs, "groups": found.groups},
+            }
+
+        def pair(one: Pair) -> dict[str, Any]:
+            return {
+                **{"planner": one.planner.name, "crowd": one.crowd.name, "planned": one.planned},
+                **{"stopped": one.stopped, "seconds": round(one.seconds, 1)},
+                "numbers": {name: measured(one.runs, measure).mean for name, measure in MEASURES.items()},
+                "per_run": [{**run, "score": run_score(run)} for run in one.runs],
+            }
+
         return {
             "format": FORMAT,
             "suite": self.suite.name,
             "passed": self.passed,
             "store": {"path": str(self.suite.store.path), "checksum": self.suite.store.checksum()},
             "seconds": round(self.seconds, 1),
-            "verdicts": [
-                {
-                    "planner": one.planner,
-                    "crowd": one.crowd,
-                    "threshold": str(one.threshold),
-                    "metric": one.threshold.metric,
-                    "compared": one.threshold.compared,
-                    "status": one.status,
-                    "value": one.found.mean,
-                    "bound": one.bound,
-                    "limit": one.threshold.limit,
-                    "runs": one.found.runs,
-                    "groups": one.found.groups,
-                }
-                for one in self.verdicts
-            ],
+            "verdicts": [verdict(one) for one in self.verdicts],
             "regressions": self.regressions,
-            "pairs": [
-                {
-                    "planner": pair.planner.name,
-                    "crowd": pair.crowd.name,
-                    "planned": pair.planned,
-                    "stopped": pair.stopped,
-                    "seconds": round(pair.seconds, 1),
-                    "numbers": {name: _mean(pair.runs, name) for name in MEASURES},
-                    "per_run": [{**run, "score": run_score(run)} for run in pair.runs],
-                }
-                for pair in self.pairs
-            ],
+            "pairs": [pair(one) for one in self.pairs],
         }
 
 
-def _mean(runs: Sequence[dict[str, Any]], name: str) -> float | None:
-    return estimate([MEASURES[name].of(run) for run in runs], [run["group"] for run in runs], 0.95).mean
-
-
-def run_suite(
-    suite: Suite, out: Path, progress: Callable[[str, int, int], None] | None = None, *, view: bool = True
-) -> Result:
+def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool = True) -> Result:
     """Simulate and judge a suite; what was interrupted goes on where it stopped.
 
     Args:
@@ -162,76 +155,72 @@ def run_suite(
     began = time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
     with Lock(out / "suite.lock"):
-        earlier = _earlier(suite)
-        pairs: dict[tuple[str, str], Pair] = {}
+        base = _earlier(suite)
+        pairs = []
         # The baseline comes first: others are compared with it.
         for planner in sorted(suite.planners, key=lambda one: one.name != suite.baseline):
             for crowd in suite.crowds:
-                pair = Pair(
-                    planner,
-                    crowd,
-                    len(suite.items) * crowd.config.rollouts,
-                    out / planner.name / crowd.name,
-                )
-                pairs[planner.name, crowd.name] = pair
-                _drive(suite, pair, progress)
-        ordered = [pairs[one.name, crowd.name] for crowd in suite.crowds for one in suite.planners]
-        if all(run["failed"] for pair in ordered for run in pair.runs):
-            why = next(run["failed"] for pair in ordered for run in pair.runs)
-            raise AllFailedError(f"every run failed, the first: {why}")
+                planned = len(suite.items) * crowd.config.rollouts
+                pairs.append(Pair(planner, crowd, planned, out / planner.name / crowd.name))
+                _drive(suite, pairs[-1], progress)
+        order = [one.name for one in suite.planners]
+        pairs.sort(key=lambda pair: (suite.crowds.index(pair.crowd), order.index(pair.planner.name)))
+        runs = [run for pair in pairs for run in pair.runs]
+        if all(run["failed"] for run in runs):
+            raise AllFailedError(f"every run failed, the first: {runs[0]['failed']}")
+        for pair in pairs:
+            if pair.planner.name == suite.baseline:
+                base |= {(one, pair.crowd.name): pair.runs for one in order if one != suite.baseline}
         verdicts, regressions = [], []
-        for pair in ordered:
-            base = _base(suite, pairs, earlier, pair)
-            verdicts += judged(suite, pair, base)
-            regressions += find_regressions(pair, base)
+        for pair in pairs:
+            before = base.get((pair.planner.name, pair.crowd.name), [])
+            verdicts += judged(suite, pair, before)
+            regressions += find_regressions(pair, before)
             if view:
-                _write_view(pair)
-        result = Result(suite, ordered, verdicts, regressions, time.perf_counter() - began)
+                folder = RolloutFolder(pair.folder)
+                replays = ((one, pair.report.events.get(one.segment.segment_id, [])) for one in folder)
+                write_file(pair.folder / "view.html", view_page(pair.name, replays, folder.about.settings))
+        result = Result(suite, pairs, verdicts, regressions, time.perf_counter() - began)
         write_json(out / "result.json", result.plain())
     return result
 
 
-def _drive(
-    suite: Suite,
-    pair: Pair,
-    progress: Callable[[str, int, int], None] | None,
-) -> None:
+def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
     """Simulate a pair part by part, until its verdict is clear."""
     began, config = time.perf_counter(), pair.crowd.config
     agent = load_agent(pair.crowd.agent, config.device)
     # Beside log playback nobody else is simulated.
     others = 1 if agent.policy is None else agent.interactive
-    name = f"{pair.planner.name} among {pair.crowd.name}"
-    for part in range(ROUNDS):
+    pair.report.agent = pair.name
+    for part in range(min(ROUNDS, len(suite.items))):
         items = suite.items[part::ROUNDS]
-        if not items:
-            break
-        dataset = crowd_dataset(suite.store, agent, config, items, default=others, routes=True)
         done = len(pair.runs)
 
         def tell(segments: int, total: int, done: int = done) -> None:
             if progress is not None:
-                progress(name, done + segments * config.rollouts, pair.planned)
+                progress(pair.name, done + segments * config.rollouts, pair.planned)
 
         folder = save_simulation(
             pair.folder,
             agent,
-            dataset,
+            crowd_dataset(suite.store, agent, config, items, default=others, routes=True),
             config,
             planner=pair.planner.planner,
             planner_seconds=pair.planner.seconds,
             progress=tell,
         ).only(suite.store.ids[i] for i in items)
         found = report(folder, "ego")
-        pair.report.rows += _with_pdm(found, folder)
+        pair.report.rows += with_pdm(found, folder)
         pair.report.events |= found.events
-        if pair.planner.name != suite.baseline and _lost(suite, pair):
+        # The rest need not be simulated where some threshold can't be kept any more.
+        if pair.planner.name != suite.baseline and any(
+            _beyond(one, pair) for one in _thresholds(suite, pair)
+        ):
             break
-    pair.report.agent = name
     pair.seconds = time.perf_counter() - began
 
 
-def _with_pdm(found: Report, folder: RolloutFolder) -> list[dict[str, Any]]:
+def with_pdm(found: Report, folder: RolloutFolder) -> list[Run]:
     """The rows of a report with the PDM score of each run."""
     rows = {(row["segment"], row["rollout"]): row for row in found.rows}
     for saved in folder:
@@ -243,11 +232,6 @@ def _with_pdm(found: Report, folder: RolloutFolder) -> list[dict[str, Any]]:
     return [{"pdm_score": 0.0 if row["failed"] else None, **row} for row in found.rows]
 
 
-def _lost(suite: Suite, pair: Pair) -> bool:
-    """Whether some threshold can't be kept any more, so that the rest need not be simulated."""
-    return any(_beyond(one, pair) for one in _thresholds(suite, pair))
-
-
 def _beyond(one: Threshold, pair: Pair) -> bool:
     """Whether a rate will be beyond its limit even if nothing happens in the runs that are left.
 
@@ -256,50 +240,33 @@ def _beyond(one: Threshold, pair: Pair) -> bool:
     measure = MEASURES[one.metric]
     if one.compared or one.side != "at_most" or measure.kind != "rate":
         return False
-    values = [measure.of(run) for run in pair.runs]
-    hits = sum(value for value in values if value is not None)
+    known = [value for run in pair.runs if (value := measure.of(run)) is not None]
     # The runs that are left may all count.
-    known = sum(value is not None for value in values) + pair.planned - len(pair.runs)
-    return known > 0 and hits / known > one.limit
+    count = len(known) + pair.planned - len(pair.runs)
+    return count > 0 and sum(known) / count > one.limit
 
 
 def _thresholds(suite: Suite, pair: Pair) -> list[Threshold]:
     """Those of a pair. A failed run is no good run: if nothing is said of them, none may fail."""
-    found = [
-        one
-        for one in suite.thresholds
-        if pair.planner.name in one.planners
-        and pair.crowd.name in one.crowds
-        # The baseline is not compared with itself.
-        and not (one.compared and pair.planner.name == suite.baseline)
-    ]
+    planner, crowd = pair.planner.name, pair.crowd.name
+    found = [one for one in suite.thresholds if planner in one.planners and crowd in one.crowds]
+    # The baseline is not compared with itself.
+    found = [one for one in found if not (one.compared and planner == suite.baseline)]
     if all(one.metric != "failed_rate" for one in found):
-        found.append(Threshold("failed_rate", 0.0, "at_most", None, (pair.planner.name,), (pair.crowd.name,)))
+        found.append(Threshold("failed_rate", 0.0, "at_most", None, (planner,), (crowd,)))
     return found
 
 
-def judged(suite: Suite, pair: Pair, base: Sequence[dict[str, Any]] | None) -> list[Verdict]:
-    """The verdicts of a pair.
-
-    Args:
-        suite: its thresholds.
-        pair: after its runs.
-        base: the baseline's runs in this crowd; None for none.
-    """
+def judged(suite: Suite, pair: Pair, base: Sequence[Run]) -> list[Verdict]:
+    """The verdicts of a pair after its runs, compared with the baseline's in this crowd."""
     found = []
     for one in _thresholds(suite, pair):
-        measure = MEASURES[one.metric]
+        measure, sure = MEASURES[one.metric], one.confidence or 0.95
         if one.compared:
-            values, groups = paired(pair.runs, base or (), measure.of)
-            known = estimate(values, groups, one.confidence or 0.95)
+            known = estimate(*paired(pair.runs, base, measure.of), sure)
         else:
-            values = [measure.of(run) for run in pair.runs]
-            known = estimate(
-                values, [run["group"] for run in pair.runs], one.confidence or 0.95, measure.kind
-            )
-        bound = known.high if one.side == "at_most" else known.low
-        if one.confidence is None:
-            bound = known.mean
+            known = measured(pair.runs, measure, sure)
+        bound = known.mean if one.confidence is None else known.high if one.side == "at_most" else known.low
         # A pair that was stopped has lost one threshold, and leaves the others open.
         if bound is None or (pair.stopped and not _beyond(one, pair)):
             status: Status = "undecided"
@@ -310,48 +277,27 @@ def judged(suite: Suite, pair: Pair, base: Sequence[dict[str, Any]] | None) -> l
     return found
 
 
-def find_regressions(pair: Pair, base: Sequence[dict[str, Any]] | None) -> list[dict[str, Any]]:
+def find_regressions(pair: Pair, base: Sequence[Run]) -> list[dict[str, Any]]:
     """Runs that were worse than the baseline's of the same segment and rollout, and how."""
-    before = {(run["segment"], run["rollout"]): run for run in base or ()}
+    before = {(run["segment"], run["rollout"]): run for run in base}
     found = []
     for run in pair.runs:
         other = before.get((run["segment"], run["rollout"]))
-        if other is None or other is run:
+        if other is None:
             continue
         what = [text for name, text in EVENTS.items() if run[name] and not other[name]]
         here, there = run_score(run), run_score(other)
         if not what and here is not None and there is not None and there - here > DROP:
             what = [f"scores {here:.0f}, not {there:.0f}"]
         if what:
-            found.append(
-                {
-                    "planner": pair.planner.name,
-                    "crowd": pair.crowd.name,
-                    "segment": run["segment"],
-                    "rollout": run["rollout"],
-                    "seed": pair.crowd.config.seed,
-                    "what": ", ".join(what),
-                }
-            )
+            who = {"planner": pair.planner.name, "crowd": pair.crowd.name, "seed": pair.crowd.config.seed}
+            where = {"segment": run["segment"], "rollout": run["rollout"], "what": ", ".join(what)}
+            found.append({**who, **where})
     return found
 
 
-def _base(
-    suite: Suite,
-    pairs: Mapping[tuple[str, str], Pair],
-    earlier: Mapping[tuple[str, str], list[dict[str, Any]]],
-    pair: Pair,
-) -> Sequence[dict[str, Any]] | None:
-    """The baseline's runs in the same crowd."""
-    if isinstance(suite.baseline, Path):
-        return earlier.get((pair.planner.name, pair.crowd.name))
-    if not suite.baseline or pair.planner.name == suite.baseline:
-        return None
-    return pairs[suite.baseline, pair.crowd.name].runs
-
-
-def _earlier(suite: Suite) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Runs of an earlier result, by planner and crowd."""
+def _earlier(suite: Suite) -> dict[tuple[str, str], list[Run]]:
+    """Runs of an earlier result that is the baseline, by planner and crowd."""
     if not isinstance(suite.baseline, Path):
         return {}
     try:
@@ -363,9 +309,3 @@ def _earlier(suite: Suite) -> dict[tuple[str, str], list[dict[str, Any]]]:
         return {(one["planner"], one["crowd"]): list(one["per_run"]) for one in found["pairs"]}
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"is no result of a suite: {error!r}", file=suite.baseline) from error
-
-
-def _write_view(pair: Pair) -> None:
-    folder = RolloutFolder(pair.folder)
-    replays = ((saved, pair.report.events.get(saved.segment.segment_id, [])) for saved in folder)
-    write_file(pair.folder / "view.html", view_page(pair.report.agent, replays, folder.about.settings))

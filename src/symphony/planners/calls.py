@@ -23,12 +23,8 @@ class _Overdue(BaseException):
 def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: float = SECONDS) -> list[Any]:
     """Ask planners, each for what it sees; gives plans in their order, or the exceptions that the calls ended with.
 
-    Those of one class that has ``plan_batch`` are asked together, and fail together.
-
-    Args:
-        planners: any number.
-        seen: as many.
-        seconds: for each call; in threads other than the first there is no limit.
+    Those of one class that has ``plan_batch`` are asked together, and fail together. Each call may take so many
+    seconds; in threads other than the first there is no limit.
     """
     found: list[Any] = [None] * len(planners)
     together: dict[type, list[int]] = {}
@@ -39,26 +35,17 @@ def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: floa
             found[m] = answer(planner.plan, seen[m], seconds=seconds)
     for kind, members in together.items():
         given = answer(
-            kind.plan_batch,  # type: ignore[attr-defined]
-            [planners[m] for m in members],
-            [seen[m] for m in members],
-            seconds=seconds,
+            _batch, kind, [planners[m] for m in members], [seen[m] for m in members], seconds=seconds
         )
-        if not isinstance(given, Exception):
-            given = _as_many(given, len(members))
         for k, m in enumerate(members):
             found[m] = given if isinstance(given, Exception) else given[k]
     return found
 
 
-def _as_many(given: Any, count: int) -> Any:
-    """The plans that ``plan_batch`` gave as a list, or an exception if they are something else."""
-    try:
-        plans = list(given)
-    except TypeError:
-        return TypeError(f"plan_batch gave no plans, but {type(given).__name__}")
-    if len(plans) != count:
-        return ValueError(f"plan_batch gave {len(plans)} plans for {count} planners")
+def _batch(kind: Any, planners: list[Planner], seen: list[Traffic]) -> list[Any]:
+    plans = list(kind.plan_batch(planners, seen))
+    if len(plans) != len(planners):
+        raise ValueError(f"plan_batch gave {len(plans)} plans for {len(planners)} planners")
     return plans
 
 
@@ -83,8 +70,7 @@ def _at_most(seconds: float) -> Iterator[None]:
         return
 
     def ring(number: int, frame: FrameType | None) -> None:
-        place = f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})" if frame is not None else ""
-        raise _Overdue(place)
+        raise _Overdue("" if frame is None else f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})")
 
     before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)

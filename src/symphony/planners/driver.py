@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from symphony import keys
 from symphony.data.segment import RunSegment
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import bicycle_step
+from symphony.envs.observation import ObservationConfig
 from symphony.envs.routes import ONWARD, SPACING
 from symphony.errors import ConfigError
 from symphony.planners.calls import SECONDS, answer, plans_of
@@ -42,12 +43,7 @@ class PlannedEnv(DrivingEnv):
 
 
 class Failure(NamedTuple):
-    """Why a planner drives no more.
-
-    Attributes:
-        step: from which on the rollout doesn't count.
-        reason: in words.
-    """
+    """Why a planner drives no more: from which step on the rollout doesn't count, and the reason in words."""
 
     step: int
     reason: str
@@ -69,6 +65,41 @@ class EgoPlanners(NamedTuple):
     seconds: float = SECONDS
 
 
+class RuledEgo(TensorDictModuleBase):
+    """Writes the states that a rule for background agents leads the egos to as ``PLANNED``.
+
+    Args:
+        env: the environment.
+        rule: made with an environment, it writes ``BACKGROUND``.
+        start: [...] states at which rollouts begin; each names its scene as its planner.
+    """
+
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012 - the type declared
+    out_keys = [keys.PLANNED]  # noqa: RUF012
+
+    def __init__(
+        self, env: DrivingEnv, rule: Callable[[PlannedEnv], TensorDictModuleBase], start: TensorDictBase
+    ) -> None:
+        super().__init__()
+        scenes = env.scenes.clone(recurse=False)
+        scenes.background = torch.zeros_like(scenes.background).index_fill(
+            1, scenes.interactive.new_zeros(1), 1
+        )
+        self.rule = rule(PlannedEnv(scenes, env.dynamics, ObservationConfig.nothing()))
+        self.lost = scenes.route_logged[:, 0] < 0
+        start.set(keys.PLANNER, start.get(keys.SCENE).clone())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write planned states [..., 4]."""
+        moved = self.rule(tensordict.select(*self.in_keys)).get(keys.BACKGROUND)
+        return tensordict.set(keys.PLANNED, moved[..., 0, :])
+
+    def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
+        """The failures of egos in these scenes, flattened: those on no lane fail from the first step on."""
+        failure = Failure(0, "reset: the ego is on no lane that it could follow")
+        return [failure if lost else None for lost in self.lost[number.flatten()].tolist()]
+
+
 class EgoPolicy(TensorDictModuleBase):
     """Asks the planners and writes the states they lead to as ``PLANNED``.
 
@@ -86,7 +117,7 @@ class EgoPolicy(TensorDictModuleBase):
         ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
     """
 
-    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012 - the type declared
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012
     out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
 
     def __init__(
@@ -101,9 +132,11 @@ class EgoPolicy(TensorDictModuleBase):
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
         stream = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed).flatten().tolist()
-        self._routes = routes = [self._route(row) for row in range(len(egos.segments))]
+        self._routes = [self._route(row) for row in range(len(egos.segments))]
         for number, row in enumerate(scene):
-            made = scenario_of(egos.segments[row], routes[row], state[number], stream[number] & (2**63 - 1))
+            made = scenario_of(
+                egos.segments[row], self._routes[row], state[number], stream[number] & (2**63 - 1)
+            )
             planner = answer(egos.make, seconds=egos.seconds)
             error = planner if isinstance(planner, Exception) else None
             error = error or answer(planner.reset, made, seconds=egos.seconds)
@@ -116,10 +149,10 @@ class EgoPolicy(TensorDictModuleBase):
 
     def _route(self, row: int) -> NDArray[np.float32]:
         """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
-        scenes, which = self.env.scenes, int(self.env.scenes.route_logged[row, 0])
+        which = int(self.env.scenes.route_logged[row, 0])
         if which < 0:
             return np.zeros((0, 2), np.float32)
-        return scenes.whole_route(row, 0, which).cpu().numpy()
+        return self.env.scenes.whole_route(row, 0, which).cpu().numpy()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write planned states [..., 4] and numbers of planners [..., 1]."""
@@ -128,28 +161,27 @@ class EgoPolicy(TensorDictModuleBase):
             tensordict.get(key).flatten(0, tensordict.ndim - 1)
             for key in (keys.STATE, keys.VALID, keys.PROGRESS)
         )
-        come = progress[:, 0].tolist()
         everyone = self.env.objects(scene, at, state, valid)
-        rows, steps, driving = scene.tolist(), at.tolist(), valid[:, 0].tolist()
+        rows, steps, come = scene.tolist(), at.tolist(), progress[:, 0].tolist()
         # An ego that has left the map is over, too.
-        going = [
-            step < self._last[row] and there for row, step, there in zip(rows, steps, driving, strict=True)
-        ]
+        last, there = self._last[rows].tolist(), valid[:, 0].tolist()
+        going = [step < end and here for step, end, here in zip(steps, last, there, strict=True)]
         numbers = self._own(number.tolist(), going)
         own = state[:, 0].cpu().double()
-        moves, there = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
-        # One that is over, or has failed, keeps its speed.
-        control, target = np.zeros((len(rows), 2)), np.full((len(rows), 4), np.nan)
+        moves, present = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
         asked: list[tuple[int, Planner, Traffic]] = []
         for m, row in enumerate(rows):
             planner = self._held[numbers[m]]
             if going[m] and not isinstance(planner, Failure):
                 ahead = route_from(self._routes[row], come[m])
-                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], there[m], ahead)
-                asked.append((m, planner, seen))
+                asked.append(
+                    (m, planner, self._traffic(row, steps[m], own[m].numpy(), moves[m], present[m], ahead))
+                )
         plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
+        # One that is over, or has failed, keeps its speed.
+        control, target = np.zeros((len(rows), 2)), np.full((len(rows), 4), np.nan)
         for (m, _, seen), given in zip(asked, plans, strict=True):
-            found = given
+            found: Any = given
             if not isinstance(given, Exception):
                 found = answer(checked_plan, given, seen.state, self.env.dt)
             if isinstance(found, Exception):
@@ -158,9 +190,9 @@ class EgoPolicy(TensorDictModuleBase):
                 (control if len(found) == 2 else target)[m] = found
         length = [float(self.egos.segments[row].size[self.egos.segments[row].ego, 0]) for row in rows]
         pulled, turned = torch.from_numpy(control).unbind(-1)
-        driven = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
+        after = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
         wanted = torch.from_numpy(target)
-        after = torch.where(wanted.isnan(), driven, wanted).to(state)
+        after = torch.where(wanted.isnan(), after, wanted).to(state)
         tensordict.set(keys.PLANNED, after.reshape(*tensordict.shape, 4))
         return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
 
@@ -197,14 +229,14 @@ class EgoPolicy(TensorDictModuleBase):
         self,
         row: int,
         step: int,
-        own: NDArray[np.float64],
-        moves: NDArray[np.float64],
-        there: NDArray[np.bool_],
-        route: NDArray[np.float64],
+        own: NDArray[Any],
+        moves: NDArray[Any],
+        there: NDArray[Any],
+        route: NDArray[Any],
     ) -> Traffic:
         segment = self.egos.segments[row]
-        moves, there = moves[: segment.num_agents], there[: segment.num_agents]
-        moves = np.where(there[:, None], moves, 0.0)
+        there = there[: segment.num_agents]
+        moves = np.where(there[:, None], moves[: segment.num_agents], 0.0)
         return Traffic(
             step=step,
             time=step * self.env.dt,
@@ -219,6 +251,21 @@ class EgoPolicy(TensorDictModuleBase):
             lights=fixed(segment.signal_state[:, step]),
             route=fixed(route),
         )
+
+
+def ego_policy(
+    env: DrivingEnv,
+    egos: EgoPlanners,
+    start: TensorDictBase,
+    seed: int,
+    rules: Mapping[str, Callable[[PlannedEnv], TensorDictModuleBase]],
+    *,
+    forked: bool = False,
+) -> EgoPolicy | RuledEgo:
+    """What moves the egos: the rule that a planner's class names, or else planners of their own."""
+    if rule := getattr(egos.make, "rule", ""):
+        return RuledEgo(env, rules[rule], start)
+    return EgoPolicy(env, egos, start, seed, forked=forked)
 
 
 def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float64]:

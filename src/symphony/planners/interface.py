@@ -24,10 +24,8 @@ from symphony.imports import load_object
 
 Reals = NDArray[np.float64]
 
-MAX_ACCELERATION = 5.0
-"""m/s^2 that a vehicle gains at most, whatever it is asked for."""
-MAX_BRAKING = 10.0
-"""m/s^2 that it loses at most."""
+MAX_ACCELERATION, MAX_BRAKING = 5.0, 10.0
+"""m/s^2 that a vehicle gains and loses at most, whatever it is asked for."""
 MAX_STEERING = 0.6
 """Radians of its front wheels either way."""
 MAX_SPEED = 80.0
@@ -178,10 +176,19 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
     Raises:
         ConfigError: there is no such planner, or it has no ``reset`` and ``plan``.
     """
+    from symphony.planners.process import ProcessPlanner  # noqa: PLC0415 - both build on this module
+    from symphony.planners.view import FunctionPlanner  # noqa: PLC0415
+
     name, given = planner_name(planner), planner
     if isinstance(given, str):
         if given.startswith(PIPE):
-            return _process_maker(given.removeprefix(PIPE))
+            try:
+                words = shlex.split(given.removeprefix(PIPE))
+            except ValueError as error:
+                raise ConfigError(f"planner '{given}': {error}") from error
+            if not words or shutil.which(words[0]) is None:
+                raise ConfigError(f"planner '{given}': there is no command '{words[0] if words else ''}'")
+            return partial(ProcessPlanner, given.removeprefix(PIPE))
         path = NAMES.get(given, given)
         if ":" not in path:
             raise ConfigError(
@@ -190,15 +197,13 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
             )
         given = load_object(path)
     if not inspect.isclass(given) and len(_needed(given)) == 1:
-        from symphony.planners.view import FunctionPlanner  # noqa: PLC0415 - builds on this module
-
         return partial(FunctionPlanner, given)
     try:
         made = given()
     except (Exception, SystemExit) as error:  # whatever a user's planner raises
         raise ConfigError(f"planner '{name}' can't be made: {type(error).__name__}: {error}") from error
     missing = [part for part in ("reset", "plan") if not callable(getattr(made, part, None))]
-    if missing:
+    if missing and not hasattr(made, "rule"):
         raise ConfigError(f"planner '{name}' has no {' and no '.join(missing)}")
     return given
 
@@ -212,18 +217,6 @@ def planner_name(planner: str | Callable[..., Any]) -> str:
     return f"{getattr(planner, '__module__', '')}:{getattr(planner, '__qualname__', type(planner).__name__)}"
 
 
-def _process_maker(command: str) -> Callable[[], Planner]:
-    from symphony.planners.process import ProcessPlanner  # noqa: PLC0415 - builds on this module
-
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise ConfigError(f"planner '{PIPE}{command}': {error}") from error
-    if not words or shutil.which(words[0]) is None:
-        raise ConfigError(f"planner '{PIPE}{command}': there is no command '{words[0] if words else ''}'")
-    return partial(ProcessPlanner, command)
-
-
 def _needed(function: Callable[..., Any]) -> list[str]:
     """Arguments by position that a function can't do without."""
     by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -235,19 +228,11 @@ def _needed(function: Callable[..., Any]) -> list[str]:
 
 
 def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
-    """The scenario that planners of a run segment are told.
-
-    Args:
-        segment: the segment.
-        route: [P, 2].
-        state: [4] first state of the ego.
-        seed: of the rollout.
-    """
+    """The scenario of a run segment, for a route [P, 2], the first state [4] of the ego and a seed."""
     ego, valid = segment.ego, segment.valid[segment.ego]
     heading, velocity = segment.heading[ego].astype(np.float64), segment.velocity[ego].astype(np.float64)
     speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
     position = segment.position[ego, :, :2].astype(np.float64)
-    last = segment.num_steps - 1 - int(valid[::-1].argmax())
     return Scenario(
         segment_id=segment.segment_id,
         dt=float(segment.dt),
@@ -256,7 +241,7 @@ def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], s
         size=fixed(segment.size[ego, :2].astype(np.float64)),
         state=fixed(state.astype(np.float64)),
         route=fixed(route.astype(np.float64)),
-        goal=fixed(position[last]),
+        goal=fixed(position[np.flatnonzero(valid)[-1]]),
         road=_fixed_road(segment.road),
         signal_lane=fixed(segment.signal_lane),
         signal_point=fixed(segment.signal_point[:, :2].astype(np.float64)),
@@ -275,14 +260,11 @@ def fixed(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _fixed_road(road: RoadMap) -> RoadMap:
-    def of(value: Any) -> Any:
-        return (
-            Polylines(fixed(value.points), fixed(value.offsets))
-            if isinstance(value, Polylines)
-            else fixed(value)
-        )
-
-    return replace(road, **{item.name: of(getattr(road, item.name)) for item in fields(road)})
+    parts: dict[str, Any] = {item.name: getattr(road, item.name) for item in fields(road)}
+    for name, value in parts.items():
+        lines = isinstance(value, Polylines)
+        parts[name] = Polylines(fixed(value.points), fixed(value.offsets)) if lines else fixed(value)
+    return replace(road, **parts)
 
 
 def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
@@ -299,22 +281,20 @@ def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
     numbers = np.asarray(plan, np.float64)
     trajectory = numbers.ndim == 2 and numbers.shape[1] == 4 and len(numbers) > 0
     if numbers.shape not in ((2,), (4,)) and not trajectory:
-        shape = "x".join(map(str, numbers.shape)) or "single"
         raise ValueError(
             "a plan is 4 numbers (a state), several such states, or 2 numbers (acceleration, steering), "
-            f"not a {shape} one"
+            f"not a {'x'.join(map(str, numbers.shape)) or 'single'} one"
         )
     if not np.isfinite(numbers).all():
         raise ValueError(f"a plan that is not finite: {numbers.tolist()}")
-    if trajectory:
-        numbers = numbers[0]
-    if len(numbers) == 4:
-        away = math.dist(numbers[:2], state[:2])
-        if max(away / dt, abs(numbers[3])) > MAX_SPEED:
-            raise ValueError(
-                f"a target {away:.1f} m away at {numbers[3]:.1f} m/s, at most {MAX_SPEED:g} m/s are possible"
-            )
-        if abs(numbers[2]) > MAX_HEADING:
-            raise ValueError(f"a heading of {numbers[2]:g} rad, at most {MAX_HEADING:g} are possible")
-        return numbers
-    return np.clip(numbers, [-MAX_BRAKING, -MAX_STEERING], [MAX_ACCELERATION, MAX_STEERING])
+    if numbers.shape == (2,):
+        return np.clip(numbers, [-MAX_BRAKING, -MAX_STEERING], [MAX_ACCELERATION, MAX_STEERING])
+    target: Reals = numbers[0] if trajectory else numbers
+    away = math.dist(target[:2], state[:2])
+    if max(away / dt, abs(target[3])) > MAX_SPEED:
+        raise ValueError(
+            f"a target {away:.1f} m away at {target[3]:.1f} m/s, at most {MAX_SPEED:g} m/s are possible"
+        )
+    if abs(target[2]) > MAX_HEADING:
+        raise ValueError(f"a heading of {target[2]:g} rad, at most {MAX_HEADING:g} are possible")
+    return target

@@ -29,6 +29,7 @@ import signal
 import subprocess
 import time
 import weakref
+from math import isnan
 from typing import Any
 
 from symphony.planners.interface import Scenario, Traffic
@@ -51,7 +52,6 @@ class ProcessPlanner:
 
     def __init__(self, command: str) -> None:
         self.command = command
-        self._process: subprocess.Popen[bytes] | None = None
 
     def reset(self, scenario: Scenario) -> None:
         """Start the process and tell it the scene."""
@@ -65,31 +65,21 @@ class ProcessPlanner:
             start_new_session=True,  # a group of its own, which can be ended with it
         )
         self._ended = weakref.finalize(self, _end, self._process)
-        lanes = [
-            {
-                "id": lane.id,
-                "points": lane.points.tolist(),
-                "speed_limit": None if lane.speed_limit != lane.speed_limit else lane.speed_limit,
-                "successors": list(lane.successors),
-            }
-            for lane in lanes_of(scenario)
-        ]
         x, y = scenario.signal_point.T.tolist()
-        lane = scenario.road.lane_id[scenario.signal_lane].tolist()
-        given = self._ask(
-            "reset",
-            {
-                "segment_id": scenario.segment_id,
-                "dt": scenario.dt,
-                "steps": scenario.steps,
-                "seed": scenario.seed,
-                "ego": Ego(*scenario.state.tolist(), *scenario.size.tolist())._asdict(),
-                "goal": scenario.goal.tolist(),
-                "route": scenario.route.tolist(),
-                "lanes": lanes,
-                "lights": {"x": x, "y": y, "lane": lane},
-            },
-        )
+        told = {name: getattr(scenario, name) for name in ("segment_id", "dt", "steps", "seed")}
+        told |= {
+            "ego": Ego(*scenario.state.tolist(), *scenario.size.tolist())._asdict(),
+            "goal": scenario.goal.tolist(),
+            "route": scenario.route.tolist(),
+            "lanes": [
+                lane._asdict()
+                | {"points": lane.points.tolist()}
+                | ({"speed_limit": None} if isnan(lane.speed_limit) else {})
+                for lane in lanes_of(scenario)
+            ],
+            "lights": {"x": x, "y": y, "lane": scenario.road.lane_id[scenario.signal_lane].tolist()},
+        }
+        given = self._ask("reset", told)
         if not isinstance(given, dict):
             self._ended()
             raise ValueError(f"answered reset with {str(given)[:80]}, not with {{}}")
@@ -115,29 +105,27 @@ class ProcessPlanner:
         return given["plan"]
 
     def _ask(self, what: str, told: dict[str, Any]) -> Any:
-        if self._process is None:
-            raise RuntimeError("the planner's process was not started")
         try:
-            return self._answer(self._process, what, json.dumps({what: told}, allow_nan=False).encode())
+            return self._answer(what, json.dumps({what: told}, allow_nan=False).encode())
         except BaseException:
             self._ended()
             raise
 
-    def _answer(self, process: subprocess.Popen[bytes], what: str, told: bytes) -> Any:
-        pipe, waiting = process.stdout, select.poll()
-        if pipe is None or process.stdin is None:
-            raise RuntimeError("the planner's process has no pipes")
+    def _answer(self, what: str, told: bytes) -> Any:
+        pipe, waiting = self._process.stdout, select.poll()
+        assert pipe is not None and self._process.stdin is not None  # noqa: S101, PT018 - as asked for
         waiting.register(pipe, select.POLLIN)
-        if waiting.poll(0) and (more := os.read(pipe.fileno(), 80)):
-            raise ValueError(f"wrote more than one line for an answer: {more.decode(errors='replace')!r}")
+        line = os.read(pipe.fileno(), 80) if waiting.poll(0) else b""
+        if line:
+            raise ValueError(f"wrote more than one line for an answer: {line.decode(errors='replace')!r}")
         with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(told + b"\n")
-        line = b""
+            self._process.stdin.write(told + b"\n")
         while b"\n" not in line:
             part = os.read(pipe.fileno(), 1 << 16)
             if not part:
+                status = self._ended()
                 raise RuntimeError(
-                    f"the planner's process ended (status {self._ended()}) without an answer to {what}"
+                    f"the planner's process ended (status {status}) without an answer to {what}"
                 )
             line += part
             if len(line) > LONGEST:

@@ -69,20 +69,9 @@ class Lights(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The record that a planner sees at one step.
-
-    Attributes:
-        time: seconds since the start.
-        dt: seconds per step.
-        step: since the start, 0 at the first call.
-        ego: the ego.
-        agents: everyone else.
-        route: [K, 2] points to follow from where the ego is, as of :class:`~symphony.planners.interface.Traffic`; may
-            be empty.
-        lanes: of the map.
-        lights: traffic lights.
-        segment_id: of the run segment.
-        seed: of the rollout.
+    """The record that a planner sees at one step: seconds and steps since the start, seconds per step, the ego and
+    everyone else, points [K, 2] to follow from where the ego is (see :class:`~symphony.planners.interface.Traffic`;
+    may be empty), lanes and lights of the map, the run segment's id and the seed of the rollout.
     """
 
     time: float

@@ -24,7 +24,7 @@ from symphony.errors import ConfigError
 from symphony.learning.logged import logged, logged_heights
 from symphony.metrics import collisions
 from symphony.modules import SeededNoise
-from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv
+from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv, RuledEgo, ego_policy
 from symphony.rollouts.background import CarFollower, ConstantSpeed
 from symphony.rollouts.control import Tempered, given_personas
 from symphony.rollouts.finite import NaNGuard
@@ -123,12 +123,12 @@ def simulation(
         personas=given_personas(agent.personas, config.persona),
         fix=fix,
     )
-    planned: EgoPolicy | None = None
+    planned: EgoPolicy | RuledEgo | None = None
     result: BeamSearchResult | None = None
     if egos is not None:
         if kind == "backtrack":
             raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
-        planned = EgoPolicy(env, egos, start, config.seed, forked=searches)
+        planned = ego_policy(env, egos, start, config.seed, RULES, forked=searches)
         actor = TensorDictSequential(actor, planned)
     if not searches:
         noise = SeededNoise(config.seed, env.dynamics.numbers)
@@ -285,7 +285,7 @@ def _fixed_goals(
     return fixed
 
 
-def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
+def _without_failed(found: Simulation, planned: EgoPolicy | RuledEgo, number: Tensor) -> Simulation:
     """Steps after a planner, number [B, K, 1], failed don't count."""
     scenes, rollouts = number.shape[:2]
     each = planned.failures(number)
