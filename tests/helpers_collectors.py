@@ -26,15 +26,11 @@ class Walk(EnvBase):
         number = Unbounded((1,), dtype=torch.int64)
         self.observation_spec = Composite({"agents": x, "step": number, STREAM: number.clone()})
         self.state_spec = self.observation_spec.clone()
-        self.action_spec = Composite(
-            {"agents": Composite({"action": Unbounded((agents, 1))}, shape=(agents,))}
-        )
-        self.reward_spec = Composite(
-            {"agents": Composite({"reward": Unbounded((agents, 1))}, shape=(agents,))}
-        )
-        self.done_spec = Composite(
-            {k: Binary(shape=(1,), dtype=torch.bool) for k in ("done", "truncated", "terminated")}
-        )
+        for name in ("action", "reward"):
+            one = Composite({name: Unbounded((agents, 1))}, shape=(agents,))
+            setattr(self, f"{name}_spec", Composite({"agents": one}))
+        flags = ("done", "truncated", "terminated")
+        self.done_spec = Composite({name: Binary(shape=(1,), dtype=torch.bool) for name in flags})
         self.rng = torch.Generator()
         self.set_seed(0)
 
@@ -105,23 +101,13 @@ def starts(env: Walk, *rows: int, branches: int, seed: int = 0) -> TensorDictBas
     return give_streams(start)
 
 
-class FreshWalk(Walk):
-    """Seeded by whatever the process would draw next, as unseeded environments are."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.set_seed(int(torch.randint(1 << 31, ())))
-
-
-class Weighted(nn.Module):
-    """Distance times a weight."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(()))
-
-    def forward(self, tensordict: TensorDictBase) -> Tensor:
-        return self.weight * distance(tensordict)
+def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
+    """The same entries with the same values, to the last bit."""
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    for key in first.keys(True, True):
+        torch.testing.assert_close(
+            first.get(key), second.get(key), rtol=0, atol=0, equal_nan=True, msg=str(key)
+        )
 
 
 class Mass(EnvBase):
@@ -156,9 +142,8 @@ class Mass(EnvBase):
         self.state_spec = spec(place=Unbounded((*each, 2)))
         self.action_spec = spec(action=Bounded(-1, 1, (*each, 1)))
         self.reward_spec = spec(reward=Unbounded((*each, 1)))
-        self.done_spec = spec(
-            **{name: Binary(1, shape=(*each, 1), dtype=torch.bool) for name in ("done", "terminated")}
-        )
+        flag = Binary(1, shape=(*each, 1), dtype=torch.bool)
+        self.done_spec = spec(done=flag, terminated=flag.clone())
         self.shape_of_one = each[len(self.batch_size) :]
         self.rng = torch.Generator()
         self.set_seed(0)
@@ -172,8 +157,7 @@ class Mass(EnvBase):
             "observation": seen.clone(),
             "done": over,
             "terminated": over.clone(),
-            **more,
-        }
+        } | more
         shape = seen.shape[: -1 - len(self.shape_of_one)]
         found = TensorDict(entries, seen.shape[:-1])
         return found if self.group is None else TensorDict({self.group: found}, shape)

@@ -12,10 +12,9 @@ from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 from torchrl.envs import ParallelEnv, PendulumEnv, SerialEnv, StepCounter, TransformedEnv
 
-from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, distance, noise, starts
+from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, assert_same, distance, noise, starts
 from symphony.collectors import (
     Aggregate,
-    BeamSearchCollector,
     KeepAll,
     KeepBest,
     KeyScore,
@@ -24,7 +23,6 @@ from symphony.collectors import (
     beam_search,
     branch,
     check_branching,
-    lineage,
     max_then_sum,
     mean_then_sum,
 )
@@ -38,16 +36,10 @@ def no_gradients():
 
 
 def search(start, *, env=None, policy=None, score=distance, steps=12, prune_every=4, **kwargs):
-    kwargs.setdefault("slot_keys", [STREAM])
+    how = {"slot_keys": [STREAM], **kwargs}
     return beam_search(
-        env or Walk(), policy or Policy(), score, start, steps=steps, prune_every=prune_every, **kwargs
+        env or Walk(), policy or Policy(), score, start, steps=steps, prune_every=prune_every, **how
     )
-
-
-def assert_same(first, second):
-    assert set(first.keys(True, True)) == set(second.keys(True, True))
-    for key in first.keys(True, True):
-        assert_close(first.get(key), second.get(key), rtol=0, atol=0, msg=str(key))
 
 
 def test_one_branch_is_a_plain_rollout():
@@ -64,21 +56,21 @@ def test_one_branch_is_a_plain_rollout():
 def test_constant_score_prunes_blindly(branches):
     """With nothing to choose by, the parents are a fixed pattern and every slot goes on with numbers of its own."""
     start = starts(Walk(), 3, branches=branches)
-    found = search(start, score=lambda td: td.get(X).squeeze(-1) * 0)
-    half = torch.arange(branches) % math.ceil(branches / 2)
-    assert (found.parents == half).all()
-    tree = search(start, score=lambda td: td.get(X).squeeze(-1) * 0, keep_tree=True).tree
-    for step in range(12):
-        here = tree[..., step]
-        assert_close(here.get(STREAM), start.get(STREAM), rtol=0, atol=0)
-        assert_close(here.get(ACTION), -0.2 * here.get(X) + noise(here, 2))
+    found = search(start, score=lambda td: td.get(X).squeeze(-1) * 0, keep_tree=True)
+    assert (found.parents == torch.arange(branches) % math.ceil(branches / 2)).all()
+    tree = found.tree
+    assert torch.equal(tree.get(STREAM), start.get(STREAM)[..., None, :].expand(3, branches, 12, 1))
+    assert_close(tree.get(ACTION), -0.2 * tree.get(X) + noise(tree, 2))
 
 
 def test_leaves_are_true_histories():
     """Replaying a leaf's actions from its start gives its states, log-probabilities and scores."""
     env, policy = Walk(), Policy()
     start = starts(env, 3, branches=8)
+    before, versions = start.clone(), {k: v._version for k, v in start.items(True, True)}
     found = search(start, env=env, policy=policy, steps=14)
+    assert_same(start, before)
+    assert versions == {k: v._version for k, v in start.items(True, True)}
     leaves, now = found.trajectories, start
     for step in range(14):
         here = leaves[..., step]
@@ -91,23 +83,16 @@ def test_leaves_are_true_histories():
 
 
 def test_the_better_half_survives():
-    branches, prune_every = 6, 4
     # Rounded scores make ties, which must go to the lower slot.
-    found = search(
-        starts(Walk(), 4, branches=branches), score=lambda td: distance(td).round(), steps=10, keep_tree=True
-    )
-    ties = 0
-    for row in range(4):
-        for period, first in enumerate(range(0, 10, prune_every)):
-            scores = found.simulated_scores[row, :, first : first + prune_every].tolist()
-            totals = [
-                sum(max(step[agent] for step in branch_scores) for agent in range(2))
-                for branch_scores in scores
-            ]
-            assert found.totals[row, period].tolist() == totals
-            ties += len(set(totals)) < branches
-            ranked = sorted(range(branches), key=lambda slot, t=totals: (t[slot], slot))[:3]
-            assert found.parents[row, period].tolist() == ranked + ranked
+    branches, ties = 6, 0
+    found = search(starts(Walk(), 4, branches=branches), score=lambda td: distance(td).round(), steps=10)
+    for row, (period, first) in itertools.product(range(4), enumerate(range(0, 10, 4))):
+        scores = found.simulated_scores[row, :, first : first + 4].tolist()
+        totals = [sum(max(step[agent] for step in one) for agent in range(2)) for one in scores]
+        assert found.totals[row, period].tolist() == totals
+        ties += len(set(totals)) < branches
+        ranked = sorted(range(branches), key=lambda slot, t=totals: (t[slot], slot))[:3]
+        assert found.parents[row, period].tolist() == ranked + ranked
     assert ties > 0
 
 
@@ -117,9 +102,8 @@ def test_the_last_period_may_be_short_and_unpruned():
     assert pruned.totals.shape == (2, 3, 4)
     assert (kept.parents[:, -1] == torch.arange(4)).all()
     assert_close(kept.simulated_scores, pruned.simulated_scores)
-    assert_close(
-        pruned.scores, kept.scores.gather(1, pruned.parents[:, -1, :, None, None].expand(2, 4, 10, 2))
-    )
+    last = pruned.parents[:, -1, :, None, None].expand(2, 4, 10, 2)
+    assert_close(pruned.scores, kept.scores.gather(1, last))
     assert_close(search(start, steps=3, prune_every=10).totals, search(start, steps=3, prune_every=3).totals)
 
 
@@ -133,33 +117,22 @@ def test_rows_never_meet():
         alone = search(start.reshape(6, 4)[row])
         assert_same(alone.trajectories, flat.trajectories[row])
         assert_close(alone.scores, flat.scores[row], rtol=0, atol=0)
-
-
-def test_start_is_left_alone():
-    start = starts(Walk(), 2, branches=4)
-    before, versions = start.clone(), {k: v._version for k, v in start.items(True, True)}
-    search(start)
-    assert_same(start, before)
-    assert versions == {k: v._version for k, v in start.items(True, True)}
-
-
-def test_views_of_one_row_will_do_for_a_start():
-    env = Walk()
-    rows = env.reset(TensorDict({}, [3]))
+    rows = Walk().reset(TensorDict({}, [3]))  # views of one row will do for a start
     assert_same(search(branch(rows, 4)).trajectories, search(branch(rows, 4).clone()).trajectories)
 
 
 def test_copies_draw_numbers_of_their_slot():
     start = starts(Walk(), 3, branches=4)
-    apart, together = search(start, prune_last=False), search(start, prune_last=False, slot_keys=())
 
-    def twins(found):
-        x = found.trajectories.get(("next", *X))[:, :, -1]
-        return torch.isclose(x[:, :2], x[:, 2:]).all()
+    def twins(**how):
+        found = search(start, prune_last=False, **how).trajectories
+        x = found.get(("next", *X))[:, :, -1]
+        return torch.isclose(x[:, :2], x[:, 2:]).all(), found.get(STREAM)[:, :, -1]
 
-    assert twins(together)
-    assert not twins(apart)
-    assert_close(apart.trajectories.get(STREAM)[:, :, -1], start.get(STREAM))
+    assert twins(slot_keys=())[0]
+    alike, stream = twins()
+    assert not alike
+    assert_close(stream, start.get(STREAM))
 
 
 def test_gradient_follows_the_survivors():
@@ -168,13 +141,10 @@ def test_gradient_follows_the_survivors():
     with torch.enable_grad():
         root = start.get(X).clone().requires_grad_()
         found = search(start.clone().set(X, root), env=env, policy=policy)
-        loss = found.trajectories.get(("next", *X))[:, :, -1].square().sum() + found.totals.sum()
-        gain, at_root = torch.autograd.grad(
-            found.trajectories.get(("next", *X))[:, :, -1].square().sum(),
-            [policy.gain, root],
-            retain_graph=True,
-        )
-        assert torch.autograd.grad(loss, policy.gain)[0] != gain  # scores carry a gradient, too
+        end = found.trajectories.get(("next", *X))[:, :, -1].square().sum()
+        gain, at_root = torch.autograd.grad(end, [policy.gain, root], retain_graph=True)
+        scored = torch.autograd.grad(end + found.totals.sum(), policy.gain)[0]
+        assert scored != gain  # scores carry a gradient, too
         origin = found.slots[:, 0]
         x = root.gather(1, origin[..., None, None].expand(3, 4, 2, 1))
         drawn = noise(found.trajectories, 2)
@@ -217,73 +187,56 @@ class Drawing(Walk):
     ],
 )
 def test_what_remembers_can_not_be_branched(env, why):
-    env, start = env(), starts(Walk(), 2, branches=4)
-    start.set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
-    refused = f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and ParallelEnv can't"
-    with pytest.raises(ValueError, match=refused):
-        search(start, env=env)
-
-    def collect():
-        BeamSearchCollector(env, Policy(), score=distance, branches=4, frames_per_batch=4).next()
-
-    with pytest.raises(ValueError, match=refused):
-        collect()
+    start = starts(Walk(), 2, branches=4).set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
+    with pytest.raises(
+        ValueError, match=f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and Para"
+    ):
+        search(start, env=env())
 
 
-@pytest.mark.parametrize("action", ["discrete", "continuous"])
-def test_an_environment_of_gymnasium_can_not_be_branched(action):
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
+def test_an_environment_of_gymnasium_can_not_be_branched(name):
     pytest.importorskip("gymnasium")
     from torchrl.envs import GymEnv
 
-    env = GymEnv({"discrete": "CartPole-v1", "continuous": "Pendulum-v1"}[action])
     with pytest.raises(ValueError, match="GymEnv can't be branched"):
-        check_branching(env)
+        check_branching(GymEnv(name))
 
 
-def test_random_numbers_are_no_memory():
+@pytest.mark.parametrize("kind", [Drawing, Walk, PendulumEnv])
+def test_random_numbers_are_no_memory(kind):
     """Nor does looking for it cost any."""
-    for env in (Drawing(), Walk(), PendulumEnv(seed=0)):
-        state = (
-            env.reset(env.gen_params(batch_size=[3]), set_state=False)
-            if isinstance(env, PendulumEnv)
-            else starts(env, 3, branches=1)
-        )
-        torch.manual_seed(5)
-        own = env.rng.get_state() if isinstance(env, Walk) else None
-        before = state.clone()
-        check_branching(env, state)
-        assert_same(state, before)
-        drawn = torch.rand(3)
-        torch.manual_seed(5)
-        assert torch.equal(drawn, torch.rand(3))
-        assert own is None or torch.equal(own, env.rng.get_state())
-
-
-def test_lineage_by_hand():
-    parents = torch.tensor([[[2, 0, 2], [1, 1, 0], [2, 1, 0]]])
-    # the last pruning puts slots 2, 1, 0 into the leaves; slot 2 came from 0 and the others from 1; and so on
-    assert lineage(parents).tolist() == [[[2, 0, 0], [0, 1, 1], [2, 1, 0]]]
+    env = kind()
+    if isinstance(env, PendulumEnv):
+        state, own = env.reset(env.gen_params(batch_size=[3]), set_state=False), None
+    else:
+        state, own = starts(env, 3, branches=1), env.rng.get_state()
+    before = state.clone()
+    torch.manual_seed(5)
+    check_branching(env, state)
+    assert_same(state, before)
+    drawn = torch.rand(3)
+    torch.manual_seed(5)
+    assert torch.equal(drawn, torch.rand(3))
+    assert own is None or torch.equal(own, env.rng.get_state())
 
 
 def test_marks_of_the_tree():
     found = search(starts(Walk(), 3, branches=4), keep_tree=True)
     assert ((found.descendants > 0).sum(-1) <= 2).all()
     assert (found.descendants.sum(-1) == 4).all()
-    for row in range(3):
-        for leaf in range(4):
-            for step in range(12):
-                slot = found.slots[row, step // 4, leaf]
-                assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
+    for row, leaf, step in itertools.product(range(3), range(4), range(12)):
+        slot = found.slots[row, step // 4, leaf]
+        assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
     assert_close(found.leaf_totals, max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2)))
 
 
 def test_leaves_rank_by_their_total_after_those_of_histories_not_named_yet():
     generator = torch.Generator().manual_seed(0)
-    totals = torch.randint(3, (4, 5, 6), generator=generator).float()
-    slots = torch.randint(6, (4, 5, 7), generator=generator)
+    totals = torch.randint(3, (20, 6), generator=generator).float()
+    slots = torch.randint(6, (20, 7), generator=generator)
     found = ranking(totals.gather(-1, slots), slots)
-    for row in itertools.product(range(4), range(5)):
-        names = slots[row].tolist()
+    for row, names in enumerate(slots.tolist()):
 
         def place(leaf, row=row, names=names):
             return names[:leaf].count(names[leaf]), float(totals[row][names[leaf]]), leaf
@@ -299,39 +252,28 @@ def test_leaves_are_the_best_and_distinct():
     assert_close(best.slots, whole.slots[..., :4])
     assert_close(best.scores, whole.scores[:, :4])
     free, chosen = search(start, rule=KeepAll()), search(start, rule=KeepAll(), leaves=6)
-    order = free.totals[:, -1].argsort(-1)
-    assert torch.equal(chosen.slots[:, 0], order)
+    assert torch.equal(chosen.slots[:, 0], free.totals[:, -1].argsort(-1))
 
 
 def test_a_rule_may_mix_groups():
     """Branches of a bad group take over the goal of the branch they are copied from; several numbers are one goal."""
-    start = starts(Walk(), 3, branches=6)
-    goals = torch.randint(3, (3, 6, 2), generator=torch.Generator().manual_seed(0))
-    start = start.set(("agents", "goal"), goals)
-    found = search(
-        start,
-        rule=ReplaceBad(2.0),
-        group_key=("agents", "goal"),
-        noise=torch.rand(3, 3, generator=torch.Generator().manual_seed(1)),
-    )
+    generator, key = torch.Generator().manual_seed(0), ("agents", "goal")
+    goals = torch.randint(3, (3, 6, 2), generator=generator)
+    start = starts(Walk(), 3, branches=6).set(key, goals)
+    found = search(start, rule=ReplaceBad(2.0), group_key=key, noise=torch.rand(3, 3, generator=generator))
     groups, mixed = goals, 0
-    for period in range(3):
-        parents, totals = found.parents[:, period], found.totals[:, period]
+    for parents, totals in zip(found.parents.unbind(1), found.totals.unbind(1), strict=True):
         after = groups.gather(1, parents[..., None].expand(3, 6, 2))
-        for row, slot in (totals > 2.0).nonzero().tolist():
-            same = (groups[row] == groups[row, slot]).all(-1) & (totals[row] <= 2.0)
-            assert (
-                bool(same.any()) == bool((after[row, slot] == groups[row, slot]).all())
-                or not (totals[row] <= 2.0).any()
-            )
-            mixed += not bool(same.any())
+        good = totals <= 2.0
+        for row, slot in (~good & good.any(1, True)).nonzero().tolist():
+            same = ((groups[row] == groups[row, slot]).all(-1) & good[row]).any()
+            assert bool(same) == bool((after[row, slot] == groups[row, slot]).all())
+            mixed += not bool(same)
         groups = after
     assert mixed > 0
-    assert torch.equal(
-        found.trajectories.get(("agents", "goal"))[:, :, -1],
-        goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)),
-    )
-    assert torch.equal(groups, goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2)))
+    kept = goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2))
+    assert torch.equal(found.trajectories.get(key)[:, :, -1], kept)
+    assert torch.equal(groups, kept)
 
 
 def test_only_what_is_kept_comes_back():
@@ -347,33 +289,23 @@ def test_only_what_is_kept_comes_back():
         search(start, keep=["nowhere"])
 
 
-def test_scores_without_agents_and_of_the_reward():
+def test_scores_without_agents_of_the_reward_and_of_a_module():
     start = starts(Walk(), 2, branches=4)
     one = search(start, score=lambda td: distance(td).sum(-1), aggregate=mean_then_sum)
     assert one.scores.shape == (2, 4, 12, 1)
-    reward = search(start, score=KeyScore(("agents", "reward"), negate=True))
-    assert_close(reward.scores, search(start).scores)
-    assert ("agents", "reward") not in reward.trajectories.keys(True, True)
-
-
-def test_score_of_a_module_leaves_no_trace():
-    start = starts(Walk(), 2, branches=4)
+    plain, reward = search(start), search(start, score=KeyScore(("agents", "reward"), negate=True))
+    assert_close(reward.scores, plain.scores)
     module = TensorDictModule(lambda x: x.abs(), in_keys=[X], out_keys=[("agents", "score")])
-    found = search(start, score=KeyScore(("agents", "score"), module))
-    assert_same(found.trajectories, search(start).trajectories)
-    with pytest.raises(KeyError, match="nothing"):
-        search(start, score=KeyScore("nothing"))
+    written = search(start, score=KeyScore(("agents", "score"), module))
+    for found in (reward, written):  # scores leave no trace
+        assert set(found.trajectories.keys(True, True)) == set(plain.trajectories.keys(True, True))
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 1), (3, 2), (3, 1, 1), (3, 2, 1)])
-def test_scores_of_any_usual_shape_become_one_number_per_agent(shape):
-    # Of three branches: without agents, with one or two, and with a last dimension as TorchRL's rewards have it.
-    values = torch.rand(5, *shape)
-    td = TensorDict({"score": values}, [5, 3])
-    assert torch.equal(KeyScore("score")(td), values.reshape(5, 3, -1))
-
-
-def test_padded_agents_do_not_count():
+def test_scores_of_any_usual_shape_become_one_number_per_agent():
+    """Of three branches: without agents, with one or two, and with a last dimension as TorchRL's rewards have it."""
+    for shape in ((3,), (3, 1), (3, 2), (3, 1, 1), (3, 2, 1)):
+        values = torch.rand(5, *shape)
+        assert torch.equal(KeyScore("score")(TensorDict({"score": values}, [5, 3])), values.reshape(5, 3, -1))
     td = TensorDict({"score": torch.tensor([[1.0, torch.nan]]), "valid": torch.tensor([[True, False]])}, [1])
     assert KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]
     with pytest.raises(KeyError, match="absent"):
@@ -389,6 +321,9 @@ def test_aggregates_by_hand():
     wanted = {("max", "sum"): 8.0, ("mean", "sum"): 4.0, ("sum", "max"): 6.0, ("last", "mean"): 1.5}
     for (time, agents), total in wanted.items():
         assert Aggregate(time, agents)(scores).tolist() == [[total]]
+    for wrong in (("median", "sum"), ("max", "last")):
+        with pytest.raises(ValueError, match="is one of"):
+            Aggregate(*wrong)
 
 
 @pytest.mark.parametrize(
@@ -403,7 +338,9 @@ def test_aggregates_by_hand():
         ({"noise": torch.zeros(2, 2)}, "noise"),
         ({"rule": Systematic(1.0)}, "noise"),
         ({"rule": lambda totals, noise: totals}, "int64"),
+        ({"rule": lambda totals, noise: totals.argsort(-1)[:, :2]}, "int64"),
         ({"rule": lambda totals, noise: totals.argsort(-1) + 1}, "outside"),
+        ({"rule": lambda totals, noise: totals.argsort(-1) - 1}, "outside"),
         ({"score": lambda td: td.get(X)}, "scores must be"),
         ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
     ],
@@ -419,6 +356,10 @@ def test_search_beats_independent_rollouts_on_a_pendulum(rule):
     """Random torques, but the costly futures are dropped: nearly every start ends cheaper than without search."""
     env, rows, steps = PendulumEnv(seed=0), 24, 60
     start = branch(env.reset(env.gen_params(batch_size=[rows]), set_state=False), 16)
+    score, how = (
+        KeyScore("reward", negate=True),
+        {"steps": steps, "prune_every": 5, "aggregate": mean_then_sum},
+    )
 
     def cost(rule):
         generator = torch.Generator().manual_seed(1)
@@ -426,17 +367,8 @@ def test_search_beats_independent_rollouts_on_a_pendulum(rule):
         def policy(td):
             return td.set("action", 4 * torch.rand(*td.shape, 1, generator=generator) - 2)
 
-        found = beam_search(
-            env,
-            policy,
-            KeyScore("reward", negate=True),
-            start,
-            steps=steps,
-            prune_every=5,
-            rule=rule,
-            aggregate=mean_then_sum,
-            noise=torch.rand(rows, 12, generator=generator),
-        )
+        drawn = torch.rand(rows, 12, generator=generator)
+        found = beam_search(env, policy, score, start, rule=rule, noise=drawn, **how)
         assert_close(found.scores, -found.trajectories.get(("next", "reward")))
         return found.scores.sum((-1, -2)).mean(-1)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import pickle
 import time
-from dataclasses import dataclass
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, PendulumEnv, StepCounter
 
-from helpers_collectors import ACTION, STREAM, Policy, Walk, X, distance, give_streams
+from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams
 from symphony.collectors import (
     BeamSearchCollector,
     KeepAll,
@@ -28,6 +27,7 @@ from symphony.collectors import (
 )
 
 ROWS, STEPS, FRAMES = 3, 8, 3 * 8
+EXTRAS = [("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")]
 
 
 def make_env(last: int = 1000, *transforms) -> EnvBase:
@@ -44,24 +44,14 @@ def make(env=make_env, policy=None, **kwargs) -> BeamSearchCollector:
         "prune_every": 4,
         "prepare": give_streams,
         "slot_keys": [STREAM],
-        "frames_per_batch": FRAMES,
     }
-    settings["total_frames"] = 3 * kwargs.get("frames_per_batch", FRAMES)
-    return BeamSearchCollector(env, policy or Policy(), **{**settings, **kwargs})
+    settings |= {"frames_per_batch": FRAMES, "total_frames": 3 * kwargs.get("frames_per_batch", FRAMES)}
+    return BeamSearchCollector(env, policy or Policy(), **settings | kwargs)
 
 
 def plain_collector(**kwargs) -> Collector:
-    settings = {"frames_per_batch": FRAMES, "total_frames": 3 * FRAMES}
-    return Collector(make_env, Policy(), auto_register_policy_transforms=False, **settings, **kwargs)
-
-
-def assert_same(first, second):
-    assert set(first.keys(True, True)) == set(second.keys(True, True))
-    for key in first.keys(True, True):
-        assert_close(first.get(key), second.get(key), rtol=0, atol=0, equal_nan=True, msg=str(key))
-
-
-EXTRAS = [("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")]
+    settings = {"frames_per_batch": FRAMES, "total_frames": 3 * FRAMES, **kwargs}
+    return Collector(make_env, Policy(), auto_register_policy_transforms=False, **settings)
 
 
 def test_one_branch_collects_what_a_plain_collector_does():
@@ -83,9 +73,9 @@ def test_one_branch_collects_what_a_plain_collector_does():
 
 
 def test_best_leaf_and_its_search():
-    collector = make(leaves=2, frames_per_batch=2 * FRAMES, total_frames=2 * FRAMES)
-    (batch,) = collector
+    (batch,) = collector = make(leaves=2, frames_per_batch=2 * FRAMES, total_frames=2 * FRAMES)
     assert batch.shape == (ROWS, 2, STEPS)
+    assert not any(value.requires_grad for value in batch.values(True, True))
     score, total, slot = (batch.get(key) for key in EXTRAS[:3])
     assert_close(score, batch.get(("next", *X)).squeeze(-1).abs())
     for first in (0, 4):
@@ -100,31 +90,27 @@ def test_best_leaf_and_its_search():
 
 
 def test_search_lowers_the_score():
-    free, pruned = (
-        make(rule=rule, branches=8, leaves=8, frames_per_batch=8 * FRAMES) for rule in (KeepAll(), KeepBest())
-    )
-    free.set_seed(0)
-    pruned.set_seed(0)
-    means = [torch.stack([b.get(EXTRAS[0]).mean() for b in c]).mean() for c in (free, pruned)]
+    means = []
+    for rule in (KeepAll(), KeepBest()):
+        collector = make(rule=rule, branches=8, leaves=8, frames_per_batch=8 * FRAMES)
+        collector.set_seed(0)
+        means.append(torch.stack([batch.get(EXTRAS[0]).mean() for batch in collector]).mean())
     assert means[1] < 0.9 * means[0]
 
 
 def test_same_seed_same_data():
-    def data(seed, **kwargs):
-        collector = make(rule=Systematic(0.5), **kwargs)
-        collector.set_seed(seed)
-        return torch.cat([batch.exclude("collector") for batch in collector])
+    def data(seed):
+        collector = make(rule=Systematic(0.5))
+        following = collector.set_seed(seed)
+        drawn = collector.rule_noise(TensorDict(batch_size=[4, 2]))  # the numbers of the rule are seeded, too
+        return torch.cat([batch.exclude("collector") for batch in collector]), drawn, following
 
-    assert_same(data(0), data(0))
-    assert not torch.equal(data(0).get(ACTION), data(1).get(ACTION))
-    # the numbers of the rule are seeded, too
-    noises = [make() for _ in range(3)]
-    seeds = [collector.set_seed(seed) for collector, seed in zip(noises, (5, 5, 6), strict=True)]
-    start = TensorDict(batch_size=[4, 2])
-    drawn = [collector.rule_noise(start) for collector in noises]
-    assert seeds[0] == seeds[1] != seeds[2]
-    assert torch.equal(drawn[0], drawn[1])
-    assert not torch.equal(drawn[0], drawn[2])
+    (first, drawn, seed), (again, redrawn, same), (other, others, another) = data(0), data(0), data(1)
+    assert_same(first, again)
+    assert torch.equal(drawn, redrawn)
+    assert seed == same != another
+    assert not torch.equal(first.get(ACTION), other.get(ACTION))
+    assert not torch.equal(drawn, others)
 
 
 def test_reloading():
@@ -142,8 +128,7 @@ def test_reloading():
     assert len(ids) == 2
     assert min(int(i.min()) for i in ids) >= 2 * ROWS
     assert second.stats()["frames"] == second.total_frames
-    plain = plain_collector()
-    make().load_state_dict(plain.state_dict())
+    make().load_state_dict(plain_collector().state_dict())
 
 
 def test_weights_are_shared_and_updated():
@@ -157,10 +142,6 @@ def test_weights_are_shared_and_updated():
     assert after.get(X)[:, -1].abs().mean() < before.get(X)[:, -1].abs().mean()
     collector.update_policy_weights_(TensorDict.from_module(Policy()))
     assert_close(policy.gain.detach(), torch.tensor(-0.2))
-
-
-def test_gradients_are_off():
-    assert not any(value.requires_grad for value in next(iter(make())).values(True, True))
 
 
 def test_hooks_and_postproc():
@@ -182,23 +163,12 @@ def test_hooks_and_postproc():
 def test_fake_batch_looks_like_a_real_one(options, leaves):
     collector = make(leaves=leaves, frames_per_batch=FRAMES * (leaves or 1), **options)
     fake, real = collector.fake_tensordict(), next(iter(collector))
-    assert fake.shape == real.shape
-    assert fake.names == real.names
+    assert (fake.shape, fake.names) == (real.shape, real.names)
     assert set(fake.keys(True, True)) == set(real.keys(True, True))
     for key in real.keys(True, True):
         assert (fake.get(key).shape, fake.get(key).dtype) == (real.get(key).shape, real.get(key).dtype), key
     assert bool(real.get(("next", "done"))[..., -1, :].all()) == ("set_truncated" in options)
-    if "compact_obs" in options:
-        assert ("next", *X) not in real.keys(True, True)
-
-
-def test_replay_buffer():
-    """One item per row; flat steps with trajectories."""
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=5)
-    for batch in make(replay_buffer=buffer):
-        assert batch is None
-    assert len(buffer) == 3 * ROWS
-    assert buffer.sample().shape == (5, STEPS)
+    assert ("compact_obs" in options) == (("next", *X) not in real.keys(True, True))
 
 
 def test_trajectories_are_complete_and_stop_at_their_end():
@@ -209,15 +179,10 @@ def test_trajectories_are_complete_and_stop_at_their_end():
     for layout in ("padded", "cat"):
         for batch in make(env, trajs_per_batch=3, traj_format=layout):
             assert batch.shape == ((3, 6) if layout == "padded" else (18,))
-            done = batch.get(("next", "done")).flatten().nonzero().flatten()
-            assert done.tolist() == [5, 11, 17]
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(200),
-        sampler=SliceSampler(slice_len=6, end_key=("next", "done")),
-        batch_size=12,
-    )
-    for _ in make(env, replay_buffer=buffer, trajs_per_batch=1):
-        pass
+            assert batch.get(("next", "done")).flatten().nonzero().flatten().tolist() == [5, 11, 17]
+    sampler = SliceSampler(slice_len=6, end_key=("next", "done"))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), sampler=sampler, batch_size=12)
+    assert [batch for batch in make(env, replay_buffer=buffer, trajs_per_batch=1) if batch is not None] == []
     assert len(buffer) == 3 * ROWS * 6
     assert (buffer.sample().get("step").reshape(2, 6) == torch.arange(6)).all()
     # unfinished episodes are not trajectories, unless they are declared truncated
@@ -230,11 +195,11 @@ def test_trajectory_ids_never_repeat():
     ids = torch.cat([batch.get(("collector", "traj_ids")) for batch in make()])
     assert (ids == ids[:, :1]).all()
     assert len(ids[:, 0].unique()) == 3 * ROWS
-    untracked = next(iter(make(track_traj_ids=False)))
-    assert ("collector", "traj_ids") not in untracked.keys(True, True)
+    assert ("collector", "traj_ids") not in next(iter(make(track_traj_ids=False))).keys(True, True)
 
 
 def test_start_and_shutdown():
+    """One item of the replay buffer per row."""
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=5)
     collector = make(replay_buffer=buffer, total_frames=-1)
     collector.start()
@@ -242,18 +207,8 @@ def test_start_and_shutdown():
     while buffer.write_count < 2 * ROWS and time.monotonic() < waited:
         time.sleep(0.01)
     collector.async_shutdown()
-    assert buffer.write_count >= 2 * ROWS
-    assert collector.closed
-
-
-def test_an_environment_that_fails_shuts_the_collector_down():
-    class Failing(Walk):
-        def _step(self, tensordict):
-            raise RuntimeError("broken")
-
-    collector = make(Failing)
-    with pytest.raises(RuntimeError, match="broken"):
-        next(iter(collector))
+    assert len(buffer) >= 2 * ROWS
+    assert buffer.sample().shape == (5, STEPS)
     assert collector.closed
 
 
@@ -271,51 +226,44 @@ def test_without_rows_and_with_other_transforms():
 @pytest.mark.parametrize("options", [{}, {"init_random_frames": FRAMES}])
 def test_random_actions(options):
     env = with_rows(PendulumEnv(seed=0), [ROWS])
-    settings = {"score": KeyScore("reward", negate=True), "branches": 4, "frames_per_batch": FRAMES}
+    settings = {
+        "score": KeyScore("reward", negate=True),
+        "branches": 4,
+        "frames_per_batch": FRAMES,
+        **options,
+    }
     policy = (lambda td: td.set("action", torch.full((*td.shape, 1), 9.0))) if options else None
-    collector = BeamSearchCollector(env, policy, total_frames=2 * FRAMES, **settings, **options)
+    collector = BeamSearchCollector(env, policy, total_frames=2 * FRAMES, **settings)
     first, second = (batch.get("action") for batch in collector)
     assert first.abs().max() <= 2
     assert len(first.unique()) > FRAMES / 2
     assert bool((second == 9).all()) == bool(options)
 
 
-def test_rows_start_apart_and_are_reset_apart():
-    env = with_rows(Walk(), [ROWS])
-    start = env.reset()
-    assert start.shape == (ROWS,)
-    assert len(start.get(X).unique()) == ROWS * 2
-    rows = torch.tensor([[True], [False], [True]])
-    again = env.reset(start.clone().set("_reset", rows), select_reset_only=False, set_state=False)
-    assert again.shape == (ROWS,)
-    env.rollout(3, break_when_any_done=False)
-
-
-def test_impossible_options_are_errors():
+def test_what_can_not_be_right_is_an_error():
     for options, message in (
-        ({"leaves": 5}, "leaves"),
+        ({"keep_tree": True}, "keep_tree needs leaves=4"),
         ({"split_trajs": True}, "split_trajs"),
         ({"extend_buffer": False}, "extend_buffer"),
     ):
         with pytest.raises(ValueError, match=message):
             make(**options)
-
-    class Locked(Walk):
-        batch_locked = True
-
-    with pytest.raises(ValueError, match="Locked can't be branched: it is batch-locked"):
-        make(Locked)
+    with pytest.raises(ValueError, match="leaves must be"):
+        make(leaves=5).next()
     with pytest.raises(TypeError, match="unknown"):
-        make(tree=3)
+        make(unknown=3)
 
+    class Failing(Walk):
+        def _step(self, tensordict):
+            raise RuntimeError("broken")
 
-@dataclass(frozen=True)
-class DropWorst:
-    """A rule of one's own: the worst branch makes room for the best."""
-
-    def __call__(self, totals, noise=None):
-        slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
-        return slots.scatter(-1, totals.argmax(-1, keepdim=True), totals.argmin(-1, keepdim=True))
+    collector = make(Failing)
+    with pytest.raises(RuntimeError, match="broken"):
+        next(iter(collector))
+    assert collector.closed
+    Failing.batch_locked = True
+    with pytest.raises(ValueError, match="Failing can't be branched: it is batch-locked"):
+        make(Failing)
 
 
 def test_a_rule_and_an_aggregate_of_ones_own():
@@ -324,25 +272,19 @@ def test_a_rule_and_an_aggregate_of_ones_own():
     def median(scores):
         return scores.flatten(-2).median(-1).values
 
-    collector = make(
-        rule=DropWorst(), aggregate=median, leaves=4, frames_per_batch=4 * FRAMES, keep_tree=True
-    )
-    collector.set_seed(3)
+    def drop_worst(totals, noise=None):
+        slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
+        return slots.scatter(-1, totals.argmax(-1, keepdim=True), totals.argmin(-1, keepdim=True))
+
+    how = {"rule": drop_worst, "aggregate": median}
+    collector, env = make(leaves=4, frames_per_batch=4 * FRAMES, keep_tree=True, **how), make_env()
+    for seeded in (collector, env):
+        seeded.set_seed(3)
     batch = collector.next()
     scores = batch.get("tree").get(EXTRAS[0])
-    env = make_env()
-    env.set_seed(3)
-    found = beam_search(
-        env.base_env,
-        Policy(),
-        distance,
-        give_streams(branch(env.reset(), 4).copy()),
-        steps=STEPS,
-        prune_every=4,
-        rule=DropWorst(),
-        aggregate=median,
-        slot_keys=[STREAM],
-    )
+    start = give_streams(branch(env.reset(), 4).copy())
+    how |= {"steps": STEPS, "prune_every": 4, "slot_keys": [STREAM]}
+    found = beam_search(env.base_env, Policy(), distance, start, **how)
     assert_close(found.simulated_scores, scores)
     assert_close(found.totals, scores.unflatten(2, (2, 4)).flatten(-2).median(-1).values.transpose(1, 2))
     for totals, parents in zip(found.totals.flatten(0, 1), found.parents.flatten(0, 1), strict=True):
@@ -353,18 +295,17 @@ def test_a_rule_and_an_aggregate_of_ones_own():
 
 def test_a_policy_on_a_device_of_its_own_gets_its_inputs_there():
     """What it is given is moved, and only what it writes comes back."""
-    seen = []
+    seen, batches = [], []
 
     class Elsewhere(Policy):
         def forward(self, tensordict):
             seen.append(tensordict.device)
             return super().forward(tensordict)
 
-    batches = []
     for options in ({}, {"policy_device": "cpu"}):
         collector = make(policy=Elsewhere(), **options)
         collector.set_seed(3)
         seen.clear()
         batches.append(collector.next())
-        assert set(seen) == {None if not options else torch.device("cpu")}
+        assert set(seen) == {torch.device("cpu") if options else None}
     assert_same(batches[0].exclude("collector"), batches[1].exclude("collector"))

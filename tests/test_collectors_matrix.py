@@ -11,14 +11,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.envs import (
     CatFrames,
     Compose,
     EnvBase,
     InitTracker,
     ObservationNorm,
-    PendulumEnv,
     RewardSum,
     StepCounter,
     Transform,
@@ -69,52 +68,31 @@ def acting(key: Any, features: int) -> TensorDictModule:
 def recurrent() -> tuple[GRUModule, TensorDictSequential]:
     torch.manual_seed(0)
     memory = GRUModule(input_size=2, hidden_size=4, in_key="observation", out_key="embedding")
-    head = TensorDictModule(
-        nn.Sequential(nn.Linear(4, 2), NormalParamExtractor()), ["embedding"], ["loc", "scale"]
-    )
-    actor = ProbabilisticActor(
-        TensorDictSequential(memory, head), ["loc", "scale"], distribution_class=TanhNormal
-    )
-    return memory, actor
+    head = nn.Sequential(nn.Linear(4, 2), NormalParamExtractor())
+    both = TensorDictSequential(memory, TensorDictModule(head, ["embedding"], ["loc", "scale"]))
+    return memory, ProbabilisticActor(both, ["loc", "scale"], distribution_class=TanhNormal)
 
 
-def beams(
-    env: EnvBase, policy: Any, *, key: Any = "reward", branches: int = 1, **kwargs: Any
-) -> BeamSearchCollector:
-    return BeamSearchCollector(
-        env,
-        policy,
-        score=KeyScore(key, negate=True),
-        branches=branches,
-        prune_every=4,
-        frames_per_batch=env.batch_size.numel() * STEPS,
-        total_frames=env.batch_size.numel() * STEPS,
-        **kwargs,
-    )
+def beams(env: EnvBase, policy: Any, *, key: Any = "reward", **kwargs: Any) -> BeamSearchCollector:
+    frames = env.batch_size.numel() * STEPS
+    how = {"branches": 1, "prune_every": 4, "frames_per_batch": frames, "total_frames": frames, **kwargs}
+    return BeamSearchCollector(env, policy, score=KeyScore(key, negate=True), **how)
 
 
 def assert_same_until_done(env: Callable[[], EnvBase], policy: Any, **kwargs: Any) -> TensorDictBase:
     """The first batches of both collectors have the same entries, the same up to the first end of an episode."""
-    one = env()
-    plain = Collector(
-        one,
-        policy,
-        frames_per_batch=one.batch_size.numel() * STEPS,
-        total_frames=one.batch_size.numel() * STEPS,
-        reset_at_each_iter=True,
-        auto_register_policy_transforms=False,
-    )
-    ours = beams(env(), policy, **kwargs)
+    one, ours = env(), beams(env(), policy, **kwargs)
+    frames = one.batch_size.numel() * STEPS
+    how = {"frames_per_batch": frames, "total_frames": frames, "reset_at_each_iter": True}
+    plain = Collector(one, policy, auto_register_policy_transforms=False, **how)
     for collector in (plain, ours):
         collector.set_seed(1)
-    expected, found = plain.next(), ours.next()
-    own = {key for key in found.keys(True, True) if key[0] == "collector"}
-    assert set(found.keys(True, True)) - own == {
-        key for key in expected.keys(True, True) if key[0] != "collector"
-    }
+    expected, found = plain.next().exclude("collector"), ours.next()
     mask = found["collector", "mask"]
     assert mask[..., 0].all()
-    for entry in set(found.keys(True, True)) - own:
+    entries = set(found.exclude("collector").keys(True, True))
+    assert entries == set(expected.keys(True, True))
+    for entry in entries:
         torch.testing.assert_close(found[entry][mask], expected[entry][mask], msg=f"{entry}")
     return found
 
@@ -166,20 +144,16 @@ def test_hidden_states_are_copied_with_a_branch(env: str, register: bool) -> Non
         torch.testing.assert_close(again[0], row["embedding"])
 
 
-@pytest.mark.parametrize("module", ["gaussian", "greedy", "random"])
-def test_exploration_takes_the_specs_of_the_environment(module: str) -> None:
+@pytest.mark.parametrize("exploration", [AdditiveGaussianModule, EGreedyModule])
+def test_exploration_takes_the_specs_of_the_environment(exploration: type) -> None:
     env = ENVIRONMENTS["rows"]()
-    wrap = {
-        "gaussian": lambda: AdditiveGaussianModule(spec=env.action_spec, sigma_init=0.3, sigma_end=0.3),
-        "greedy": lambda: EGreedyModule(spec=env.action_spec, eps_init=1.0, eps_end=1.0),
-    }
-    policy = None if module == "random" else TensorDictSequential(acting("observation", 2), wrap[module]())
-    before = None if policy is None else policy[-1].spec.shape
-    batch = beams(env, policy, branches=4, leaves=4, auto_register_policy_transforms=False).next()
+    module = exploration(env.action_spec)
+    before = module.spec.shape
+    batch = beams(env, TensorDictSequential(acting("observation", 2), module), branches=4, leaves=4).next()
     action = batch["action"]
     assert action.abs().max() <= 1
     assert len(action.flatten().unique()) > action.numel() / 4
-    assert policy is None or policy[-1].spec.shape == before
+    assert module.spec.shape == before
 
 
 def test_rows_are_a_batch_of_an_environment() -> None:
@@ -197,35 +171,9 @@ def test_rows_are_a_batch_of_an_environment() -> None:
 
 
 def test_what_can_not_be_right_is_refused() -> None:
-    twice = Compose(
-        CatFrames(2, -1, in_keys=["observation"]), ObservationNorm(0.0, 1.0, in_keys=["observation"])
-    )
-    for transform, why in (
-        (VecNormV2(in_keys=["observation"]), "reduce_batch_dims"),
-        (twice, "must come after"),
-    ):
+    seen = {"in_keys": ["observation"]}
+    twice = Compose(CatFrames(2, -1, **seen), ObservationNorm(0.0, 1.0, **seen))
+    for transform, why in ((VecNormV2(**seen), "reduce_batch_dims"), (twice, "must come after")):
         env = TransformedEnv(with_rows(Mass(), [ROWS]), transform)
         with pytest.raises(ValueError, match=why):
             beams(env, None, branches=2).next()
-
-
-def rows_of_pendulum() -> EnvBase:
-    return with_rows(PendulumEnv(seed=0), [ROWS])
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_started_quickly")
-def test_random_actions_in_other_processes() -> None:
-    collector = MultiSyncCollector(
-        [rows_of_pendulum],
-        None,
-        collector_class=BeamSearchCollector.bind(score=KeyScore("reward", negate=True), branches=2),
-        frames_per_batch=ROWS * STEPS,
-        total_frames=ROWS * STEPS,
-        use_buffers=False,
-        cat_results="stack",
-    )
-    try:
-        assert [batch.shape for batch in collector] == [(1, ROWS, STEPS)]
-    finally:
-        collector.shutdown()

@@ -48,16 +48,14 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued: bool) -> None:
         return 3.0 * place[..., :1]
 
     network = TensorDictModule(worth, ["place"], ["state_value"]) if valued else None
-    planner = BeamSearchPlanner(
-        env,
-        HORIZON,
-        BRANCHES,
-        policy=hashed,
-        value_network=network,
-        rule=KeepAll(),
-        prune_every=2,
-        temperature=0.5,
-    )
+    how = {
+        "policy": hashed,
+        "value_network": network,
+        "rule": KeepAll(),
+        "prune_every": 2,
+        "temperature": 0.5,
+    }
+    planner = BeamSearchPlanner(env, HORIZON, BRANCHES, **how)
     planned = planner(start.clone())
     expected, actions = returns(env, start, worth if valued else None)
     best = expected.argmax(-1)
@@ -85,11 +83,6 @@ def test_it_is_a_policy_of_torchrl(outer: Any) -> None:
     planned, drawn = (make().rollout(20, policy, break_when_any_done=False) for policy in (planner, None))
     assert planned["next", "reward"].mean() > drawn["next", "reward"].mean() + 0.2
     torch.testing.assert_close(planned["planner", "weight"].sum(-1), torch.ones(ROWS, 20))
-    collector = Collector(
-        make(),
-        planner,
-        frames_per_batch=ROWS * 4,
-        total_frames=ROWS * 4,
-        auto_register_policy_transforms=False,
-    )
+    how = {"frames_per_batch": ROWS * 4, "total_frames": ROWS * 4, "auto_register_policy_transforms": False}
+    collector = Collector(make(), planner, **how)
     assert next(iter(collector))["planner", "action"].shape == (ROWS, 4, 32, 1)

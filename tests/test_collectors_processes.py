@@ -7,29 +7,39 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 from torch.testing import assert_close
 from torchrl.collectors import MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import PendulumEnv
 
-from helpers_collectors import (
-    ACTION,
-    STREAM,
-    FreshWalk,
-    Policy,
-    Walk,
-    Weighted,
-    X,
-    distance,
-    give_streams,
-    noise,
-)
+from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams, noise
 from symphony.collectors import BeamSearchCollector, KeyScore, Systematic, with_rows
 
 ROWS, STEPS, WORKERS = 3, 8, 2
 FRAMES = ROWS * STEPS
+SEARCH = {"branches": 4, "prune_every": 4, "prepare": give_streams, "slot_keys": [STREAM]}
 EXTRAS = {("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")}
+
+
+class FreshWalk(Walk):
+    """Seeded by whatever the process would draw next, as unseeded environments are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_seed(int(torch.randint(1 << 31, ())))
+
+
+class Weighted(nn.Module):
+    """Distance times a weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        return self.weight * distance(tensordict)
 
 
 def make_env():
@@ -40,49 +50,31 @@ def fresh_env():
     return with_rows(FreshWalk(), [ROWS])
 
 
-def several(env=make_env, policy=None, *, workers=WORKERS, score=distance, batches=2, **kwargs):
-    bound = BeamSearchCollector.bind(
-        score=score, branches=4, prune_every=4, prepare=give_streams, slot_keys=[STREAM]
-    )
-    if "replay_buffer" not in kwargs:
-        kwargs |= {"use_buffers": False, "cat_results": "stack"}
-    return MultiSyncCollector(
-        [env] * workers,
-        Policy() if policy is None else policy,
-        collector_class=bound,
-        frames_per_batch=workers * FRAMES,
-        total_frames=batches * workers * FRAMES,
-        auto_register_policy_transforms=False,
-        **kwargs,
-    )
-
-
-def assert_same(first, second):
-    assert set(first.keys(True, True)) == set(second.keys(True, True))
-    for key in first.keys(True, True):
-        assert_close(first.get(key), second.get(key), rtol=0, atol=0, equal_nan=True, msg=str(key))
+def several(
+    env=make_env, policy=None, *, workers=WORKERS, batches=2, search=SEARCH, score=distance, **kwargs
+):
+    frames = workers * FRAMES
+    how = {
+        "frames_per_batch": frames,
+        "total_frames": batches * frames,
+        "auto_register_policy_transforms": False,
+    }
+    how |= {} if "replay_buffer" in kwargs else {"use_buffers": False, "cat_results": "stack"}
+    bound = BeamSearchCollector.bind(score=score, **search)
+    return MultiSyncCollector([env] * workers, policy, collector_class=bound, **how, **kwargs)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_started_quickly")
 def test_a_worker_collects_what_the_collector_does_here():
-    collector = several(workers=1)
+    collector = several(policy=Policy(), workers=1)
     try:
         collector.set_seed(3)
         batches = [batch.clone() for batch in collector]
     finally:
         collector.shutdown()
-    local = BeamSearchCollector(
-        make_env,
-        Policy(),
-        score=distance,
-        branches=4,
-        prune_every=4,
-        prepare=give_streams,
-        slot_keys=[STREAM],
-        frames_per_batch=FRAMES,
-        total_frames=2 * FRAMES,
-    )
+    how = {"score": distance, "frames_per_batch": FRAMES, "total_frames": 2 * FRAMES, **SEARCH}
+    local = BeamSearchCollector(make_env, Policy(), **how)
     local.set_seed(3)
     local.reset()  # as the multi-process collector does after seeding
     for one, other in zip(batches, local, strict=True):
@@ -97,51 +89,57 @@ def test_two_workers_fill_a_replay_buffer_with_data_of_their_own():
     """Nobody seeded them; a score's network is the one that is trained here."""
     score = Weighted()
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100, shared_init=True), batch_size=5)
-    collector = several(fresh_env, score=score, batches=3, replay_buffer=buffer)
+    collector = several(fresh_env, Policy(), score=score, batches=3, replay_buffer=buffer)
     try:
         seen = []
-        for done, batch in enumerate(collector, 1):
+        for batch in collector:
             assert batch is None
             seen.append(len(buffer))
-            if done == 1:
-                score.weight.data.fill_(3.0)
+            score.weight.data.fill_(3.0)
     finally:
         collector.shutdown()
     assert len(buffer) == 3 * WORKERS * ROWS
     assert seen[0] == WORKERS * ROWS
     assert buffer.sample().shape == (5, STEPS)
     items = buffer[:]
-    starts = items.get(X)[:, 0].flatten(1)
-    assert len(starts.unique(dim=0)) == len(items)
+    assert len(items.get(X)[:, 0].flatten(1).unique(dim=0)) == len(items)
     assert len(items.get(("collector", "traj_ids"))[:, 0].unique()) == len(items)
     factor = items.get(("collector", "beam_score")) / items.get(("next", *X)).squeeze(-1).abs()
-    assert_close(factor.mean(-1).mean(-1)[: seen[0]], torch.ones(seen[0]))
-    assert_close(factor.mean(-1).mean(-1)[-WORKERS * ROWS :], torch.full((WORKERS * ROWS,), 3.0))
+    assert_close(factor.mean((-1, -2))[: seen[0]], torch.ones(seen[0]))
+    assert_close(factor.mean((-1, -2))[-seen[0] :], torch.full((seen[0],), 3.0))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_started_quickly")
+def test_random_actions_in_other_processes():
+    score = KeyScore("reward", negate=True)
+    pendulum = with_rows(PendulumEnv(seed=0), [ROWS])
+    collector = several(lambda: pendulum, None, workers=1, batches=1, score=score, search={"branches": 2})
+    try:
+        assert [batch.shape for batch in collector] == [(1, ROWS, STEPS)]
+    finally:
+        collector.shutdown()
 
 
 def test_workers_that_nobody_seeded_draw_apart():
     """From the global generator, which begins alike in every process: the environment's starts, the random actions
     and the noise of the rule.
     """
+    how = {"score": KeyScore("reward", negate=True), "branches": 4, "rule": Systematic(1.0)}
     collectors = []
     for worker in range(2):
-        state = torch.get_rng_state()
-        torch.manual_seed(0)
-        collectors.append(
-            BeamSearchCollector(
-                lambda: with_rows(PendulumEnv(), [ROWS]),
-                score=KeyScore("reward", negate=True),
-                branches=4,
-                rule=Systematic(1.0),
-                frames_per_batch=FRAMES,
-                worker_idx=worker,
+        with torch.random.fork_rng([]):
+            torch.manual_seed(0)
+            collectors.append(
+                BeamSearchCollector(
+                    lambda: with_rows(PendulumEnv(), [ROWS]),
+                    frames_per_batch=FRAMES,
+                    worker_idx=worker,
+                    **how,
+                )
             )
-        )
-        torch.set_rng_state(state)
     start = TensorDict(batch_size=[ROWS, 4])
-    noises = [collector.rule_noise(start) for collector in collectors]
-    assert not torch.equal(*noises)
-    assert collectors[0].env.base_env.rng is not None
+    assert not torch.equal(*(collector.rule_noise(start) for collector in collectors))
     firsts = [collector.next() for collector in collectors]
     for key in ("th", "action"):
         assert not torch.isclose(firsts[0].get(key), firsts[1].get(key)).any()
@@ -153,22 +151,13 @@ def test_through_ray():
     ray = pytest.importorskip("ray")
     from torchrl.collectors.distributed import RayCollector
 
-    path = [str(Path(__file__).parent), *sys.path]
-    ray.init(num_cpus=1, include_dashboard=False, runtime_env={"env_vars": {"PYTHONPATH": ":".join(path)}})
+    path = ":".join([str(Path(__file__).parent), *sys.path])
+    ray.init(num_cpus=1, include_dashboard=False, runtime_env={"env_vars": {"PYTHONPATH": path}})
+    how = {"frames_per_batch": FRAMES, "total_frames": 2 * FRAMES, "sync": True}
     try:
-        bound = BeamSearchCollector.bind(
-            score=distance, branches=4, prune_every=4, prepare=give_streams, slot_keys=[STREAM]
-        )
-        policy = Policy()
-        collector = RayCollector(
-            [fresh_env],
-            policy,
-            collector_class=bound,
-            frames_per_batch=FRAMES,
-            total_frames=2 * FRAMES,
-            remote_configs={"num_cpus": 1, "num_gpus": 0},
-            sync=True,
-        )
+        policy, bound = Policy(), BeamSearchCollector.bind(score=distance, **SEARCH)
+        remote = {"num_cpus": 1, "num_gpus": 0}
+        collector = RayCollector([fresh_env], policy, collector_class=bound, remote_configs=remote, **how)
         policy.gain.data.fill_(-0.9)
         collector.update_policy_weights_(TensorDict.from_module(policy))
         batches = [batch.clone() for batch in collector]

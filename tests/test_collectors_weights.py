@@ -31,7 +31,6 @@ from symphony.collectors import (
     with_rows,
 )
 
-NOISE = st.floats(0, 1, exclude_max=True)
 STEPS, KEPT, SPREAD = 8, 0.9, 0.5
 SCHEMES = (Systematic, Stratified, Residual)
 
@@ -83,20 +82,14 @@ def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> BeamSearchResul
     start = TensorDict(
         {"x": torch.zeros(rows, 1), "t": torch.zeros(rows, 1, dtype=torch.int64), "y": y}, [rows]
     )
-    slots = [branches] if rule.noise_per_slot else []
-    return beam_search(
-        Filtered(),
-        lambda td: td.set("action", torch.randn(*td.shape, 1)),
-        KeyScore("reward", negate=True),
-        branch(start, branches),
-        steps=STEPS,
-        prune_every=1,
-        rule=rule,
-        aggregate=Aggregate("sum"),
-        noise=torch.rand(rows, STEPS, *slots),
-        keep=[("next", "x")],
-        **how,
-    )
+    noise = torch.rand(rows, STEPS, *([branches] if rule.noise_per_slot else []))
+    how |= {"steps": STEPS, "prune_every": 1, "aggregate": Aggregate("sum"), "keep": [("next", "x")]}
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        return td.set("action", torch.randn(*td.shape, 1))
+
+    score, start = KeyScore("reward", negate=True), branch(start, branches)
+    return beam_search(Filtered(), policy, score, start, rule=rule, noise=noise, **how)
 
 
 @pytest.mark.parametrize("threshold", [1.0, 0.5, 0.0])
@@ -142,44 +135,12 @@ def test_a_value_looks_ahead_without_a_bias() -> None:
     assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
 
 
-@given(st.lists(st.floats(-20, 20), min_size=1, max_size=12), st.lists(NOISE, min_size=12, max_size=12))
-def test_copies_are_proportional(totals: list[float], noise: list[float]) -> None:
-    """Each scheme gives a branch of weight w at least as many copies as it promises."""
-    given_totals = torch.tensor([totals], dtype=torch.float64)
-    share = len(totals) * torch.softmax(-given_totals[0], 0)
-    for scheme in SCHEMES:
-        numbers = torch.tensor(
-            [noise[: len(totals)]] if scheme is Stratified else noise[:1], dtype=torch.float64
-        )
-        parents = scheme()(given_totals, numbers)[0]
-        counts = torch.bincount(parents, minlength=len(totals))
-        least = 0 if scheme is Stratified else (share + 1e-6 if scheme is Residual else share - 1e-6).floor()
-        assert (counts >= (least - 1e-9 if scheme is not Residual else (share - 1e-6).floor())).all()
-        assert (counts <= (share + 1e-6).ceil() + (scheme is not Systematic)).all()
-        assert (given_totals[0][parents].diff() >= 0).all()
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_copies_are_fair(scheme: type[Resampling]) -> None:
-    totals = torch.tensor([0.3, 2.0, 0.1, 0.9, 0.3])
-    torch.manual_seed(0)
-    noise = torch.rand(20000, *([5] if scheme is Stratified else []))
-    parents = scheme(0.7)(totals.expand(20000, 5), noise)
-    average = torch.bincount(parents.flatten(), minlength=5) / 20000
-    torch.testing.assert_close(average, 5 * torch.softmax(-totals / 0.7, 0), atol=0.02, rtol=0)
-
-
 @pytest.mark.parametrize(("rule", "weighs"), [(Stratified(threshold=0.5), True), (KeepBest(), False)])
 def test_weights_are_in_the_batch(rule: Any, weighs: bool) -> None:
+    how = {"branches": 4, "leaves": 4, "prune_every": 3, "aggregate": Aggregate("sum")}
+    score = KeyScore("reward", negate=True)
     collector = BeamSearchCollector(
-        with_rows(Mass(), [3]),
-        score=KeyScore("reward", negate=True),
-        branches=4,
-        leaves=4,
-        rule=rule,
-        prune_every=3,
-        aggregate=Aggregate("sum"),
-        frames_per_batch=3 * 4 * 8,
+        with_rows(Mass(), [3]), score=score, rule=rule, frames_per_batch=96, **how
     )
     fake, batch = collector.fake_tensordict(), collector.next()
     key = ("collector", "log_weight")
@@ -207,18 +168,8 @@ def test_what_follows_an_end_changes_nothing(rule: Any, agents: int | None, time
             return torch.where(over, garbage, -td.get((*group, "reward")).squeeze(-1))
 
         env, noise = Mass(agents=agents, sticky=sticky), torch.full((20, 4), 0.3)
-        return beam_search(
-            env,
-            policy,
-            score,
-            start,
-            steps=12,
-            prune_every=3,
-            rule=rule,
-            aggregate=Aggregate(time),
-            noise=noise,
-            **how,
-        )
+        how |= {"steps": 12, "prune_every": 3, "rule": rule, "aggregate": Aggregate(time), "noise": noise}
+        return beam_search(env, policy, score, start, **how)
 
     results = [found(sticky, garbage) for sticky in (True, False) for garbage in (0.0, 1e4, -1e4)]
     for one in results[1:]:
@@ -233,18 +184,12 @@ def test_what_follows_an_end_changes_nothing(rule: Any, agents: int | None, time
 def test_rows_that_have_ended_are_left_alone() -> None:
     """Their leaves are those of the last period in which an episode went on."""
     start = starts(Walk(), 3, branches=4)
-    long, short = (
-        beam_search(
-            Walk(last=5),
-            lambda td: td.set(("agents", "action"), td["agents", "x"].sin()),
-            distance,
-            start,
-            steps=steps,
-            prune_every=2,
-            leaves=3,
-        )
-        for steps in (16, 6)
-    )
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        return td.set(("agents", "action"), td["agents", "x"].sin())
+
+    how = {"prune_every": 2, "leaves": 3}
+    long, short = (beam_search(Walk(last=5), policy, distance, start, steps=n, **how) for n in (16, 6))
     assert (long.parents[:, 3:] == torch.arange(4)).all()
     assert torch.equal(long.alive[..., :6], short.alive)
     assert torch.equal(long.slots[:, :3], short.slots)
@@ -268,14 +213,9 @@ def test_a_search_by_reward_keeps_an_episode_going() -> None:
 
     def steps(branches: int) -> float:
         torch.manual_seed(0)
-        collector = BeamSearchCollector(
-            with_rows(Mass(limit=1.0), [32]),
-            score=lambda td: -torch.ones(td.shape),
-            branches=branches,
-            prune_every=3,
-            aggregate=Aggregate("sum"),
-            frames_per_batch=32 * 60,
-        )
+        env, how = with_rows(Mass(limit=1.0), [32]), {"prune_every": 3, "aggregate": Aggregate("sum")}
+        how |= {"score": lambda td: -torch.ones(td.shape), "frames_per_batch": 32 * 60}
+        collector = BeamSearchCollector(env, branches=branches, **how)
         return float(collector.next()["collector", "mask"].sum(-1).float().mean())
 
     assert steps(16) > 3 * steps(1)

@@ -22,7 +22,7 @@ from helpers_shapes import tensors_only
 from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import KeepAll, KeepBest, PruningRule, ReplaceBad, Systematic
-from symphony.collectors.pruning import checked
+from symphony.collectors.rules import checked
 from symphony.envs import DrivingEnv, ObservationConfig
 from symphony.modules import SeededNoise
 from symphony.rollouts.background import CarFollower

@@ -12,16 +12,19 @@ from symphony.collectors.branching import branch, check_branching, with_rows
 from symphony.collectors.collector import BeamSearchCollector
 from symphony.collectors.planner import BeamSearchPlanner
 from symphony.collectors.rules import (
+    Aggregate,
     KeepAll,
     KeepBest,
+    KeyScore,
     PruningRule,
     ReplaceBad,
     Resampling,
     Residual,
     Stratified,
     Systematic,
+    max_then_sum,
+    mean_then_sum,
 )
-from symphony.collectors.scores import Aggregate, KeyScore, max_then_sum, mean_then_sum
 
 __all__ = [
     "Aggregate",

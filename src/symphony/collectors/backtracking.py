@@ -2,8 +2,7 @@
 
 Copying good branches over bad ones makes rollouts alike; here nothing is copied from another line. After every T_p
 steps the lines whose total is above a threshold go back, the first time a little and with every failed try farther,
-in the end to the start; only the lines that are still under way are simulated. Like the beam search it knows nothing
-of what is simulated.
+in the end to the start; only the lines that are still under way are simulated.
 
 Legend: M lines (all rows and branches), R lines under way, P periods of T_p steps, N agents.
 """
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
@@ -51,28 +50,20 @@ class Backtrack:
     width: int | None = None
 
     def __post_init__(self) -> None:
-        if not self.back or min(self.back) < 0 or self.back[0] < 1:
-            raise ValueError(f"back is periods, the first at least 1, is {self.back}")
-        if self.width is not None and self.width < 1:
-            raise ValueError(f"width must be at least 1 line, is {self.width}")
-        if not self.cap >= 0 or self.threshold != self.threshold:  # NaN
-            raise ValueError(f"cap and threshold must be numbers, are {self.cap} and {self.threshold}")
+        back = bool(self.back) and min(self.back) >= 0 and self.back[0] >= 1
+        width = self.width is None or self.width >= 1
+        if not (back and width and self.cap >= 0) or self.threshold != self.threshold:  # NaN
+            raise ValueError(f"back and width begin at 1, cap at 0, and the threshold is a number: {self}")
 
 
 class Course:
-    """Where each line is, and how often it has tried; all [M].
-
-    Args:
-        rule: of going back.
-        lines: M.
-        periods: P.
-        device: of the totals.
-    """
+    """The next period `at` of each line [M], and how often it has gone back, its `times`."""
 
     def __init__(self, rule: Backtrack, lines: int, periods: int, device: torch.device) -> None:
         self.rule, self.periods = rule, periods
         self.back = torch.tensor(rule.back, device=device)
-        self.at, self.tries, self.times, self.front, self.again = torch.zeros(
+        # Tries since it came past its last trouble, the place of that, and periods simulated again.
+        self.at, self.times, self.tries, self.front, self.again = torch.zeros(
             5, lines, dtype=torch.int64, device=device
         )
 
@@ -82,7 +73,6 @@ class Course:
         goes = bad & (self.again[line] < self.rule.cap * self.periods)
         back = self.back[tries.clamp_max(len(self.back) - 1)]
         to = torch.where(back == 0, 0, (at + 1 - back).clamp_min(0))
-        # Past the place of its trouble a line begins to count anew.
         past = ~bad & (at >= front + self.rule.back[0])
         self.tries[line] = torch.where(past, 0, tries + goes)
         self.front[line] = torch.where(goes, torch.maximum(front, at), front)
@@ -93,20 +83,15 @@ class Course:
 
 
 class Run(NamedTuple):
-    """A period of branches [*b, S] (of lines [R, 1]) as simulated.
-
-    Attributes:
-        records: T_p steps, kept entries.
-        scores: [*b, S, T_p, N], 0 after the end of an episode.
-        alive: [*b, S, T_p, K] steps before (and with) the end of the episode of each agent, or of all (K = 1).
-        ended: [*b, S, K] whose episodes have ended.
-        after: the last states.
+    """A period of branches [*b, S] (of lines [R, 1]) as simulated: the kept entries of its steps, their scores, which
+    are 0 after the end of an episode, the steps before (and with) the end of that of each agent, or of all (K = 1),
+    whose have ended, and the last states.
     """
 
     records: list[TensorDictBase]
-    scores: Tensor
-    alive: Tensor
-    ended: Tensor
+    scores: Float[Tensor, "*b S T N"]
+    alive: Bool[Tensor, "*b S T K"]
+    ended: Bool[Tensor, "*b S K"]
     after: TensorDictBase
 
 
@@ -124,24 +109,15 @@ def follow(
 
     Returns their kept entries and scores [*b, S, T, N], which steps counted [*b, S, T], totals [*b, P, S], and how
     many line-steps were simulated, those that were done again included.
-
-    Args:
-        simulate: steps of lines [R, 1] that may have ended [R, 1, K].
-        total: of a run [R, 1], or of its first steps alone.
-        start: [*b, S].
-        ended: whose episodes have ended before they begin.
-        rule: when lines go back, and how far.
-        steps: T.
-        every: T_p.
     """
     lines, device = start.numel(), ended.device
     periods, short = -(-steps // every), steps % every
     entries, length = list(start.keys(True, True)), periods * every
     course = Course(rule, lines, periods, device)
-    everyone = torch.arange(lines, device=device)
-    line = everyone[: rule.width]
+    waiting = torch.arange(lines, device=device)
+    line, waiting = waiting[: rule.width], waiting[rule.width or lines :]
     now, over = take(start, line[:, None]), take_values(ended, line[:, None], start.ndim)
-    simulated, begun = line.new_zeros(()), len(line)
+    simulated = line.new_zeros(())
     history: TensorDictBase | None = None
     while len(line):
         at = course.at[line]
@@ -160,7 +136,8 @@ def follow(
             all_alive = alive[:, 0, 0][nowhere]
         place = (line * periods + at) * every
         for k, record in enumerate(run.records):
-            _write(history, place + k, record)
+            for key in record.keys(True, True):
+                history.get(key).index_copy_(0, place + k, record.get(key).flatten(0, 1))
             all_scores.index_copy_(0, place + k, run.scores[:, 0, k])
             all_alive.index_copy_(0, place + k, alive[:, 0, k])
         all_totals.index_copy_(0, line * periods + at, totals)
@@ -175,12 +152,11 @@ def follow(
         on = (course.at[line] < periods).nonzero().squeeze(-1)
         finished = len(line) - len(on)
         if finished:
-            line, now, over = line[on], take(now, on[:, None]), over[on]
-        if finished and begun < lines:
-            others = everyone[begun : begun + finished]
-            line, begun = torch.cat([line, others]), begun + len(others)
-            now = torch.cat([now, take(start, others[:, None]).select(*entries)])
-            over = torch.cat([over, take_values(ended, others[:, None], start.ndim)])
+            others, waiting = waiting[:finished, None], waiting[finished:]
+            line, now, over = torch.cat([line[on], others[:, 0]]), take(now, on[:, None]), over[on]
+            if len(others):
+                now = torch.cat([now, take(start, others).select(*entries)])
+                over = torch.cat([over, take_values(ended, others, start.ndim)])
     assert history is not None  # noqa: S101  (a search has a line and a step)
     order = torch.arange(lines * length, device=device).reshape(*start.shape, length)[..., :steps]
     return (
@@ -190,15 +166,6 @@ def follow(
         all_totals.reshape(*start.shape, periods).transpose(-1, -2),
         int(simulated),
     )
-
-
-def _write(into: TensorDictBase, rows: Int[Tensor, " R"], values: TensorDictBase) -> None:
-    """Put values [R, 1] into rows of a flat buffer, in place."""
-    for key, value in values.items():
-        if isinstance(value, TensorDictBase):
-            _write(into.get(key), rows, value)
-        else:
-            into.get(key).index_copy_(0, rows, value.flatten(0, 1))
 
 
 def _with_rows(

@@ -1,9 +1,7 @@
 """Beam search over simulated futures of environments that keep their state in the TensorDict (paper, section IV-A).
 
 S branches of each row are simulated side by side. After every T_p steps each gets a total, aggregated from the
-scores of its steps and agents; the branches with *high* totals are dropped and the others copied into the free
-slots. Nothing here knows what is simulated: rows, branches and agents are batch dimensions of any TorchRL
-environment that can be branched, see :func:`symphony.collectors.branching.check_branching`.
+scores of its steps and agents; the branches with *high* totals are dropped and the others copied into the free slots.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -29,9 +27,7 @@ from symphony.collectors.branching import (
     take,
     take_values,
 )
-from symphony.collectors.pruning import Pruning
-from symphony.collectors.rules import KeepBest, PruningRule, sample_size
-from symphony.collectors.scores import Aggregate, max_then_sum
+from symphony.collectors.rules import Aggregate, KeepBest, Pruning, PruningRule, max_then_sum, sample_size
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Score = Callable[[TensorDictBase], Tensor]
@@ -47,20 +43,18 @@ class BeamSearchResult:
 
     Attributes:
         trajectories: [*b, L, T] of the leaves, laid out and named as by ``env.rollout``, kept entries only.
-        scores: [*b, L, T, N] of the leaves' histories; `scores[..., t, :]` is of ``("next", ...)`` of step t, 0 after
-            the end of an episode.
+        scores: [*b, L, T, N] of what each step of the leaves led to, 0 after the end of an episode.
         alive: [*b, L, T] steps before (and with) the end of their episodes.
         slots: [*b, P, L] int64, the slot in which each period of each leaf's history was simulated.
         totals: [*b, P, S] aggregate of each period, by the slot that simulated it.
-        parents: [*b, P, S] int64; after period p slot s was continued from slot `parents[..., p, s]`. The last
-            row is the identity if the last period was not pruned.
+        parents: [*b, P, S] int64; after period p slot s was continued from slot `parents[..., p, s]`.
         simulated_scores: [*b, S, T, N] by the slot that simulated the step, the pruned ones included.
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated.
         leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended.
-        log_weights: [*b, P, S] of a :class:`Resampling` rule, before each pruning: minus the totals since the row was
-            last resampled, by the temperature; None with other rules, like the following.
+        log_weights: [*b, P, S] before each pruning, minus the totals since the row was last resampled, by the
+            temperature; None unless the rule is a :class:`Resampling`, like the following.
         leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 where it resampled.
         log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
             bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
@@ -119,9 +113,8 @@ def beam_search(
     leaves: int | None = None,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
-    """Search an environment whose whole state is in the TensorDict (no GymEnv, VmasEnv, SerialEnv or ParallelEnv).
-
-    S branches are simulated per row, and those with high scores make room for copies of the others.
+    """Search an environment whose whole state is in the TensorDict: those with high scores of the S branches of each
+    row make room for copies of the others.
 
     Gradients flow through environment, policy and scores unless the caller turns them off, along the history of
     each leaf; no tensor is changed in place. An episode ends once, with the first ``done`` (terminated or truncated):
@@ -129,15 +122,14 @@ def beam_search(
     mean, and rows whose branches have all ended are pruned no more.
 
     Args:
-        env: accepts any batch shape, or any that begins with its own; random numbers of its own are allowed, memory
-            is not. Its transforms are applied to the branches.
+        env: can be branched, see :func:`check_branching`. Its transforms are applied to the branches.
         policy: writes the action into the TensorDict it is given.
         score: of the state after a step, [*b, S, N] or [*b, S]; high is bad, padded agents 0. It gets the next
             state with reward and action, and must not write into it.
         start: [*b, S], e.g. ``branch(env.reset(...), S)``.
         steps: T, decisions per branch.
         prune_every: T_p, steps per period.
-        rule: which branches go on, see :mod:`symphony.collectors.rules`; or :class:`Backtrack`, with which nothing is
+        rule: which branches go on; or :class:`Backtrack`, with which nothing is
             copied: branches are independent lines that go back where they are bad. That takes no gradients and gives
             all leaves, and what is said below of slots, groups, values and noise has no meaning for it.
         aggregate: of the scores of a period [*b, S, T_p, N] to totals [*b, S]: an :class:`Aggregate`, which leaves
@@ -147,83 +139,78 @@ def beam_search(
         accumulate: the rule sees the sum of the totals of a branch's whole history, not those of the period alone.
         prune_last: prune after the last period too.
         until_done: False if ends of episodes are to change nothing at all.
-        noise: numbers in [0, 1) for rules that draw, one per row and period, or for each slot where a rule says
-            ``noise_per_slot``.
+        noise: numbers in [0, 1) for rules that draw, see :data:`PruningRule`.
         slot_keys: entries that stay in their slot when a branch is copied, such as the identity of a stream of
             random numbers: otherwise copies of one branch that draw from it would all do the same.
-        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree, for a rule that
-            takes groups. A copy is
-            of its parent's group.
+        group_key: integers [*b, S] in `start`, or [*b, S, N] that must all agree, for a rule that takes groups. A
+            copy is of its parent's group.
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
-        leaves: return only so many, the best of the last period in which the row had not ended first; default all,
-            in the order of their slots.
+        leaves: return only so many, the best by their `leaf_costs` first; default all, in the order of their slots.
         exploration_type: under which the policy runs.
 
     Raises:
-        ValueError: for an environment that can't be branched, arguments that contradict each other or shapes that
-            do not fit.
+        ValueError: for an environment that can't be branched, arguments that contradict each other, or wrong shapes.
     """
-    _check(start, steps, prune_every, leaves)
+    if not start.batch_dims or not start.numel() or steps < 1 or prune_every < 1:
+        what = f"a start state of {list(start.shape)}, {steps} steps, pruned every {prune_every}"
+        raise ValueError(f"rows, branches, steps and prune_every must be positive: {what}")
+    branches = start.shape[-1]
+    if leaves is not None and not 1 <= leaves <= branches:
+        raise ValueError(f"leaves must be 1 ... {branches} branches, is {leaves}")
     check_branching(env, start)
-    branches = branched_env(env, start.shape)
-
-    def simulate(now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
-        there = branches if now.shape == start.shape else branched_env(env, now.shape)
-        return _simulate(there, policy, score, now, ended, length, keep, until_done)
-
-    def total(run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
-        return _total(aggregate, run.scores[..., :length, :], run.alive[..., :length, :])
-
+    whole = branched_env(env, start.shape)
+    simulation = Simulation(env, whole, start.shape, policy, score, aggregate, keep, until_done)
     ended = _ended(env, start, start.ndim)
     with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
         if isinstance(rule, Backtrack):
-            if leaves not in (None, start.shape[-1]):
+            if leaves not in (None, branches):
                 raise ValueError("rule Backtrack gives all branches as leaves")
-            return _independent(
-                follow(simulate, total, start, ended, rule, steps, prune_every), prune_every, keep_tree
-            )
+            lines = follow(simulation.run, simulation.total, start, ended, rule, steps, prune_every)
+            return _independent(lines, prune_every, keep_tree)
         periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
         pruning = Pruning(start, rule, len(periods), group_key=group_key, noise=noise, accumulate=accumulate)
         now, records, scores, alive = start, [], [], []
         for period, length in enumerate(periods):
-            run = simulate(now, ended, length)
+            run = simulation.run(now, ended, length)
             records += run.records
             scores.append(run.scores)
             alive.append(run.alive)
             worth = None if value is None else torch.where(run.ended.all(-1), 0.0, value(run.after)).detach()
             last = period == len(periods) - 1
             active = run.alive[..., 0, :].any(-1).any(-1)
-            parents = pruning.prune(total(run), active, worth, keep_all=last and not prune_last)
+            parents = pruning.prune(simulation.total(run), active, worth, keep_all=last and not prune_last)
             if not last:
-                now, ended = _fork(run.after, run.ended, parents, slot_keys)
+                place = _places(parents, start)
+                now, ended = take(run.after, place), take_values(run.ended, place, start.ndim)
+                now = now.update(run.after.select(*slot_keys))
             del run  # or its last states live through the next period
 
     tree = TensorDict.stack(records, -1)
     del records
+    tree.refine_names(..., "time")
     simulated_scores, counted = torch.cat(scores, -2), torch.cat(alive, -2).any(-1)
     totals, seen, parents = (
         torch.stack(part, -2) for part in (pruning.totals, pruning.seen, pruning.parents)
     )
-    slots, weights = lineage(parents), pruning.last_weights()
-    log_weight, evidence = weights if weights is not None else (None, None)
+    slots, (log_weights, evidence) = lineage(parents), pruning.last_weights()
     # In later periods all branches of a row that has ended are equal.
-    last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)
-    costs, named = (_period(part, last_period) for part in (seen, slots))
+    last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)[..., None, None]
+    costs, named = (part.take_along_dim(last_period, -2).squeeze(-2) for part in (seen, slots))
     costs = costs.gather(-1, named)
     if leaves is not None:
         best = ranking(costs, named)[..., :leaves]
-        slots = slots.gather(-1, best[..., None, :].expand(*slots.shape[:-1], leaves))
-        costs = costs.gather(-1, best)
-        log_weight = None if log_weight is None else log_weight.gather(-1, best)
-    steps_at = _step_rows(slots, start.shape[-1], periods)
-    trajectories = take(tree, steps_at)
+        slots, costs = slots.take_along_dim(best[..., None, :], -1), costs.gather(-1, best)
+        log_weights = None if log_weights is None else log_weights.gather(-1, best)
+    # The place of each leaf's steps in the flattened tree [*b, S, T].
+    step = torch.arange(steps, device=slots.device)
+    place = _places(slots, start).transpose(-1, -2)[..., step // prune_every] * steps + step
+    trajectories = take(tree, place)
     trajectories.refine_names(..., "time")
-    tree.refine_names(..., "time")
     return BeamSearchResult(
         trajectories=trajectories,
-        scores=take_values(simulated_scores, steps_at, tree.batch_dims),
-        alive=take_values(counted, steps_at, tree.batch_dims),
+        scores=take_values(simulated_scores, place, tree.batch_dims),
+        alive=take_values(counted, place, tree.batch_dims),
         slots=slots,
         totals=totals,
         parents=parents,
@@ -233,7 +220,7 @@ def beam_search(
         simulated_steps=start.numel() * steps,
         leaf_costs=costs,
         log_weights=torch.stack(pruning.log_weights, -2) if pruning.log_weights else None,
-        leaf_log_weights=log_weight,
+        leaf_log_weights=log_weights,
         log_evidence=evidence,
     )
 
@@ -249,68 +236,68 @@ def _independent(
     return BeamSearchResult(steps, scores, alive, slots, totals, slots, scores, tree, prune_every, simulated)
 
 
-def _period(values: Shaped[Tensor, "*b P S"], number: Int[Tensor, "*b"]) -> Shaped[Tensor, "*b S"]:
-    """Of each row the values of a period of its own."""
-    place = number[..., None, None].expand(*number.shape, 1, values.shape[-1])
-    return values.gather(-2, place).squeeze(-2)
+@dataclass(frozen=True)
+class Simulation:
+    """How branches are simulated and scored; `whole` is the environment for all, [*b, S] of a `shape`."""
 
+    env: EnvBase
+    whole: EnvBase
+    shape: torch.Size
+    policy: Policy
+    score: Score
+    aggregate: Aggregation
+    keep: Sequence[NestedKey] | None
+    until_done: bool
 
-def score_state(
-    env: EnvBase, score: Score, stepped: TensorDictBase, now: TensorDictBase
-) -> Float[Tensor, "*b S N"]:
-    """Scores [*b, S, N] of the state `now` that the step `stepped` led to.
+    def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
+        """A period of some steps."""
+        env = self.whole if now.shape == self.shape else branched_env(self.env, now.shape)
+        recall(env, now)
+        # Policy and environment write into the TensorDict they are given.
+        now, records, scores, ends = now.copy(), [], [], [ended]
+        for _ in range(length):
+            stepped = env.step(self.policy(now))
+            now = env.step_mdp(stepped)
+            records.append(stepped if self.keep is None else stepped.select(*self.keep))
+            scores.append(self._scores(stepped, now))
+            ends.append(_ended(env, stepped.get("next"), now.ndim))
+            del stepped  # or one more set of observations lives through the next step
+        joined = torch.stack(scores, -2)
+        if not self.until_done:
+            alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
+            return Run(records, joined, alive, ended, now)
+        over = torch.stack(ends, -2).cumsum(-2) > 0
+        alive = ~over[..., :-1, :]
+        if alive.shape[-1] not in (1, joined.shape[-1]):
+            alive = alive.any(-1, keepdim=True)
+        return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now)
 
-    The reward is shown to the score, but is no part of the next step's input.
-    """
-    seen = now.copy()
-    for key in env.reward_keys:
-        seen.set(key, stepped.get(below(key)))
-    values = score(seen)
-    values = values.unsqueeze(-1) if values.shape == now.shape else values
-    if values.ndim != now.ndim + 1 or values.shape[:-1] != now.shape:
-        expected = ", ".join(map(str, now.shape))
-        raise ValueError(f"scores must be [{expected}] or [{expected}, agents], are {list(values.shape)}")
-    return values if values.is_floating_point() else values.float()
+    def _scores(self, stepped: TensorDictBase, now: TensorDictBase) -> Float[Tensor, "*b S N"]:
+        """Scores of the state `now` that the step `stepped` led to."""
+        seen = now.copy()  # the reward is shown to the score, but is no part of the next step's input
+        for key in self.env.reward_keys:
+            seen.set(key, stepped.get(below(key)))
+        values = self.score(seen)
+        values = values.unsqueeze(-1) if values.shape == now.shape else values
+        if values.ndim != now.ndim + 1 or values.shape[:-1] != now.shape:
+            raise ValueError(f"scores must be {[*now.shape]} or one more, agents, are {[*values.shape]}")
+        return values if values.is_floating_point() else values.float()
 
-
-def _simulate(
-    env: EnvBase,
-    policy: Policy,
-    score: Score,
-    now: TensorDictBase,
-    ended: Bool[Tensor, "*b S K"],
-    length: int,
-    keep: Sequence[NestedKey] | None,
-    until_done: bool,
-) -> Run:
-    recall(env, now)
-    # Policy and environment write into the TensorDict they are given.
-    now, records, scores, ends = now.copy(), [], [], [ended]
-    for _ in range(length):
-        stepped = env.step(policy(now))
-        now = env.step_mdp(stepped)
-        records.append(stepped if keep is None else stepped.select(*keep))
-        scores.append(score_state(env, score, stepped, now))
-        ends.append(_ended(env, stepped.get("next"), now.ndim))
-        del stepped  # or one more set of observations lives through the next step
-    joined = torch.stack(scores, -2)
-    if not until_done:
-        alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
-        return Run(records, joined, alive, ended, now)
-    over = torch.stack(ends, -2).cumsum(-2) > 0
-    alive = ~over[..., :-1, :]
-    if alive.shape[-1] not in (1, joined.shape[-1]):
-        alive = alive.any(-1, keepdim=True)
-    return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now)
+    def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
+        """The totals of a period, or of its first steps alone."""
+        scores, alive = run.scores[..., :length, :], run.alive[..., :length, :]
+        weighs = self.aggregate if isinstance(self.aggregate, Aggregate) else None
+        found = self.aggregate(scores) if weighs is None else weighs(scores, alive)
+        if found.shape != scores.shape[:-2]:
+            raise ValueError(f"the aggregate must be {tuple(scores.shape[:-2])}, is {tuple(found.shape)}")
+        return torch.where(alive[..., 0, :].any(-1), found, 0.0)
 
 
 def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b S K"]:
     """Whether the episode is done, for each of K agents where they end apart and for all (K = 1) where together."""
-    names = [key if isinstance(key, tuple) else (key,) for key in env.done_keys if last_name(key) == "done"]
+    names = [below(key)[1:] for key in env.done_keys if last_name(key) == "done"]
     # As TorchRL has it, the end of a group is that of all that is nested in it.
-    outer = [
-        key for key in names if not any(len(o) < len(key) and key[: len(o) - 1] == o[:-1] for o in names)
-    ]
+    outer = [n for n in names if not any(len(o) < len(n) and n[: len(o) - 1] == o[:-1] for o in names)]
     flags = [state.get(key).flatten(batch) for key in outer if state.get(key, None) is not None]
     if not flags:
         return torch.zeros(*state.shape[:batch], 1, dtype=torch.bool, device=state.device)
@@ -319,49 +306,10 @@ def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b 
     return torch.stack(flags).any(0)
 
 
-def _total(
-    aggregate: Aggregation, scores: Float[Tensor, "*b S T N"], alive: Bool[Tensor, "*b S T K"]
-) -> Float[Tensor, "*b S"]:
-    found = aggregate(scores, alive) if isinstance(aggregate, Aggregate) else aggregate(scores)
-    if found.shape != scores.shape[:-2]:
-        raise ValueError(f"the aggregate must be {tuple(scores.shape[:-2])}, is {tuple(found.shape)}")
-    return torch.where(alive[..., 0, :].any(-1), found, 0.0)
-
-
-def _fork(
-    state: TensorDictBase,
-    ended: Bool[Tensor, "*b S K"],
-    parents: Int[Tensor, "*b S"],
-    slot_keys: Sequence[NestedKey],
-) -> tuple[TensorDictBase, Bool[Tensor, "*b S K"]]:
-    """The states of the parents, but for entries that stay in their slots, and whether they have ended."""
-    branches = parents.shape[-1]
-    # Places in the flattened [*b, S]: of the first branch of each row, and of the parents beside it.
-    first = torch.arange(0, parents.numel(), branches, device=parents.device)
-    rows = first.reshape(*parents.shape[:-1], 1) + parents
-    forked = take(state, rows)
-    for key in slot_keys:
-        forked.set(key, state.get(key))
-    return forked, take_values(ended, rows, parents.ndim)
-
-
-def _step_rows(slots: Int[Tensor, "*b P L"], branches: int, periods: list[int]) -> Int[Tensor, "*b L T"]:
-    """For each leaf and step its place in the flattened tree [*b, S, T]."""
-    device, steps = slots.device, sum(periods)
-    # All periods are as long as the first, but for the last, which may be shorter.
-    period = torch.arange(steps, device=device) // periods[0]
-    slot = slots.transpose(-1, -2).index_select(-1, period)
-    row = torch.arange(slot[..., 0, 0].numel(), device=device).reshape(*slot.shape[:-2], 1, 1)
-    return (row * branches + slot) * steps + torch.arange(steps, device=device)
-
-
-def _check(start: TensorDictBase, steps: int, prune_every: int, leaves: int | None) -> None:
-    if not start.batch_dims or not start.numel():
-        raise ValueError(f"the start state must have rows and branches, its batch is {list(start.shape)}")
-    if steps < 1 or prune_every < 1:
-        raise ValueError(f"steps and prune_every must be positive, are {steps} and {prune_every}")
-    if leaves is not None and not 1 <= leaves <= start.shape[-1]:
-        raise ValueError(f"leaves must be 1 ... {start.shape[-1]} branches, is {leaves}")
+def _places(slots: Int[Tensor, "*b _"], start: TensorDictBase) -> Int[Tensor, "*b _"]:
+    """The places of slots [*b, L] or [*b, P, L] in the flattened branches [*b, S]."""
+    first = torch.arange(0, start.numel(), start.shape[-1], device=slots.device)
+    return first.reshape(*start.shape[:-1], *(1,) * (slots.ndim - start.ndim + 1)) + slots
 
 
 def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:

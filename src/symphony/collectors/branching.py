@@ -9,7 +9,7 @@ from weakref import WeakSet
 
 import torch
 from jaxtyping import Int, Shaped
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import (
@@ -33,12 +33,7 @@ def branch(tensordict: TensorDictBase, branches: int) -> TensorDictBase:
 
 
 class BatchedEnv(EnvBase):
-    """A view of an environment in which its specs have a batch size; the environment itself is left as it is.
-
-    Args:
-        env: steps any batch shape that begins with its own batch size.
-        batch_size: of the view, with the environment's own in front.
-    """
+    """A view of an environment in which its specs have a batch size, with the environment's own in front."""
 
     # Or TorchRL would step some rows alone, where others have ended, and take their specs for those of all.
     batch_locked = True
@@ -47,12 +42,9 @@ class BatchedEnv(EnvBase):
         super().__init__(device=env.device, batch_size=torch.Size(batch_size))
         self.inner = env
         self._supports_set_state = env._supports_set_state
-        own, shape = env.batch_size, self.batch_size
-        self.observation_spec = expanded_spec(env.full_observation_spec, own, shape)
-        self.state_spec = expanded_spec(env.full_state_spec, own, shape)
-        self.action_spec = expanded_spec(env.full_action_spec, own, shape)
-        self.reward_spec = expanded_spec(env.full_reward_spec, own, shape)
-        self.done_spec = expanded_spec(env.full_done_spec, own, shape)
+        for name in ("observation", "state", "action", "reward", "done"):
+            spec = getattr(env, f"full_{name}_spec")
+            setattr(self, f"{name}_spec", _expanded(spec, env.batch_size, self.batch_size))
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -88,14 +80,13 @@ class BatchedEnv(EnvBase):
         return super().to(device)
 
 
-def expanded_spec(spec: Composite, own: torch.Size, shape: torch.Size) -> Composite:
+def _expanded(spec: Composite, own: torch.Size, shape: torch.Size) -> Composite:
     """A spec of batch size `own` with the batch size `shape`, which begins with `own`."""
     if spec.shape != own:
         spec = spec.clone()
         spec.shape = own
-    if own:
-        for _ in range(len(shape) - len(own)):
-            spec = spec.unsqueeze(len(own))
+    for _ in range(len(shape) - len(own) if own else 0):
+        spec = spec.unsqueeze(len(own))
     return spec.expand(*shape) if shape else spec.clone()
 
 
@@ -105,25 +96,22 @@ def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
     Transforms of the environment are applied to the batch; others may be appended. (A bare
     ``BatchSizeTransform(batch_size=...)`` resets once and starts all rows from the same state.)
     """
-    base, transforms = _parts(env)
+    base, transforms = parts_of(env)
     _check_shape(base, torch.Size(batch_size))
     rows = BatchedEnv(base, batch_size)
     return TransformedEnv(rows, Compose(*(transform.clone() for transform in transforms)))
 
 
 def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> EnvBase:
-    """The environment for states of a batch shape [*b, S], its transforms included.
+    """The environment for states of a batch shape, its transforms included; ValueError if it can't be branched.
 
     Args:
         env: with rows [*b], or for any batch shape.
-        shape: of the states.
+        shape: of the states, [*b, S].
         share: what its transforms learn, such as the statistics of VecNorm, is one with the environment's; else it is
             a copy of its own, and frozen.
-
-    Raises:
-        ValueError: if it can't be branched.
     """
-    base, transforms = _parts(env)
+    base, transforms = parts_of(env)
     _check_shape(base, torch.Size(shape))
     if not transforms and not base.batch_size:
         return base
@@ -133,16 +121,15 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
         copy = Transform.clone(transform) if share else transform.clone()
         if isinstance(copy, TensorDictPrimer) and copy.primers.shape == env.batch_size:
             # It adds the batch of its environment to its specs, but can't replace another one.
-            copy.primers = (
-                copy.primers[(0,) * len(env.batch_size)] if env.batch_size else copy.primers.clone()
-            )
+            first = (0,) * len(env.batch_size)
+            copy.primers = copy.primers[first] if first else copy.primers.clone()
         if isinstance(copy, VecNormV2) and not share:
             copy.freeze()
         copies.append(copy)
     return TransformedEnv(BatchedEnv(base, shape), Compose(*copies))
 
 
-def _parts(env: EnvBase) -> tuple[EnvBase, list[Transform]]:
+def parts_of(env: EnvBase) -> tuple[EnvBase, list[Transform]]:
     """The innermost environment and the transforms around it, those that only give it a batch size left out."""
     transforms: list[Transform] = []
     while isinstance(env, TransformedEnv):
@@ -152,39 +139,29 @@ def _parts(env: EnvBase) -> tuple[EnvBase, list[Transform]]:
     return env, [one for one in transforms if not isinstance(one, BatchSizeTransform)]
 
 
-def innermost(env: EnvBase) -> EnvBase:
-    """The environment without transforms and rows."""
-    return _parts(env)[0]
-
-
 def _flat(transform: Transform) -> list[Transform]:
-    if isinstance(transform, Compose):
-        return [part for one in transform for part in _flat(one)]
-    return [transform]
+    return [p for one in transform for p in _flat(one)] if isinstance(transform, Compose) else [transform]
 
 
 def _check_shape(base: EnvBase, shape: torch.Size) -> None:
-    if base.batch_locked:
-        raise ValueError(_refusal(base, "is batch-locked"))
     own = base.batch_size
+    if base.batch_locked:
+        raise _refusal(base, "is batch-locked")
     if shape[: len(own)] != own:
-        raise ValueError(
-            _refusal(base, f"has a batch size, {list(own)}, which {list(shape)} does not begin with")
-        )
+        raise _refusal(base, f"has a batch size, {list(own)}, which {list(shape)} does not begin with")
 
 
 def _check_transform(transform: Transform, later: Sequence[Transform]) -> None:
     if isinstance(transform, VecNormV2) and not transform.reduce_batch_dims:
         raise ValueError("VecNormV2 needs reduce_batch_dims=True: its statistics are those of all branches")
-    if isinstance(transform, CatFrames):
-        written = {key for other in later for key in other.out_keys or ()}
-        if written & set(transform.out_keys):
-            raise ValueError("CatFrames must come after other transforms of the entries that it writes")
+    written = {key for other in later for key in other.out_keys or ()}
+    if isinstance(transform, CatFrames) and written & set(transform.out_keys):
+        raise ValueError("CatFrames must come after other transforms of the entries that it writes")
 
 
 def recall(env: EnvBase, state: TensorDictBase) -> None:
     """Let transforms that keep frames of their own go on from those in a state."""
-    for transform in _parts(env)[1]:
+    for transform in parts_of(env)[1]:
         if isinstance(transform, CatFrames):
             for into, key in zip(transform.in_keys, transform.out_keys, strict=True):
                 setattr(transform, f"_cat_buffers_{into}", state.get(key).clone())
@@ -198,10 +175,7 @@ def branched_specs(policy: Any, own: torch.Size, shape: torch.Size) -> Iterator[
         spec = vars(module).get("_spec")
         if own and isinstance(spec, Composite) and spec.shape[: len(own)] == own:
             changed.append((module, spec))
-            # The spec of an action alone has all dimensions but the last for a batch.
-            spec = spec.clone()
-            spec.shape = own
-            module._spec = expanded_spec(spec, own, shape)
+            module._spec = _expanded(spec, own, shape)
     try:
         yield
     finally:
@@ -212,19 +186,14 @@ def branched_specs(policy: Any, own: torch.Size, shape: torch.Size) -> Iterator[
 def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     """Refuse an environment that keeps anything outside of the TensorDict: copies of its branches would share it.
 
-    That rules out GymEnv, VmasEnv, SerialEnv, ParallelEnv and whatever wraps a simulator of its own. Given a state,
-    the environment is also stepped from it twice by the same random numbers, once in its lifetime: if the results
-    differ, it remembers something. One whose class says ``branchable = True`` is spared that trial, which waits for
-    the device.
+    It must accept any batch shape, or any that begins with its own, which rules out GymEnv, VmasEnv, SerialEnv,
+    ParallelEnv and whatever wraps a simulator of its own; random numbers of its own are allowed. Given a state, it is
+    also stepped from it twice by the same random numbers, once in its lifetime: if the results differ, it remembers
+    something. One whose class says ``branchable = True`` is spared that trial, which waits for the device.
 
-    Args:
-        env: to be branched.
-        state: [*b, S], from which it can be stepped.
-
-    Raises:
-        ValueError: if it can't be branched.
+    Raises ValueError if it can't be branched.
     """
-    base, transforms = _parts(env)
+    base, transforms = parts_of(env)
     _check_shape(base, base.batch_size if state is None else state.shape)
     if state is None or base in _PASSED or (getattr(base, "branchable", False) and not transforms):
         return
@@ -239,17 +208,14 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
                 recall(trial, one)
                 results.append(trial.step(acting.copy()).get("next"))
     for key, value in results[0].items(True, True):
-        try:  # a device may add up in another order each time
-            torch.testing.assert_close(results[1].get(key), value, rtol=1e-4, atol=1e-5, equal_nan=True)
-        except AssertionError as error:
-            raise ValueError(
-                _refusal(env, f"gave another {key!r} when stepped from the same state again")
-            ) from error
+        # A device may add up in another order each time.
+        if not torch.allclose(results[1].get(key), value, rtol=1e-4, atol=1e-5, equal_nan=True):
+            raise _refusal(env, f"gave another {key!r} when stepped from the same state again")
     _PASSED.add(base)
 
 
-def _refusal(env: EnvBase, why: str) -> str:
-    return (
+def _refusal(env: EnvBase, why: str) -> ValueError:
+    return ValueError(
         f"{type(env).__name__} can't be branched: it {why}. A search copies branches by copying TensorDicts, so the "
         "environment must keep all of its state there and step any batch shape (batch_locked = False). GymEnv, "
         "VmasEnv, SerialEnv and ParallelEnv can't be branched"
@@ -259,12 +225,10 @@ def _refusal(env: EnvBase, why: str) -> str:
 @contextmanager
 def _same_numbers(env: EnvBase) -> Iterator[None]:
     """Put back the generators, the global ones and the environment's, as if nothing had been drawn."""
-    device = torch.device("cpu") if env.device is None else env.device
-    own = [
-        value for part in env.modules() for value in vars(part).values() if isinstance(value, torch.Generator)
-    ]
+    held = [value for part in env.modules() for value in vars(part).values()]
+    own = [value for value in held if isinstance(value, torch.Generator)]
     states = [generator.get_state() for generator in own]
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+    with torch.random.fork_rng([env.device] if env.device is not None and env.device.type == "cuda" else []):
         yield
     for generator, before in zip(own, states, strict=True):
         generator.set_state(before)
@@ -289,7 +253,7 @@ def take_values(values: Shaped[Tensor, "*_"], rows: Int[Tensor, "*c"], dims: int
 
 def below(key: NestedKey) -> tuple[str, ...]:
     """The key under ``"next"``."""
-    return ("next", key) if isinstance(key, str) else ("next", *key)
+    return unravel_key(("next", key))
 
 
 def last_name(key: NestedKey) -> str:

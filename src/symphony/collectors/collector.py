@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import copyreg
-import functools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -18,60 +18,42 @@ from torchrl.envs.utils import RandomPolicy
 
 from symphony.collectors.backtracking import Backtrack
 from symphony.collectors.beam_search import Aggregation, BeamSearchResult, Policy, Score, beam_search
-from symphony.collectors.branching import (
-    below,
-    branch,
-    branched_env,
-    check_branching,
-    last_name,
-)
-from symphony.collectors.rules import KeepBest, PruningRule
-from symphony.collectors.scores import max_then_sum
+from symphony.collectors.branching import below, branch, branched_env, check_branching, last_name
+from symphony.collectors.rules import KeepBest, PruningRule, max_then_sum
 
 
 class BeamSearchCollector(Collector):
     """Collects beam searches of an environment that keeps its whole state in the TensorDict: see :func:`beam_search`.
 
-    Every batch starts from a reset. Each of the environment's rows is simulated in S branches, and what is
-    returned has the layout of any collector's batch: [*env.batch_size, T] with the best leaf of each row, or
-    [*env.batch_size, L, T] with the L best. Everything else is :class:`torchrl.collectors.Collector`: replay
-    buffers, weight updates, hooks, state, and being run by ``MultiSyncCollector`` or ``RayCollector``: these take
-    ``collector_class=BeamSearchCollector.bind(score=..., branches=...)``.
+    Every batch starts from a reset: [*env.batch_size, T] with the best leaf of each row, or [*env.batch_size, L, T]
+    with the L best. Everything else is :class:`torchrl.collectors.Collector`: replay buffers, weight updates, hooks,
+    state, and being run by ``MultiSyncCollector`` or ``RayCollector``, see :meth:`bind`.
 
     Besides the usual entries a batch holds
 
     - ``("collector", "beam_score")`` [..., T, N]: score of each step and agent,
     - ``("collector", "beam_total")`` [..., T]: aggregate of the period that the step belongs to,
     - ``("collector", "beam_slot")`` [..., T] int64: slot in which the step was simulated,
-    - ``("collector", "mask")`` [..., T] bool: False after the end of an episode that did not last T steps;
-      TorchRL's losses leave such steps out. With ``trajs_per_batch`` they are dropped.
+    - ``("collector", "mask")`` [..., T] bool: False after the end of an episode; TorchRL's losses leave such steps
+      out. With ``trajs_per_batch`` they are dropped.
     - with a :class:`Resampling` rule, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
-      weight of its tree; 0 where the last pruning resampled. Losses may weigh leaves by its exponential.
+      weight of its tree. Losses may weigh leaves by its exponential.
     - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all that was simulated, by slot, pruned
       branches included, with their ``("collector", "beam_score")``.
 
-    Frames are counted as returned; `simulated_frames` counts what was simulated for them, about S / L times as
-    many.
-
     Args:
-        create_env_fn: environment that can be branched, see :func:`check_branching`; for more than one row one with
-            a batch size, such as ``with_rows(env, [B])``. Its transforms are applied to the branches as well.
+        create_env_fn: as for :func:`beam_search`; for more than one row with a batch size: ``with_rows(env, [B])``.
         policy: as for :class:`Collector`; random actions by default.
         score: of the state after a step, see :func:`beam_search`.
         branches: S.
         leaves: L; by default the best leaf alone, without a dimension of its own.
-        prepare: called on the branched start state [*env.batch_size, S]; e.g. to give each branch a stream of
-            random numbers or a group.
+        prepare: called on the branched start state [*env.batch_size, S], e.g. to give each branch a group.
         keep_tree: also return what was pruned; with ``leaves=branches`` only.
         rule_noise: ``rule_noise(start, periods)`` gives numbers in [0, 1) for rules that draw, as `noise` of
             :func:`beam_search`; by default from a generator that :meth:`set_seed` sets.
         prune_every, rule, aggregate, value, accumulate, prune_last, until_done, slot_keys, group_key, keep: as for
             :func:`beam_search`.
-        kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T. Batches are never cut short by an
-            interruptor, and trajectories all have one length, so `split_trajs` is not available.
-
-    Raises:
-        ValueError: if the environment can't be branched, or for options that need single steps.
+        kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T, `simulated_frames` S / L times as many.
     """
 
     def __init__(
@@ -99,12 +81,8 @@ class BeamSearchCollector(Collector):
     ) -> None:
         if keep_tree and leaves != branches:
             raise ValueError(f"keep_tree needs leaves={branches}, as many as branches; leaves is {leaves}")
-        if leaves is not None and not 1 <= leaves <= branches:
-            raise ValueError(f"leaves must be 1 ... {branches} branches, is {leaves}")
-        if kwargs.get("split_trajs"):
-            raise ValueError("split_trajs: the trajectories of a search all have one length")
-        if not kwargs.get("extend_buffer", True):
-            raise ValueError("extend_buffer=False: a search has no single steps to write before it ends")
+        if kwargs.get("split_trajs") or not kwargs.get("extend_buffer", True):
+            raise ValueError("a search has no single steps: neither split_trajs nor extend_buffer=False")
         # Multi-process collectors pass their own choice; here each batch is made anew, from a reset.
         kwargs["use_buffers"], kwargs["reset_at_each_iter"] = False, True
         if kwargs.get("auto_register_policy_transforms") is None:
@@ -112,37 +90,21 @@ class BeamSearchCollector(Collector):
             kwargs["auto_register_policy_transforms"] = False
         if kwargs.get("worker_idx") is not None:
             # The global generators of worker processes all begin alike.
-            torch.manual_seed(
-                (torch.initial_seed() + (kwargs["worker_idx"] + 1) * 0x9E3779B97F4A7C15) % (1 << 63)
-            )
+            apart = (kwargs["worker_idx"] + 1) * 0x9E3779B97F4A7C15
+            torch.manual_seed((torch.initial_seed() + apart) % (1 << 63))
         super().__init__(create_env_fn, policy, **kwargs)
-        self.branches = branches
-        self.leaves = leaves
-        self.prune_every = prune_every
-        self.prepare = prepare
+        self.branches, self.leaves, self.prune_every, self.prepare = branches, leaves, prune_every, prepare
         self.simulated_frames = 0
-        self._score = score
-        self._search = functools.partial(
-            beam_search,
-            prune_every=prune_every,
-            rule=rule,
-            aggregate=aggregate,
-            value=value,
-            accumulate=accumulate,
-            prune_last=prune_last,
-            until_done=until_done,
-            slot_keys=slot_keys,
-            group_key=group_key,
-            # The leaves of a whole tree stay in the order of their slots.
-            leaves=None if keep_tree else leaves or 1,
-            keep_tree=keep_tree,
-        )
-        self._rule_noise = rule_noise
+        self._score, self._rule, self._rule_noise = score, rule, rule_noise
         self._rng = torch.Generator().manual_seed(torch.initial_seed() % (1 << 63))
-        self._rule = rule
         check_branching(self.env)
         self._done = [below(key) for key in self.env.done_keys]
-        self._keep = None if keep is None else list(dict.fromkeys([*keep, *self._done]))
+        self._search: dict[str, Any] = {"prune_every": prune_every, "rule": rule, "aggregate": aggregate}
+        self._search |= {"value": value, "accumulate": accumulate, "prune_last": prune_last}
+        self._search |= {"until_done": until_done, "slot_keys": slot_keys, "group_key": group_key}
+        self._search["keep"] = None if keep is None else list(dict.fromkeys([*keep, *self._done]))
+        # The leaves of a whole tree stay in the order of their slots.
+        self._search |= {"keep_tree": keep_tree, "leaves": None if keep_tree else leaves or 1}
         rows = self.n_env * (leaves or 1)
         self.frames_per_batch = -(-kwargs["frames_per_batch"] // rows)
         self.requested_frames_per_batch = self.frames_per_batch * rows
@@ -168,82 +130,64 @@ class BeamSearchCollector(Collector):
 
     def _searched(self, rows: TensorDictBase) -> BeamSearchResult:
         start = branch(rows, self.branches)
-        if self.prepare is not None:
-            start = self.prepare(start.copy())
-        return self._search(
-            self.env,
-            self._acting(),
-            self._score,
-            start,
-            steps=self.frames_per_batch,
-            noise=self.rule_noise(start),
-            keep=self._keep,
-            exploration_type=self.exploration_type,
-        )
+        start = start if self.prepare is None else self.prepare(start.copy())
+        how = {"steps": self.frames_per_batch, "exploration_type": self.exploration_type, **self._search}
+        return beam_search(self.env, self._acting(), self._score, start, noise=self.rule_noise(start), **how)
 
     def _finish(self, found: BeamSearchResult, *, fake: bool = False) -> TensorDictBase:
         leaves, totals = found.trajectories, found.leaf_totals
         period = torch.arange(self.frames_per_batch, device=found.slots.device) // self.prune_every
         if self.compact_obs:
-            leaves = leaves.exclude(*self._next_states())
-        leaves.set(("collector", "beam_score"), found.scores)
-        leaves.set(("collector", "beam_total"), totals.transpose(-1, -2)[..., period])
-        leaves.set(("collector", "beam_slot"), found.slots.transpose(-1, -2)[..., period])
+            states = (*self.env.observation_keys, *self.env.state_keys)
+            leaves = leaves.exclude(*(below(key) for key in states))
+        ended = torch.stack([leaves.get(key).flatten(leaves.ndim).any(-1) for key in self._done]).any(0)
+        extras = {
+            "beam_score": found.scores,
+            "beam_total": totals.transpose(-1, -2)[..., period],
+            "beam_slot": found.slots.transpose(-1, -2)[..., period],
+            "mask": ended.cumsum(-1) - ended.long() == 0,
+        }
+        if found.leaf_log_weights is not None:
+            extras["log_weight"] = found.leaf_log_weights.float()[..., None].expand(leaves.shape).clone()
+        if self.track_traj_ids:
+            number = leaves.shape[:-1].numel()
+            ids = torch.zeros(number, dtype=torch.int64, device=ended.device)
+            ids = ids if fake else self._traj_pool.get_traj_and_increment(number, device=ended.device)
+            extras["traj_ids"] = ids.reshape(*leaves.shape[:-1], 1).expand(leaves.shape).clone()
+        for name, value in extras.items():
+            leaves.set(("collector", name), value)
         if found.tree is not None:
             found.tree.set(("collector", "beam_score"), found.simulated_scores)
             leaves.set("tree", found.tree)
-        ended = torch.stack([_per_entry(leaves.get(key), leaves.ndim) for key in self._done]).any(0)
-        mask = ended.cumsum(-1) - ended.long() == 0
-        leaves.set(("collector", "mask"), mask)
-        if found.leaf_log_weights is not None:
-            weight = found.leaf_log_weights.float()[..., None]
-            leaves.set(("collector", "log_weight"), weight.expand(leaves.shape).clone())
-        if self.track_traj_ids:
-            number = leaves.shape[:-1].numel()
-            ids = torch.zeros(number, dtype=torch.int64, device=mask.device)
-            ids = ids if fake else self._traj_pool.get_traj_and_increment(number, device=mask.device)
-            leaves.set(
-                ("collector", "traj_ids"), ids.reshape(*leaves.shape[:-1], 1).expand(leaves.shape).clone()
-            )
-        if self.leaves is None:
-            leaves = leaves.squeeze(-2)
+        leaves = leaves.squeeze(-2) if self.leaves is None else leaves
         leaves.refine_names(..., "time")
-        if self.storing_device is not None:
-            leaves = leaves.to(self.storing_device)
+        leaves = leaves if self.storing_device is None else leaves.to(self.storing_device)
         leaves = self._truncate(leaves)
         return leaves if self.trajs_per_batch is None else self._cut(leaves)
 
     def _cut(self, leaves: TensorDictBase) -> TensorDictBase:
         """Put what follows an episode's end into one trajectory that never ends, so that none assembles it."""
-        after = ~leaves.get(("collector", "mask"))
-        ids = leaves.get(("collector", "traj_ids"))
-        leaves.set(("collector", "traj_ids"), ids.masked_fill(after, -1))
+        after, ids = ~leaves.get(("collector", "mask")), ("collector", "traj_ids")
+        leaves.set(ids, leaves.get(ids).masked_fill(after, -1))
         for key in self._done:
-            done = leaves.get(key)
-            leaves.set(key, done & ~after.reshape(after.shape + (1,) * (done.ndim - after.ndim)))
+            leaves.set(key, leaves.get(key) & ~expand_as_right(after, leaves.get(key)))
         return leaves
 
     def _truncate(self, leaves: TensorDictBase) -> TensorDictBase:
         """Declare the last step truncated, if asked for."""
+        last = torch.arange(leaves.shape[-1]) == leaves.shape[-1] - 1
+        last = last.to(leaves.get(("collector", "mask")).device).expand(leaves.shape)
         for key in self._done if self.set_truncated else ():
             if last_name(key) == "truncated":
-                last = torch.zeros_like(leaves.get(("collector", "mask")))
-                last[..., -1] = True
                 for name in (key, (*key[:-1], "done")):
-                    flag = leaves.get(name)
-                    leaves.set(name, flag | last.reshape(last.shape + (1,) * (flag.ndim - last.ndim)))
+                    leaves.set(name, leaves.get(name) | expand_as_right(last, leaves.get(name)))
         return leaves
-
-    def _next_states(self) -> list[NestedKey]:
-        return [below(key) for key in (*self.env.observation_keys, *self.env.state_keys)]
 
     def _acting(self) -> Policy:
         """The policy of one search; until `init_random_frames` are collected, random actions."""
-        first = self.init_random_frames or 0
-        buffer = self.replay_buffer
+        buffer, policy = self.replay_buffer, self._wrapped_policy
         seen = self.stats()["frames"] if buffer is None else buffer.write_count
-        policy = self._wrapped_policy
-        if isinstance(policy, RandomPolicy) or seen < first:
+        if isinstance(policy, RandomPolicy) or seen < (self.init_random_frames or 0):
             # The specs of a random policy have the rows of the collector's environment, but no branches.
             return branched_env(self.env, (*self.env.batch_size, self.branches)).rand_action
         if self.policy_device is None or self.policy_device == self.env_device:
@@ -252,8 +196,7 @@ class BeamSearchCollector(Collector):
         def elsewhere(tensordict: TensorDictBase) -> TensorDictBase:
             there = tensordict.to(self.policy_device)
             output = policy(there.copy())
-            new = [key for key, value in output.items(True, True) if value is not there.get(key, None)]
-            output = output.select(*new)
+            output = output.select(*(k for k, v in output.items(True, True) if v is not there.get(k, None)))
             return tensordict.update(output if self.env_device is None else output.to(self.env_device))
 
         return elsewhere
@@ -302,13 +245,8 @@ class BeamSearchCollector(Collector):
         return {**super().stats(), "simulated_frames": self.simulated_frames}
 
 
-def _per_entry(flag: Bool[Tensor, "*e"], batch_dims: int) -> Bool[Tensor, "*_"]:
-    """Whether any of the flags [*b, ...] of an entry [*b] is set."""
-    return flag.reshape(*flag.shape[:batch_dims], -1).any(-1)
-
-
 class BoundType(type(Collector)):  # type: ignore[misc]  # TorchRL's metaclass has no public name
-    """Of classes made at run time, which are pickled as their base and the arguments bound."""
+    """Type of classes made at run time, which are pickled as their base and the arguments bound."""
 
     settings: dict[str, Any]
 
@@ -323,9 +261,5 @@ def bind(base: type[Collector], settings: dict[str, Any]) -> type[Collector]:
     return BoundType(base.__name__, (base,), members)
 
 
-def _reduced(bound: BoundType) -> tuple[Any, ...]:
-    return bind, (bound.__base__, bound.settings)
-
-
 # pickle would look for a class in its module, unless its type has a reduction.
-copyreg.pickle(BoundType, _reduced)
+copyreg.pickle(BoundType, lambda bound: (bind, (bound.__base__, bound.settings)))  # type: ignore[arg-type, return-value]

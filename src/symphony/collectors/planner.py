@@ -11,22 +11,18 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MPCPlannerBase
 
 from symphony.collectors.beam_search import Policy, beam_search
-from symphony.collectors.branching import branch, branched_env, check_branching, innermost
-from symphony.collectors.rules import KeepBest, PruningRule
-from symphony.collectors.scores import Aggregate, KeyScore
+from symphony.collectors.branching import branch, branched_env, check_branching, parts_of
+from symphony.collectors.rules import Aggregate, KeepBest, KeyScore, PruningRule
 
 
 class BeamSearchPlanner(MPCPlannerBase):
     """Plans as :class:`torchrl.modules.CEMPlanner` does, by a beam search for a high return.
 
     Branches are pruned by the rewards since the root and, where there is a value network, the value of the state they
-    have come to. The action is the first of the best branch. Beside it the planner writes what may serve as targets
-    for a policy (as mctx gives them):
-
-    - ``("planner", "action")`` [*b, S, ...]: the first actions of all branches;
-    - ``("planner", "weight")`` [*b, S]: the share of the final branches that go back to each of them, by
-      ``softmax(return / temperature)``;
-    - ``("planner", "value")`` [*b, 1]: the return of the best branch.
+    have come to. The action is the first of the best branch. Beside it the planner writes targets for a policy, as
+    mctx gives them: ``("planner", "action")`` [*b, S, ...], the first actions of all branches; ``("planner",
+    "weight")`` [*b, S], the share of the final branches that go back to each, by ``softmax(return / temperature)``;
+    ``("planner", "value")`` [*b, 1], the return of the best branch.
 
     Args:
         env: as for :func:`beam_search`, with the rows of the states that are planned from.
@@ -58,7 +54,7 @@ class BeamSearchPlanner(MPCPlannerBase):
         noise: Callable[[TensorDictBase, int], Tensor] | None = None,
     ) -> None:
         check_branching(env)
-        super().__init__(innermost(env), action_key)
+        super().__init__(parts_of(env)[0], action_key)
         # What is searched has rows and transforms, which TorchRL's planners know nothing of.
         self.env, self.action_spec = env, env.action_spec
         self.planning_horizon, self.branches, self.prune_every = planning_horizon, branches, prune_every
@@ -69,7 +65,7 @@ class BeamSearchPlanner(MPCPlannerBase):
     def planning(self, tensordict: TensorDictBase) -> Tensor:
         """The first action of the best branch from states [*b]; the targets are written into them."""
         root = tensordict.exclude("planner", "next", *self.env.action_keys)
-        start = branch(root, self.branches)
+        start, periods = branch(root, self.branches), -(-self.planning_horizon // self.prune_every)
         found = beam_search(
             self.env,
             self.policy or branched_env(self.env, start.shape).rand_action,
@@ -81,9 +77,7 @@ class BeamSearchPlanner(MPCPlannerBase):
             aggregate=Aggregate("sum"),
             value=None if self.value_network is None else self._cost,
             accumulate=True,
-            noise=None
-            if self.noise is None
-            else self.noise(tensordict, -(-self.planning_horizon // self.prune_every)),
+            noise=None if self.noise is None else self.noise(tensordict, periods),
             prune_last=False,
             keep=[self.action_key],
             keep_tree=True,
@@ -92,16 +86,12 @@ class BeamSearchPlanner(MPCPlannerBase):
         assert found.tree is not None and found.leaf_costs is not None  # noqa: S101, PT018  (as asked for)
         first, roots = found.tree.get(self.action_key).select(root.ndim + 1, 0), found.slots[..., 0, :]
         share = torch.softmax(-found.leaf_costs / self.temperature, -1)
-        targets = {
-            "action": first,
-            "weight": torch.zeros_like(share).scatter_add(-1, roots, share),
-            "value": -found.leaf_costs[..., :1],
-        }
+        weight = torch.zeros_like(share).scatter_add(-1, roots, share)
+        targets = {"action": first, "weight": weight, "value": -found.leaf_costs[..., :1]}
         tensordict.set("planner", TensorDict(targets, root.shape))
         best = roots[..., :1].reshape(*root.shape, 1, *(1,) * (first.ndim - root.ndim - 1))
-        return first.gather(root.ndim, best.expand(*root.shape, 1, *first.shape[root.ndim + 1 :])).squeeze(
-            root.ndim
-        )
+        best = best.expand(*root.shape, 1, *first.shape[root.ndim + 1 :])
+        return first.gather(root.ndim, best).squeeze(root.ndim)
 
     def _cost(self, state: TensorDictBase) -> Tensor:
         assert self.value_network is not None  # noqa: S101  (not asked for otherwise)

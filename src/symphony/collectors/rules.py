@@ -1,39 +1,138 @@
-"""Pruning rules: which branches go on, and in how many copies.
-
-A rule is any callable ``rule(totals, noise) -> parents``: totals [*b, S] float, where a *high* number is bad;
-noise [*b] in [0, 1) or None; parents [*b, S] int64, the branch that each slot is continued from. One with
-``takes_groups = True`` is called with groups [*b, S] (or None), too, and decides what they mean. A
-:class:`Resampling` rule weighs branches: what it sees are the totals since a row was last resampled.
-"""
+"""What decides in a search: scores of steps, totals of periods, and rules by which branches go on in some copies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 PruningRule = Callable[..., Tensor]
-"""What :func:`beam_search` calls at a pruning point: see the module. Rows are independent, and nothing is drawn but
-by the given noise. This one drops the worst branch for the best:
-
->>> import torch
->>> def drop_worst(totals, noise=None):
-...     slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
-...     best, worst = totals.argmin(-1, keepdim=True), totals.argmax(-1, keepdim=True)
-...     return slots.scatter(-1, worst, best)
->>> drop_worst(torch.tensor([[0.5, 3.0, 0.1, 1.0]])).tolist()
-[[0, 2, 2, 3]]
+"""Any callable ``rule(totals, noise) -> parents``: totals [*b, S] float, where a *high* number is bad; noise [*b] in
+[0, 1) or None, by which alone it may draw; parents [*b, S] int64, the branch that each slot is continued from. One
+with ``takes_groups = True`` is called with groups [*b, S] (or None), too, and decides what they mean; one with
+``noise_per_slot = True`` gets noise [*b, S].
 """
+
+
+def _sum(values: Float[Tensor, "*_"], dim: int) -> Float[Tensor, "*_"]:
+    # Added one by one: how many padded agents follow would change the last bit of `Tensor.sum`.
+    return values.cumsum(dim).select(dim, -1)
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """Scores of a period [*b, S, T_p, N] to totals [*b, S]: first over time, then over agents.
+
+    Args:
+        time: how the T_p steps are joined, those before the end of an episode alone.
+        agents: how the N agents are joined. Scores of padded agents are 0: a sum does not change with how many there
+            are, a maximum or a mean does.
+    """
+
+    time: Literal["max", "mean", "sum", "last"] = "max"
+    agents: Literal["sum", "max", "mean"] = "sum"
+
+    def __post_init__(self) -> None:
+        if self.time not in ("max", "mean", "sum", "last"):
+            raise ValueError(f"time is one of max, mean, sum, last, not {self.time!r}")
+        if self.agents not in ("sum", "max", "mean"):
+            raise ValueError(f"agents is one of sum, max, mean, not {self.agents!r}")
+
+    def __call__(
+        self, scores: Float[Tensor, "*b S T N"], alive: Bool[Tensor, "*b S T _"] | None = None
+    ) -> Float[Tensor, "*b S"]:
+        """The totals; an agent none of whose steps counts has 0.
+
+        Args:
+            scores: of all steps.
+            alive: which of them count, the first ones; all of them if None.
+        """
+        alive = torch.ones_like(scores[..., :1], dtype=torch.bool) if alive is None else alive
+        number = alive.sum(-2)
+        if self.time == "max":
+            found = scores.masked_fill(~alive, -torch.inf).amax(-2)
+            joined = torch.where(alive[..., 0, :], found, 0.0)
+        elif self.time == "last":
+            last = (number - 1).clamp_min(0).expand(scores.select(-2, 0).shape)
+            joined = torch.where(alive, scores, 0.0).gather(-2, last.unsqueeze(-2)).squeeze(-2)
+        else:
+            joined = _sum(torch.where(alive, scores, 0.0), -2)
+            joined = joined / number.clamp_min(1) if self.time == "mean" else joined
+        if self.agents == "max":
+            return joined.amax(-1)
+        total = _sum(joined, -1)
+        return total / joined.shape[-1] if self.agents == "mean" else total
+
+
+max_then_sum = Aggregate("max", "sum")
+"""The paper's: the worst moment of each agent, added up."""
+mean_then_sum = Aggregate("mean", "sum")
+"""The average of each agent over the period, added up."""
+
+
+@dataclass(frozen=True)
+class KeyScore:
+    """Score that is read from an entry of the TensorDict, written there by the environment or by a module.
+
+    Args:
+        key: [*b, S], [*b, S, N] or [*b, S, N, 1], any number or bool.
+        module: called first, on a shallow copy, if the entry is its output.
+        negate: for entries of which *high* is good, such as a reward.
+        valid_key: [*b, S, N] bool, if scores of padded agents are to be 0.
+    """
+
+    key: NestedKey
+    module: Callable[[TensorDictBase], TensorDictBase] | None = None
+    negate: bool = False
+    valid_key: NestedKey | None = None
+
+    def __call__(self, tensordict: TensorDictBase) -> Float[Tensor, "*b S N"]:
+        """The scores; KeyError if an entry is absent, ValueError if the mask is not one of these agents."""
+        if self.module is not None:
+            # Modules write into what they are given, and whatever is in the state is carried to the next step.
+            tensordict = self.module(tensordict.copy())
+        score, batch = _entry(tensordict, self.key), tensordict.batch_dims
+        score = score if score.is_floating_point() else score.float()
+        score = score.unsqueeze(-1) if score.ndim == batch else score
+        score = score.squeeze(-1) if score.ndim == batch + 2 and score.shape[-1] == 1 else score
+        score = -score if self.negate else score
+        if self.valid_key is None:
+            return score
+        valid = _entry(tensordict, self.valid_key)
+        if valid.shape != score.shape:  # broadcast, the score of a branch would count for each of its agents
+            shapes = f"{list(valid.shape)}, scores of agents are {list(score.shape)}"
+            raise ValueError(f"{self.valid_key!r} is {shapes}")
+        # Not a product: a padded agent may hold NaN.
+        return score.where(valid, score.new_zeros(()))
+
+
+def _entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    value = tensordict.get(key)
+    if value is None:
+        raise KeyError(f"no entry {key!r} to score with")
+    return value
 
 
 def takes_groups(rule: object) -> bool:
     """Whether a rule wants to see the groups."""
     return bool(getattr(rule, "takes_groups", False))
+
+
+def _needed(noise: Tensor | None) -> Tensor:
+    if noise is None:
+        raise ValueError("the rule needs noise: numbers in [0, 1) for each row and period")
+    return noise
+
+
+def _slots(totals: Float[Tensor, "*b S"]) -> Int[Tensor, "*b S"]:
+    """The parents where every slot goes on from itself."""
+    return torch.arange(totals.shape[-1], device=totals.device).expand(totals.shape)
 
 
 @dataclass(frozen=True)
@@ -51,30 +150,21 @@ class KeepBest:
         if not 0.0 < self.fraction <= 1.0:
             raise ValueError(f"the kept fraction must be in (0, 1], is {self.fraction}")
 
-    def survivors(self, branches: int) -> int:
-        """How many of `branches` survive."""
-        # The margin takes back what rounding may add: 0.1 * 30 is a little more than 3.
-        return max(1, math.ceil(self.fraction * branches - 1e-9))
-
-    def __call__(
-        self, totals: Float[Tensor, "*b S"], noise: Float[Tensor, "*b"] | None = None
-    ) -> Int[Tensor, "*b S"]:
+    def __call__(self, totals: Float[Tensor, "*b S"], noise: Tensor | None = None) -> Int[Tensor, "*b S"]:
         """Parents of the S slots; needs no noise."""
-        branches = totals.shape[-1]
         ranked = totals.argsort(dim=-1, stable=True)
-        slots = torch.arange(branches, device=totals.device) % self.survivors(branches)
-        return ranked[..., slots]
+        slots = torch.arange(totals.shape[-1], device=totals.device)
+        # The margin takes back what rounding may add: 0.1 * 30 is a little more than 3.
+        return ranked[..., slots % max(1, math.ceil(self.fraction * len(slots) - 1e-9))]
 
 
 @dataclass(frozen=True)
 class KeepAll:
     """Prune nothing: S independent rollouts, scored."""
 
-    def __call__(
-        self, totals: Float[Tensor, "*b S"], noise: Float[Tensor, "*b"] | None = None
-    ) -> Int[Tensor, "*b S"]:
+    def __call__(self, totals: Float[Tensor, "*b S"], noise: Tensor | None = None) -> Int[Tensor, "*b S"]:
         """Every slot is its own parent."""
-        return torch.arange(totals.shape[-1], device=totals.device).expand(totals.shape)
+        return _slots(totals)
 
 
 @dataclass(frozen=True)
@@ -82,7 +172,7 @@ class Resampling:
     """Resampling with weights softmax(-totals / temperature), as in particle filters; subclasses draw the copies.
 
     A branch of weight w gets S w copies on average over the noise. Slots are filled in order of rank, so slot 0 holds
-    the best that goes on. Softer than truncation: bad branches become rarer instead of extinct.
+    the best that goes on. What the rule sees are the totals since a row was last resampled.
 
     Args:
         temperature: in the units of the totals; 1 where they are negative log-likelihoods.
@@ -106,16 +196,9 @@ class Resampling:
             return torch.ones_like(totals[..., 0], dtype=torch.bool)
         return sample_size(self._logits(totals)) <= self.threshold * totals.shape[-1]
 
-    def __call__(
-        self, totals: Float[Tensor, "*b S"], noise: Float[Tensor, "*b"] | None = None
-    ) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots, by one number [*b] for each row or [*b, S]; NaN counts as infinitely bad.
-
-        Raises:
-            ValueError: if noise is None.
-        """
-        if noise is None:
-            raise ValueError("resampling needs noise: numbers in [0, 1) for each row and period")
+    def __call__(self, totals: Float[Tensor, "*b S"], noise: Tensor | None = None) -> Int[Tensor, "*b S"]:
+        """Parents of the S slots; NaN counts as infinitely bad. Raises ValueError without noise."""
+        noise = _needed(noise)
         ranked = totals.argsort(dim=-1, stable=True)
         weights = torch.softmax(self._logits(totals.gather(-1, ranked)), -1)
         slots = torch.arange(totals.shape[-1], device=totals.device)
@@ -135,10 +218,7 @@ class Resampling:
 
 
 class Systematic(Resampling):
-    """Systematic resampling (Kitagawa 1996): a branch of weight w gets floor(S w) or ceil(S w) copies.
-
-    Branches with equal totals all go on.
-    """
+    """Systematic resampling (Kitagawa 1996): a branch of weight w gets floor(S w) or ceil(S w) copies."""
 
 
 class Stratified(Resampling):
@@ -201,25 +281,134 @@ class ReplaceBad:
         noise: Float[Tensor, "*b"] | None = None,
         groups: Int[Tensor, "*b S"] | None = None,
     ) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots by one uniform number per row.
-
-        Raises:
-            ValueError: if noise is None.
-        """
-        if noise is None:
-            raise ValueError("ReplaceBad needs noise: one number in [0, 1) per row and pruning point")
-        slots = torch.arange(totals.shape[-1], device=totals.device)
-        good = totals <= self.threshold
-        groups = torch.zeros_like(totals, dtype=torch.int64) if groups is None else groups
+        """Parents of the S slots by one uniform number per row. Raises ValueError without noise."""
+        noise = _needed(noise)
+        slots, good = _slots(totals), totals <= self.threshold
+        groups = torch.zeros_like(slots) if groups is None else groups
         # [*b, S, S]: the slot to fill, then the branch that may fill it, or another slot that waits.
         same = groups[..., :, None] == groups[..., None, :]
         own = (good[..., None, :] & same).any(-1)
         candidates = good[..., None, :] & (same | ~own[..., :, None])
         waiting = ~good[..., None, :] & torch.where(own[..., :, None], same, ~own[..., None, :])
         # Those that wait for the same branches take them by turns, from one on that the noise picks.
-        turn = (waiting & (slots < slots[:, None])).sum(-1)
+        turn = (waiting & (slots[..., None, :] < slots[..., :, None])).sum(-1)
         number = candidates.sum(-1)
         first = (noise.double()[..., None] * number).long()
         place = (first + turn) % number.clamp_min(1)
         chosen = candidates & (candidates.cumsum(-1) - 1 == place[..., None])
         return torch.where(good | (number == 0), slots, chosen.int().argmax(-1))
+
+
+class Pruning:
+    """What a rule decides from period to period of one search, with groups and weights carried on.
+
+    The arguments are those of :func:`symphony.collectors.beam_search`.
+
+    Attributes:
+        totals: of each period [*b, S].
+        seen: what the rule saw of them.
+        parents: the slots that slots went on from.
+        active: rows [*b] in which some episode went on.
+        log_weights: of the branches before each pruning, for rules that weigh.
+    """
+
+    def __init__(
+        self,
+        start: TensorDictBase,
+        rule: PruningRule,
+        periods: int,
+        *,
+        group_key: NestedKey | None,
+        noise: Tensor | None,
+        accumulate: bool,
+    ) -> None:
+        self.rule, self.accumulate = rule, accumulate
+        self.weighs = rule if isinstance(rule, Resampling) else None
+        self._groups = None if group_key is None else _groups(start, group_key)
+        if group_key is not None and not takes_groups(rule):
+            raise ValueError(f"{rule} knows nothing of groups: group_key is for a rule that takes groups")
+        self._noises: Sequence[Tensor | None] = [None] * periods
+        if noise is not None:
+            slots = start.shape[-1:] if getattr(rule, "noise_per_slot", False) else ()
+            shape = [*start.shape[:-1], periods, *slots]
+            if list(noise.shape) != shape:
+                raise ValueError(f"noise must be {shape}, is {list(noise.shape)}")
+            self._noises = noise.unbind(start.ndim - 1)
+        self.totals, self.seen, self.parents = list[Tensor](), list[Tensor](), list[Tensor]()
+        self.active, self.log_weights, self._gained = list[Tensor](), list[Tensor](), list[Tensor]()
+        self._carried: Tensor | None = None
+
+    @torch.no_grad()
+    def prune(
+        self,
+        totals: Float[Tensor, "*b S"],
+        active: Bool[Tensor, "*b"],
+        worth: Float[Tensor, "*b S"] | None = None,
+        *,
+        keep_all: bool = False,
+    ) -> Int[Tensor, "*b S"]:
+        """Parents of the slots after a period, which went on in `active` rows and led to states of a `worth`; the
+        slots themselves if all are kept.
+        """
+        carried = totals.detach() if self._carried is None else self._carried + totals.detach()
+        seen = carried if worth is None else carried + worth
+        slots, moves = _slots(seen), torch.zeros_like(active) if keep_all else active
+        if not keep_all:
+            parents = checked(self.rule, seen, self._noises[len(self.parents)], self._groups)
+            moves = moves if self.weighs is None else moves & self.weighs.resamples(seen)
+            slots = torch.where(moves[..., None], parents, slots)
+            self._groups = None if self._groups is None else self._groups.gather(-1, slots)
+        if self.weighs is not None:
+            weights = -seen.double() / self.weighs.temperature
+            self.log_weights.append(weights)
+            self._gained.append(torch.where(moves, _log_mean(weights), 0.0))
+            # What branches were chosen for in advance is taken back, or it would count again when it comes.
+            ahead = torch.zeros_like(seen) if worth is None else -worth.gather(-1, slots)
+            self._carried = torch.where(moves[..., None], ahead, carried)
+        elif self.accumulate:
+            self._carried = carried.gather(-1, slots)
+        self.totals.append(totals)
+        self.seen.append(seen)
+        self.parents.append(slots)
+        self.active.append(active)
+        return slots
+
+    def last_weights(self) -> tuple[Float[Tensor, "*b S"] | None, Float[Tensor, "*b"] | None]:
+        """Log-weights of the slots after the last pruning, relative to their mean, and the log-evidence."""
+        if self.weighs is None or self._carried is None:
+            return None, None
+        weights = -self._carried.double() / self.weighs.temperature
+        mean = _log_mean(weights)
+        return weights - mean[..., None], torch.stack(self._gained).sum(0) + mean
+
+
+def _log_mean(log_weights: Float[Tensor, "*b S"]) -> Float[Tensor, "*b"]:
+    return log_weights.logsumexp(-1) - math.log(log_weights.shape[-1])
+
+
+def _groups(start: TensorDictBase, key: NestedKey) -> Int[Tensor, "*b S"]:
+    """The group of each branch: its number, or the first branch that agrees with it in all of its numbers."""
+    value = start.get(key, torch.zeros(()))  # no entry is as wrong as one of another kind
+    if value.is_floating_point() or value.shape[: start.ndim] != start.shape or value.ndim > start.ndim + 1:
+        raise ValueError(f"{key!r} in the start state must be integers, one or some per branch")
+    if value.ndim == start.ndim:
+        return value
+    return (value[..., :, None, :] == value[..., None, :, :]).all(-1).int().argmax(-1)
+
+
+def checked(
+    rule: PruningRule,
+    totals: Float[Tensor, "*b S"],
+    noise: Tensor | None = None,
+    groups: Int[Tensor, "*b S"] | None = None,
+) -> Int[Tensor, "*b S"]:
+    """The branch each slot goes on from; ValueError if a rule returns something else than int64 indices of them."""
+    parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)
+    if parents.dtype != torch.int64 or parents.shape != totals.shape:
+        what = f"{parents.dtype} {tuple(parents.shape)}"
+        raise ValueError(f"a pruning rule must return int64 {tuple(totals.shape)}, {rule} returned {what}")
+    # Looking at the values waits for the device; only rules of others need it.
+    own = isinstance(rule, KeepAll | KeepBest | Resampling | ReplaceBad)
+    if not own and parents.numel() and not bool(((parents >= 0) & (parents < totals.shape[-1])).all()):
+        raise ValueError(f"{rule} returned branches outside of 0 ... {totals.shape[-1] - 1}")
+    return parents
