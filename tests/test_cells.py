@@ -16,10 +16,9 @@ from helpers_segments import crossing, straight_road
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
-from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.objects import objects_at
+from symphony.envs.flags import collision_flags, offroad_flags, road_distance
+from symphony.envs.objects import Objects, Observers, objects_at
 from symphony.envs.points import nearest_points, observed_points
-from symphony.envs.road import road_distance
 from symphony.envs.tables import Tables
 from symphony.geometry import NO_BOUNDARY, segments_of
 from symphony.geometry.cells import EdgeCells, PointCells
@@ -83,13 +82,16 @@ def test_points_are_seen_as_by_the_plain_formula(scenes: SceneBatch) -> None:
     pose = torch.cat([where, torch.randn(*where.shape[:2], 2, generator=rng) * 5], -1)
     step = torch.randint(60, (len(row),), generator=rng)
     tables = Tables(scenes, FEW)
-    inputs = pose[..., :2].clone().requires_grad_(), pose[..., 2], pose[..., 3]
-    found, mask = observed_points(tables, row, step, *inputs)
+    x, y, heading, speed = pose.clone().requires_grad_().unbind(-1)
+    state = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
+    objects = Objects(state, torch.ones_like(x, dtype=torch.bool), state[..., :2], x.long())
+    who = Observers.of(objects, row, step, torch.arange(3).expand(x.shape))
+    found, mask = observed_points(tables, who)
     chosen = oracle.nearest_points(scenes, row, where, FEW.num_points)
     expected, exist = oracle.observed_points(scenes, row, step, chosen, pose, FEW)
     assert found.requires_grad
     assert torch.equal(mask, exist)
-    assert torch.equal(found.detach(), expected)
+    torch.testing.assert_close(found.detach(), expected, atol=1e-6, rtol=1e-6)
     assert (expected[..., -9:].sum((-1, -2)) > 0).any()
 
 

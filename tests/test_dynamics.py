@@ -158,7 +158,7 @@ def drive(seed: int, steps: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
 def test_greedy_fit_follows_smooth_driving() -> None:
     path, length = drive(0)
     size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
-    actions, fitted = Bicycle().fit(path[..., :2], path[..., 2], path[..., 3], valid, size, DT)
+    actions, fitted = Bicycle().fit(path, valid, size, DT)
     assert actions.shape == (8, 50)
     error = (fitted - path)[..., :2].norm(dim=-1)
     assert error.max() < 0.25
@@ -172,7 +172,7 @@ def test_greedy_fit_follows_smooth_driving() -> None:
 def test_displacement_fit_is_exact_in_position() -> None:
     path, length = drive(1)
     size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
-    _, fitted = Displacement().fit(path[..., :2], path[..., 2], path[..., 3], valid, size, DT)
+    _, fitted = Displacement().fit(path, valid, size, DT)
     torch.testing.assert_close(fitted[..., :2], path[..., :2], atol=1e-4, rtol=0)
     assert wrap(fitted[..., 2] - path[..., 2]).abs().max() < 0.05
 
@@ -183,7 +183,7 @@ def test_fit_starts_anew_where_an_agent_reappears(dynamics: Bicycle | Displaceme
     size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
     valid[:, :5] = valid[:, 20:30] = False
     hidden = torch.where(valid[..., None], path, torch.zeros(()))
-    _, fitted = dynamics.fit(hidden[..., :2], hidden[..., 2], hidden[..., 3], valid, size, DT)
+    _, fitted = dynamics.fit(hidden, valid, size, DT)
     torch.testing.assert_close(fitted[:, 30], path[:, 30])
     assert (fitted - path)[:, 30:, :2].norm(dim=-1).max() < 0.25
 

@@ -92,7 +92,7 @@ def test_states_can_be_observed_without_an_environment() -> None:
     seen, _ = observe_states(scenes, row, step, state, valid, config, goal=goal, progress=come)
     assert now[keys.ROUTE].any()
     for name, value in now["agents", "observation"].items():
-        assert torch.equal(getattr(seen, name), value), name
+        assert torch.equal(seen[name], value), name
 
 
 def test_constant_velocity_needs_no_observation() -> None:

@@ -83,8 +83,8 @@ def see(x: float, y: float, heading: float, line: NDArray[np.float64]) -> torch.
 def choices_of(state: torch.Tensor, *lines: NDArray[np.float64], turns: bool = False) -> torch.Tensor:
     """Features [1, 1, G, F] of routes of one agent."""
     count = torch.tensor([[[len(line) for line in lines]]])
-    point = torch.from_numpy(np.concatenate(lines))
-    return route_choices(state, point, count.cumsum(-1) - count, count, SCALE, turns=turns)[0]
+    routes = FollowedRoutes(torch.from_numpy(np.concatenate(lines)), count.cumsum(-1) - count, count)
+    return route_choices(state, routes, SCALE, turns=turns)[0]
 
 
 lines = st.builds(bend, st.integers(2, 20), st.floats(-2.5, 2.5), st.floats(10, 60))
@@ -198,12 +198,12 @@ def test_what_else_is_in_the_table_changes_nothing(count: int, seed: int) -> Non
     for one, other in zip(found.window(progress), one_route(line).window(progress[:, :1]), strict=True):
         assert torch.equal(one[:, :1], other)
     place = state[..., :2].expand(1, 2, 2)
-    assert torch.equal(
-        found.progress(place, progress)[:, :1], one_route(line).progress(place[:, :1], progress[:, :1])
-    )
+    moved = torch.from_numpy(rng.uniform(0, 3, (1, 2)))
+    alone = one_route(line).progress(place[:, :1], progress[:, :1], moved[:, :1])
+    assert torch.equal(found.progress(place, progress, moved)[:, :1], alone)
     for turns in (False, True):
         features, mask = route_choices(
-            state.expand(1, 2, 4), table.flatten(0, 1), first[1:] + 600, length[1:], SCALE, turns=turns
+            state.expand(1, 2, 4), routes.among(torch.tensor([1])), SCALE, turns=turns
         )
         assert features.shape == (1, 2, 3, CHOICE_FEATURES + TURN_FEATURES * turns)
         assert torch.equal(mask, length[1:] > 1)

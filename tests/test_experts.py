@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -15,7 +16,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement
-from symphony.geometry import forward_speed
+from symphony.geometry import with_speed
 from symphony.learning import experts as module
 from symphony.learning.demonstrations import ItemCache
 from symphony.learning.experts import Experts, fit_experts
@@ -60,12 +61,9 @@ def test_fitting_together_is_fitting_one_by_one(
 def test_the_fit_is_that_of_the_dynamics(dynamics: Any) -> None:
     for segment, found in zip(segments(), fit_experts(segments(), dynamics), strict=True):
         rows = found.agent.numpy()
-        heading = torch.from_numpy(segment.heading[rows])
-        speed = forward_speed(torch.from_numpy(segment.velocity[rows]), heading)
+        parts = segment.position[rows, :, :2], segment.heading[rows, :, None], segment.velocity[rows]
         actions, states = dynamics.fit(
-            torch.from_numpy(segment.position[rows, :, :2]),
-            heading,
-            speed,
+            with_speed(torch.from_numpy(np.concatenate(parts, -1))),
             torch.from_numpy(segment.valid[rows]),
             torch.from_numpy(segment.size[rows, :2]),
             segment.dt,

@@ -14,7 +14,7 @@ from symphony import keys
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.edge import map_edge
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.objects import objects_at
+from symphony.envs.objects import everyone_at
 from symphony.envs.observation import observe
 from symphony.roadgraph import LaneGraph
 
@@ -89,11 +89,10 @@ def test_observing_without_an_environment_stays_on_the_device() -> None:
         given = on(device, SCENES)
         row = torch.zeros(5, dtype=torch.int64, device=device.device)
         agent = row[:, None].expand(5, 2)
-        objects = objects_at(given, row, row)
+        objects = everyone_at(given, row, row, torch.zeros(5, 2, 4, device=row.device), agent > 0)
         seen = observe(given, row, row, objects, agent, EVERYTHING)
         flags = collision_flags(objects, agent), offroad_flags(given, row, objects.state[:, :2, :2])
-        found = [value for value in (*seen, *flags) if value is not None]
-        assert {value.device.type for value in found} == {NAME}
+        assert {value.device.type for value in (*seen.values(), *flags)} == {NAME}
 
 
 def test_the_pretended_device_notices() -> None:

@@ -22,9 +22,9 @@ from symphony.data import levels
 from symphony.data.levels import Levels, agent_heights
 from symphony.data.segment import RunSegment, validate
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.flags import road_distance
 from symphony.envs.objects import rollout_heights
 from symphony.envs.points import nearest_points
-from symphony.envs.road import road_distance
 from symphony.envs.scene import PointType
 from symphony.envs.tables import Tables
 from symphony.evaluation import evaluate
@@ -242,8 +242,8 @@ def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is done where nothing may wait for the device, on the CPU."""
     segments = overpass(), straight_road(3, steps=STEPS)
     found = drive(*segments)[1]
-    for name in ("flags", "points", "road", "driving"):
-        monkeypatch.setattr(f"symphony.envs.{name}.on_host", lambda _: False)
+    for name in ("envs.flags", "envs.points", "envs.driving", "geometry.nearest"):
+        monkeypatch.setattr(f"symphony.{name}.on_host", lambda _: False)
     there = drive(*segments)[1]
     for flag in (keys.COLLISION, keys.OFFROAD, ("agents", "observation", "objects_mask")):
         assert torch.equal(found.get(flag), there.get(flag))

@@ -10,8 +10,7 @@ from helpers_segments import crossing
 from symphony import keys
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.edge import leaving
-from symphony.envs.objects import Objects
-from symphony.envs.traffic import entering
+from symphony.envs.objects import Objects, entering
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.background import CarFollower
 
@@ -66,7 +65,7 @@ def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) 
     ready = (torch.rand(rows, driven, generator=rng) < 0.6) & valid.gather(1, index)
     found = entering(objects, index, ready)
     assert 0 < found.sum() < ready.sum()
-    monkeypatch.setattr("symphony.envs.traffic.on_host", lambda _: False)
+    monkeypatch.setattr("symphony.geometry.nearest.on_host", lambda _: False)
     assert torch.equal(entering(objects, index, ready), found)
     assert not entering(objects, index, torch.zeros_like(ready)).any()
 

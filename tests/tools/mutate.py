@@ -132,7 +132,7 @@ def noticed(module: ModuleType, number: int | None, files: Sequence[str]) -> boo
 
 
 def modules(names: Sequence[str]) -> list[str]:
-    """The modules of rooms, such as ``envs``, and those that are named themselves, such as ``envs.road``."""
+    """The modules of rooms, such as ``envs``, and those that are named themselves, such as ``envs.flags``."""
     found = []
     for name in names:
         place = PACKAGE / name.replace(".", "/")
@@ -172,7 +172,7 @@ def main(args: list[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--changes", type=int, default=10, help="of each module")
-    parser.add_argument("--modules", nargs="+", default=ROOMS, help="such as envs, or envs.road")
+    parser.add_argument("--modules", nargs="+", default=ROOMS, help="such as envs, or envs.flags")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--again", type=Path, help="earlier counts: make only the changes that were not noticed"

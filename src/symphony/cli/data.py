@@ -340,16 +340,11 @@ class Info:
     this out."""
     per_segment: bool = False
     """In the JSON, say for each run segment which agents were chosen, and why."""
-    routes: bool = False
-    """Count the routes of the interactive agents, too: whether they can be driven, where they end, and whether the
-    log follows one. This takes about 20 ms for each run segment."""
 
     def __post_init__(self) -> None:
         at_least(0, interactive=self.interactive)
         if self.per_segment and not (self.json and self.interactive):
             raise ConfigError("--per-segment goes with --json and interactive agents")
-        if self.routes and not self.interactive:
-            raise ConfigError("--routes goes with interactive agents")
 
     def run(self) -> None:
         """Print it."""
@@ -362,12 +357,6 @@ class Info:
             found["interactive"] = choices(SegmentStore(self.store), self.interactive)
             if not self.per_segment:
                 del found["interactive"]["segments"]
-        if self.routes:
-            from symphony.envs.route_report import route_counts
-
-            with progress("looking at routes") as advance:
-                found["routes"] = route_counts(SegmentStore(self.store), self.interactive, advance)
-            found["routes"]["joined_gaps"] = found["joined_gaps"]
         write_numbers(self.json, found)
         if str(self.json) != "-":
             _print_info(found)
@@ -420,7 +409,6 @@ def _print_info(found: dict[str, Any]) -> None:
             **partners,
             "too few vehicles": chosen["too_few"],
         }
-    shown |= {"routes": found["routes"]} if "routes" in found else {}
     shown |= {"MiB on disk": found["bytes"] / 2**20, "checksum": found["checksum"]}
     shown |= {"excluded": sum(excluded.values()), **_excluded(excluded)}
     shown |= {"skipped": sum(found["problems"].values()), **found["problems"]}

@@ -26,8 +26,7 @@ class ConstantVelocity(TensorDictModuleBase):
         super().__init__()
         if dt is None and not isinstance(dynamics, Bicycle):
             raise ConfigError("to keep a speed by displacements, the time step must be known")
-        self.dynamics = dynamics
-        self.dt = dt
+        self.dynamics, self.dt = dynamics, dt
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action [..., N] or [..., N, 2]."""
@@ -40,7 +39,7 @@ class ConstantVelocity(TensorDictModuleBase):
 
 
 class RandomActions(TensorDictModuleBase):
-    """Accelerates and steers at random, every action as likely as any other: what knows nothing.
+    """Accelerates and steers at random, every action as likely as any other.
 
     Args:
         dynamics: action space to act in.
@@ -51,10 +50,9 @@ class RandomActions(TensorDictModuleBase):
 
     def __init__(self, dynamics: Bicycle) -> None:
         super().__init__()
-        self.dynamics = dynamics
+        self.count = dynamics.num_actions
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action [..., N]."""
-        count = self.dynamics.num_actions
-        action = (tensordict.get(keys.NOISE) * count).long().clamp(max=count - 1)
-        return tensordict.set(keys.ACTION, action)
+        action = (tensordict.get(keys.NOISE) * self.count).long()
+        return tensordict.set(keys.ACTION, action.clamp(max=self.count - 1))

@@ -16,18 +16,11 @@ from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.objects import Objects, everyone_at
-from symphony.envs.observation import (
-    Observation,
-    ObservationConfig,
-    observation_spec,
-    observe_states,
-    rows_of,
-)
+from symphony.envs.objects import Objects, entering, everyone_at, rows_of
+from symphony.envs.observation import ObservationConfig, observation_spec, observe_states
 from symphony.envs.routes import route_choices
 from symphony.envs.scene import SceneBatch, SceneSource
 from symphony.envs.tables import Tables
-from symphony.envs.traffic import entering
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
 from symphony.geometry.nearest import on_host
@@ -148,9 +141,7 @@ class DrivingEnv(EnvBase):
     @property
     def num_agents(self) -> int:
         """N, interactive agents per scene."""
-        if self.source is not None:
-            return self.source.interactive
-        return self.scenes.interactive.shape[1]
+        return self.scenes.interactive.shape[1] if self.source is None else self.source.interactive
 
     @property
     def scenes(self) -> SceneBatch:
@@ -179,49 +170,33 @@ class DrivingEnv(EnvBase):
 
     def _make_specs(self) -> None:
         self._tables: Tables | None = None
-        agents, device = self.num_agents, self.device
+        n, device = self.num_agents, self.device
 
         def flags(*shape: int) -> Binary:
             return Binary(shape=shape, dtype=torch.bool, device=device)
 
-        def floats(*shape: int) -> Unbounded:
-            return Unbounded(shape=shape, device=device)
+        def numbers(*shape: int, dtype: torch.dtype = torch.float32) -> Unbounded:
+            return Unbounded(shape=shape, dtype=dtype, device=device)
 
-        def numbers(*shape: int) -> Unbounded:
-            return Unbounded(shape=shape, dtype=torch.int64, device=device)
+        def rows(*names: str, **agents: Any) -> Composite:
+            own = {name: numbers(1, dtype=torch.int64) for name in names}
+            return Composite(**own, agents=Composite(agents, shape=(n,)))
 
-        def state() -> dict[str, Any]:
-            parts = {
-                "valid": flags(agents),
-                "state": floats(agents, 4),
-                "goal": numbers(agents),
-                "progress": floats(agents),
-            }
-            if self.open_traffic:
-                parts["waiting"] = flags(agents)
-            return parts | {"persona": floats(agents, 2)} if self.observation.persona else parts
-
-        def of_agents(entries: dict[str, Any]) -> Composite:
-            return Composite(entries, shape=(agents,))
-
-        seen = observation_spec(self.observation, agents, device)
+        state: dict[str, Any] = {"valid": flags(n), "state": numbers(n, 4), "progress": numbers(n)}
+        state["goal"] = numbers(n, dtype=torch.int64)
+        if self.open_traffic:
+            state["waiting"] = flags(n)
+        if self.observation.persona:
+            state["persona"] = numbers(n, 2)
+        seen = observation_spec(self.observation, n, device)
         observed = {} if seen.is_empty() else {"observation": seen}
-        outcome = {"collision": flags(agents, 1), "offroad": flags(agents, 1)}
-        self.state_spec = Composite(
-            scene=numbers(1), step=numbers(1), stream=numbers(1), agents=of_agents(state())
-        )
-        self.observation_spec = Composite(
-            scene=numbers(1),
-            step=numbers(1),
-            stream=numbers(1),
-            segment=numbers(1),
-            agents=of_agents({**state(), **observed, **outcome}),
-        )
-        action: Categorical | Unbounded = floats(agents, 2)
+        outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
+        self.state_spec = rows("scene", "step", "stream", **state)
+        self.observation_spec = rows("scene", "step", "stream", "segment", **state, **observed, **outcome)
+        action: Categorical | Unbounded = numbers(n, 2)
         if self.dynamics.discrete:
-            action = Categorical(self.dynamics.num_actions, shape=(agents,), dtype=torch.int64, device=device)
-        self.action_spec = Composite(agents=of_agents({"action": action}))
-        self.reward_spec = Composite(agents=of_agents({"reward": floats(agents, 1)}))
+            action = Categorical(self.dynamics.num_actions, shape=(n,), dtype=torch.int64, device=device)
+        self.action_spec, self.reward_spec = rows(action=action), rows(reward=numbers(n, 1))
         self.done_spec = Composite(done=flags(1), terminated=flags(1), truncated=flags(1))
 
     def _set_seed(self, seed: int | None) -> None:
@@ -268,11 +243,14 @@ class DrivingEnv(EnvBase):
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)
-        real, early = self.scenes.interactive_valid[scene], self.scenes.enter[scene] == 0
+        row, index, enter = scene[..., None], self.scenes.interactive[scene], self.scenes.enter[scene]
+        real, early = self.scenes.interactive_valid[scene], enter == 0
         waiting = real & ~early if self.open_traffic else None
-        first = self._logged_state(scene)
+        # Those that enter later begin where the log has them then.
+        first = with_speed(self.scenes.log_state[row, enter, index])
+        first = torch.cat([first[..., :3], first[..., 3:].clamp_min(0.0)], -1)
         if self.observation.persona and persona is None:
-            persona = self.scenes.persona[scene[..., None], self.scenes.interactive[scene]]
+            persona = self.scenes.persona[row, index]
         begin, progress = torch.zeros_like(scene), torch.zeros_like(first[..., 0])
         none = torch.full_like(real, -1, dtype=torch.int64)
         start = State(scene, begin, stream, first, real & early, none, progress, waiting, persona)
@@ -287,19 +265,12 @@ class DrivingEnv(EnvBase):
 
         Writes ``ROUTES`` [..., N, G, F] and ``ROUTES_MASK`` [..., N, G] into a copy.
         """
-        row = state.get(keys.SCENE).squeeze(-1)
-        position, flat, routes = state.get(keys.STATE), row.flatten(), self.scenes.routes
-        features, mask = route_choices(
-            position.reshape(-1, *position.shape[-2:]),
-            routes.point.flatten(0, 1),
-            routes.first[flat] + (flat * routes.point.shape[1])[:, None, None],
-            routes.length[flat],
-            self.observation.distance_scale,
-            turns=self.observation.turns,
-        )
-        out = state.copy()
-        out.set(keys.ROUTES, features.unflatten(0, row.shape))
-        return out.set(keys.ROUTES_MASK, mask.unflatten(0, row.shape))
+        row, state = state.get(keys.SCENE).squeeze(-1), state.copy()
+        (moved,), routes = _flat(row.ndim, state.get(keys.STATE)), self.scenes.routes.among(row.flatten())
+        scale, turns = self.observation.distance_scale, self.observation.turns
+        features, mask = route_choices(moved, routes, scale, turns=turns)
+        state.set(keys.ROUTES, features.unflatten(0, row.shape))
+        return state.set(keys.ROUTES_MASK, mask.unflatten(0, row.shape))
 
     def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
         """A start state whose agents follow the given routes (by default those nearest to the log)."""
@@ -328,13 +299,8 @@ class DrivingEnv(EnvBase):
         fresh = self.start(scene, rollout)
         if partial is None:
             return fresh
-        kept = tensordict.select(*fresh.keys(True, True), strict=False)
-        return fresh.named_apply(
-            lambda name, new, old: new if old is None else torch.where(_like(partial, new), new, old),
-            kept,
-            nested_keys=True,
-            default=None,
-        )
+        kept = fresh.copy().update(tensordict.select(*fresh.keys(True, True), strict=False))
+        return torch.where(partial.squeeze(-1), fresh, kept)
 
     def _draw(self, shape: torch.Size, *, renew: bool) -> Int[Tensor, "*b"]:
         """Rows of the scenes that a batch starts, those at hand or new ones of a source."""
@@ -365,17 +331,12 @@ class DrivingEnv(EnvBase):
         """Metres [..., N] that agents have come along their routes, from where they were before."""
         if self.scenes.route_point.shape[1] == 0:
             return before.progress
-        old, new, goal, about = (
-            part.reshape(-1, *part.shape[before.scene.ndim :])
-            for part in (before.state, after, before.goal, before.progress)
-        )
+        old, new, goal, about = _flat(before.scene.ndim, before.state, after, before.goal, before.progress)
         moved = (new[..., :2] - old[..., :2]).square().sum(-1).sqrt()
         routes = self.scenes.routes.of(before.scene.flatten(), goal)
         return routes.progress(new[..., :2], about, moved).reshape(before.progress.shape)
 
-    def _moved(
-        self, tensordict: TensorDictBase, state: Float[Tensor, "*b N 4"], size: Float[Tensor, "*b N 2"]
-    ) -> Float[Tensor, "*b N 4"]:
+    def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Float[Tensor, "*b N 4"]:
         """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
         return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
@@ -384,9 +345,7 @@ class DrivingEnv(EnvBase):
     ) -> tuple[Bool[Tensor, "*b N"], Bool[Tensor, "*b N"]]:
         """Who is there after a step [..., N], and who waits: those that have left do neither."""
         row, at = scene.flatten(), step.flatten()
-        old, new, there, waits = (
-            v.reshape(-1, *v.shape[scene.ndim :]) for v in (before, after, valid, waiting)
-        )
+        old, new, there, waits = _flat(scene.ndim, before, after, valid, waiting)
         gone = leaving(old[..., :2], new[..., :2], self.scenes.exits[row], self.scenes.hull[row])
         there = there & ~gone
         ready = waits & (at[:, None] >= self.scenes.enter[row])
@@ -410,85 +369,65 @@ class DrivingEnv(EnvBase):
         persona = tensordict.get(keys.PERSONA, None) if self.observation.persona else None
         return State(scene, step, stream, state, valid, goal, progress, waiting, persona)
 
-    def _logged_state(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
-        """The logged states [..., N, 4] in which agents begin, those that enter later included."""
-        row, index = scene[..., None], self.scenes.interactive[scene]
-        logged = with_speed(self.scenes.log_state[row, self.scenes.enter[scene], index])
-        return torch.cat([logged[..., :3], logged[..., 3:].clamp_min(0.0)], -1)
-
     def _from_state(self, now: State) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
-        scene, step, stream, state, valid, goal, progress, waiting, persona = now
-        shape = scene.shape
-        row, at = scene.flatten(), step.flatten()
-        moved, real = state.reshape(-1, *state.shape[-2:]), valid.reshape(-1, valid.shape[-1])
-        index = self.scenes.interactive.index_select(0, row)
+        scenes, shape = self.scenes, now.scene.shape
+        row, at = now.scene.flatten(), now.step.flatten()
+        moved, real, goal, progress = _flat(len(shape), now.state, now.valid, now.goal, now.progress)
         follows = self.observation.route or self.observation.along
         seen, objects = observe_states(
-            self.scenes,
+            scenes,
             row,
             at,
             moved,
             real,
             self.observation,
-            goal=goal.reshape(real.shape) if follows else None,
-            progress=progress.reshape(real.shape) if follows else None,
+            goal=goal if follows else None,
+            progress=progress if follows else None,
             tables=self._kept(),
         )
-        collision, offroad = self._flags(row, objects, index, real, seen)
-        truncated = at >= self.scenes.last_step[row]
+        collision, offroad = self._flags(row, objects, real, seen)
+        truncated = at >= scenes.last_step[row]
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
         terminated = _nowhere(moved, real).any(-1)
         for key in self.ends_on:
             terminated = terminated | flags[key].any(-1)
-        observation = {name: value for name, value in seen._asdict().items() if value is not None}
 
         def back(value: Shaped[Tensor, "M ..."]) -> Shaped[Tensor, "*_"]:
             return value.reshape((*shape, *value.shape[1:]))
 
-        each = [*shape, self.num_agents]
-        agents: dict[str, Tensor | TensorDict] = {
-            "valid": valid,
-            "state": state,
-            "goal": goal,
-            "progress": progress,
-            "collision": back(collision)[..., None],
-            "offroad": back(offroad)[..., None],
-        }
-        if waiting is not None:
-            agents["waiting"] = waiting
+        def nested(parts: dict[str, Any]) -> TensorDict:
+            # One without a device would be taken for a transfer, and waited for.
+            return TensorDict(parts, batch_size=[*shape, self.num_agents], device=self.device)
+
+        agents: dict[str, Any] = {name: getattr(now, name) for name in ("valid", "state", "goal", "progress")}
+        agents |= {"collision": back(collision)[..., None], "offroad": back(offroad)[..., None]}
+        if now.waiting is not None:
+            agents["waiting"] = now.waiting
         if self.observation.persona:
             # A state that says nothing of it, such as one of the log, is of no style in particular.
-            agents["persona"] = state.new_zeros(*each, 2) if persona is None else persona
-        if observation:
-            parts = {name: back(value) for name, value in observation.items()}
-            agents["observation"] = TensorDict(parts, batch_size=each, device=self.device)
-        return TensorDict(
-            {
-                "scene": scene[..., None],
-                "step": step[..., None],
-                "stream": stream[..., None],
-                "segment": _of(self.scenes.segment, scene)[..., None],
-                # One without a device would be taken for a transfer, and waited for.
-                "agents": TensorDict(agents, batch_size=each, device=self.device),
-                "done": back(truncated | terminated)[..., None],
-                "truncated": back(truncated)[..., None],
-                "terminated": back(terminated)[..., None],
-            },
-            batch_size=shape,
-            device=self.device,
-        )
+            none = now.state.new_zeros(*shape, self.num_agents, 2)
+            agents["persona"] = none if now.persona is None else now.persona
+        if seen:
+            agents["observation"] = nested({name: back(value) for name, value in seen.items()})
+        rows = {"scene": now.scene, "step": now.step, "stream": now.stream}
+        rows |= {"segment": _of(scenes.segment, now.scene), "done": back(truncated | terminated)}
+        rows |= {"truncated": back(truncated), "terminated": back(terminated)}
+        whole = {name: value[..., None] for name, value in rows.items()} | {"agents": nested(agents)}
+        return TensorDict(whole, batch_size=shape, device=self.device)
 
     @torch.no_grad()
     def _flags(
-        self, scene: Tensor, objects: Objects, index: Tensor, valid: Tensor, seen: Observation
+        self, row: Tensor, objects: Objects, valid: Tensor, seen: dict[str, Tensor]
     ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
+        """Who collides, and who is off the road."""
+        index = self.scenes.interactive.index_select(0, row)
         collision = collision_flags(objects, index) & valid
-        if seen.road is not None:
-            return collision, (seen.road[..., 0] > 0) & valid
+        if "road" in seen:
+            return collision, (seen["road"][..., 0] > 0) & valid
         position = rows_of(objects.state, index)[..., :2]
         height = None if objects.height is None else rows_of(objects.height, index)
-        return collision, offroad_flags(self.scenes, scene, position, self._kept(), height) & valid
+        return collision, offroad_flags(self.scenes, row, position, self._kept(), height) & valid
 
     def _kept(self) -> Tables:
         """What is looked up at each step of the present scenes."""
@@ -497,12 +436,11 @@ class DrivingEnv(EnvBase):
         return self._tables
 
 
+def _flat(ndim: int, *values: Tensor) -> list[Tensor]:
+    """Values whose first so many dimensions are one."""
+    return [value.reshape(-1, *value.shape[ndim:]) for value in values]
+
+
 def _of(table: Shaped[Tensor, "B ..."], scene: Int[Tensor, "*b"]) -> Shaped[Tensor, "*_"]:
     """table[scene], which does not compile where a single scene is a number, that is, without dimensions."""
     return table.index_select(0, scene.flatten()).reshape((*scene.shape, *table.shape[1:]))
-
-
-def _like(mask: Bool[Tensor, "*b 1"], value: Shaped[Tensor, "*_"]) -> Bool[Tensor, "*_"]:
-    """mask [..., 1] with trailing dimensions of one, to broadcast against value."""
-    flat = mask.squeeze(-1)
-    return flat.reshape(flat.shape + (1,) * (value.ndim - flat.ndim))

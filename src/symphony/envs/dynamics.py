@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
-from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.errors import ConfigError
@@ -25,14 +24,12 @@ WHEELBASE = 0.6
 STEEPEST = 0.3
 """Largest ratio of sideways to distance that a displacement is made up with."""
 
+States = Float[Tensor, "*#b 4"]
+Sizes = Float[Tensor, "*b 2"]
+Reals = Float[Tensor, "*#b"]
 
-def bicycle_step(
-    state: Float[Tensor, "*#b 4"],
-    acceleration: Float[Tensor, "*#b"],
-    steering: Float[Tensor, "*#b"],
-    length: Float[Tensor, "*#b"],
-    dt: float,
-) -> Float[Tensor, "*b 4"]:
+
+def bicycle_step(state: States, acceleration: Reals, steering: Reals, length: Reals, dt: float) -> States:
     """One step of the kinematic bicycle about the box centre.
 
     With slip angle tan(beta) = tan(steering) / 2 (axles at equal distance from the centre), mean speed u of the
@@ -46,26 +43,18 @@ def bicycle_step(
         length: of the box, metres.
         dt: seconds.
     """
-    speed = state[..., 3]
+    x, y, heading, speed = state.unbind(-1)
     after = (speed + acceleration * dt).clamp_min(0.0)
     travel = 0.5 * (speed + after) * dt
     slip = torch.atan(0.5 * torch.tan(steering))
     turn = 2.0 * travel * torch.sin(slip) / (WHEELBASE * length)
-    course = state[..., 2] + 0.5 * turn + slip
+    course = heading + 0.5 * turn + slip
     return torch.stack(
-        [
-            state[..., 0] + travel * torch.cos(course),
-            state[..., 1] + travel * torch.sin(course),
-            state[..., 2] + turn,
-            after,
-        ],
-        dim=-1,
+        [x + travel * torch.cos(course), y + travel * torch.sin(course), heading + turn, after], dim=-1
     )
 
 
-def bicycle_inverse(
-    state: Float[Tensor, "*#b 4"], after: Float[Tensor, "*#b 4"], length: Float[Tensor, "*#b"], dt: float
-) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+def bicycle_inverse(state: States, after: States, length: Reals, dt: float) -> tuple[Reals, Reals]:
     """Acceleration and steering that take the speed and heading of ``state`` to those of ``after``.
 
     Exact where :func:`bicycle_step` produced ``after`` and the agent moved; steering is 0 at standstill and
@@ -75,17 +64,14 @@ def bicycle_inverse(
     travel = 0.5 * (state[..., 3] + after[..., 3]) * dt
     moving = travel > 1e-6
     turn = wrap(after[..., 2] - state[..., 2])
-    sine = turn * WHEELBASE * length / (2.0 * torch.where(moving, travel, torch.ones_like(travel)))
+    sine = turn * WHEELBASE * length / (2.0 * torch.where(moving, travel, 1.0))
     slip = torch.asin(sine.clamp(-0.999, 0.999))
-    return acceleration, torch.where(moving, torch.atan(2.0 * torch.tan(slip)), torch.zeros_like(slip))
+    return acceleration, torch.where(moving, torch.atan(2.0 * torch.tan(slip)), 0.0)
 
 
 def displacement_step(
-    state: Float[Tensor, "*#b 4"],
-    displacement: Float[Tensor, "*#b 2"],
-    length: Float[Tensor, "*#b"],
-    dt: float,
-) -> Float[Tensor, "*b 4"]:
+    state: States, displacement: Float[Tensor, "*#b 2"], length: Reals, dt: float
+) -> States:
     """Move the box centre by ``displacement`` (x forward, y left, metres, in the agent's own frame).
 
     The rear axle, half a wheelbase r behind the centre, is dragged along (a tractrix, dheading = sin(phi) / r
@@ -102,37 +88,16 @@ def displacement_step(
     return torch.cat([moved, (state[..., 2] + turn)[..., None], (distance / dt)[..., None]], dim=-1)
 
 
-def displacement_inverse(
-    state: Float[Tensor, "*#b 4"], after: Float[Tensor, "*#b 4"]
-) -> Float[Tensor, "*b 2"]:
+def displacement_inverse(state: States, after: States) -> Float[Tensor, "*b 2"]:
     """The displacement in the frame of ``state`` that leads to the position of ``after`` (exact)."""
     return rotate(after[..., :2] - state[..., :2], -state[..., 2])
 
 
-def displacement_to(
-    state: Float[Tensor, "*b 4"], after: Float[Tensor, "*b 4"], length: Float[Tensor, "*b"], dt: float
-) -> Float[Tensor, "*b 2"]:
-    """The displacement that leads to the heading and the speed of ``after``, whatever its position.
-
-    Exact unless the turn is too sharp for the distance: then the steepest step to that side, :data:`STEEPEST`.
-    """
-    distance, arm = after[..., 3].clamp_min(0.0) * dt, 0.5 * WHEELBASE * length
-    # :func:`displacement_step` backwards: left = s (arm + forward / 2), both together as long as the distance.
-    most = STEEPEST * distance / (arm + 0.5 * distance)
-    s = torch.maximum(torch.minimum(torch.tan(wrap(after[..., 2] - state[..., 2])), most), -most)
-    square = s.square()
-    half, a = 0.5 * square * arm, 1.0 + 0.25 * square
-    forward = (
-        (half.square() - a * (square * arm.square() - distance.square())).clamp_min(0.0).sqrt() - half
-    ) / a
-    return torch.stack([forward, s * (arm + 0.5 * forward)], -1)
-
-
-def _quadratic(largest: float, count: int) -> NDArray[np.float32]:
+def _quadratic(largest: float, count: int) -> list[float]:
     """An odd number of values up to ``largest`` either way, dense about the middle one, which is exactly 0."""
     half = count // 2
     unit = (np.arange(count) - half).astype(np.float32) / np.float32(half)
-    return np.float32(largest) * (unit * np.abs(unit))
+    return (np.float32(largest) * (unit * np.abs(unit))).tolist()
 
 
 @dataclass(frozen=True)
@@ -172,10 +137,9 @@ class Bicycle:
         for name in ("num_acceleration", "num_steering"):
             if getattr(self, name) < 3 or getattr(self, name) % 2 == 0:
                 raise ConfigError(f"{name} must be odd and at least 3, is {getattr(self, name)}")
-        acceleration = _quadratic(self.max_acceleration, self.num_acceleration)
         steering = _quadratic(self.max_steering, self.num_steering)
-        joint = np.repeat(acceleration, self.num_steering), np.tile(steering, self.num_acceleration)
-        object.__setattr__(self, "_joint", tuple(tuple(values.tolist()) for values in joint))
+        pairs = [(a, s) for a in _quadratic(self.max_acceleration, self.num_acceleration) for s in steering]
+        object.__setattr__(self, "_joint", tuple(zip(*pairs, strict=True)))
 
     @property
     def num_actions(self) -> int:
@@ -190,11 +154,7 @@ class Bicycle:
         return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
 
     def step(
-        self,
-        state: Float[Tensor, "*b 4"],
-        action: Int[Tensor, "*b"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
+        self, state: Float[Tensor, "*b 4"], action: Int[Tensor, "*b"], size: Sizes, dt: float
     ) -> Float[Tensor, "*b 4"]:
         """Apply joint action indices.
 
@@ -209,15 +169,9 @@ class Bicycle:
 
     @torch.no_grad()
     def fit(
-        self,
-        position: Float[Tensor, "*b T 2"],
-        heading: Float[Tensor, "*b T"],
-        speed: Float[Tensor, "*b T"],
-        valid: Bool[Tensor, "*b T"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
+        self, log: Float[Tensor, "*b T 4"], valid: Bool[Tensor, "*b T"], size: Sizes, dt: float
     ) -> tuple[Int[Tensor, "*b Tm1"], Float[Tensor, "*b T 4"]]:
-        """Greedy fit of a log: at each step the action whose next state is nearest the logged one.
+        """Greedy fit of logged states: at each step the action whose next state is nearest the logged one.
 
         Continues from the *fitted* state, so errors do not accumulate unseen. Where the next logged step is not
         valid the agent keeps its speed and course, and where it reappears the fit starts anew from the log.
@@ -225,42 +179,29 @@ class Bicycle:
         Returns:
             Joint action indices [*b, T - 1] and fitted states [*b, T, 4].
         """
-        acceleration, steering = self.grid(position)
+        acceleration, steering = self.grid(log)
         effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())
 
-        def nearest(
-            state: Float[Tensor, "*b 4"], target: Float[Tensor, "*b 4"], known: Bool[Tensor, "*b"]
-        ) -> tuple[Int[Tensor, "*b"], Float[Tensor, "*b 4"]]:
-            after = bicycle_step(
-                state[..., None, :].expand(*state.shape[:-1], self.num_actions, 4),
-                acceleration,
-                steering,
-                size[..., :1],
-                dt,
-            )
+        def nearest(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+            every = state[..., None, :].expand(*state.shape[:-1], self.num_actions, 4)
+            after = bicycle_step(every, acceleration, steering, size[..., :1], dt)
+            target = target[..., None, :]
             error = (
-                (after[..., :2] - target[..., None, :2]).square().sum(-1)
-                + (self.heading_weight * wrap(after[..., 2] - target[..., None, 2])).square()
-                + (self.speed_weight * (after[..., 3] - target[..., None, 3])).square()
+                (after[..., :2] - target[..., :2]).square().sum(-1)
+                + (self.heading_weight * wrap(after[..., 2] - target[..., 2])).square()
+                + (self.speed_weight * (after[..., 3] - target[..., 3])).square()
                 + effort
             )
             action = error.argmin(-1).masked_fill(~known, self.num_actions // 2)
             index = action[..., None, None].expand(*action.shape, 1, 4)
             return action, after.gather(-2, index).squeeze(-2)
 
-        return _follow(position, heading, speed.clamp_min(0.0), valid, nearest)
+        return _follow(torch.cat([log[..., :3], log[..., 3:].clamp_min(0.0)], -1), valid, nearest)
 
-    def towards(
-        self,
-        state: Float[Tensor, "*b 4"],
-        after: Float[Tensor, "*b 4"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
-    ) -> Int[Tensor, "*b"]:
+    def towards(self, state: States, after: States, size: Sizes, dt: float) -> Int[Tensor, "*b"]:
         """The action whose next state is nearest to ``after``, a step of :func:`bicycle_step` away."""
         pair = torch.stack([state, after], -2)
-        known = torch.ones(pair.shape[:-1], dtype=torch.bool, device=pair.device)
-        return self.fit(pair[..., :2], pair[..., 2], pair[..., 3], known, size, dt)[0].squeeze(-1)
+        return self.fit(pair, torch.ones_like(pair[..., 0], dtype=torch.bool), size, dt)[0].squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -271,54 +212,43 @@ class Displacement:
     numbers: Literal[2] = 2
 
     def step(
-        self,
-        state: Float[Tensor, "*b 4"],
-        action: Float[Tensor, "*b 2"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
+        self, state: Float[Tensor, "*b 4"], action: Float[Tensor, "*b 2"], size: Sizes, dt: float
     ) -> Float[Tensor, "*b 4"]:
         """Apply displacements in metres."""
         return displacement_step(state, action, size[..., 0], dt)
 
     @torch.no_grad()
     def fit(
-        self,
-        position: Float[Tensor, "*b T 2"],
-        heading: Float[Tensor, "*b T"],
-        speed: Float[Tensor, "*b T"],
-        valid: Bool[Tensor, "*b T"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
+        self, log: Float[Tensor, "*b T 4"], valid: Bool[Tensor, "*b T"], size: Sizes, dt: float
     ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
         """Displacements that reach every valid logged position exactly; headings follow from the motion."""
 
-        def exact(
-            state: Float[Tensor, "*b 4"], target: Float[Tensor, "*b 4"], known: Bool[Tensor, "*b"]
-        ) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b 4"]]:
+        def exact(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
             coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)
             action = torch.where(known[..., None], displacement_inverse(state, target), coast)
             return action, displacement_step(state, action, size[..., 0], dt)
 
-        return _follow(position, heading, speed, valid, exact)
+        return _follow(log, valid, exact)
 
-    def towards(
-        self,
-        state: Float[Tensor, "*b 4"],
-        after: Float[Tensor, "*b 4"],
-        size: Float[Tensor, "*b 2"],
-        dt: float,
-    ) -> Float[Tensor, "*b 2"]:
+    def towards(self, state: States, after: States, size: Sizes, dt: float) -> Float[Tensor, "*b 2"]:
         """The action that leads to the heading and the speed of ``after``, a step of :func:`bicycle_step` away.
 
-        Not to its position, which is that of the mean speed: here the whole step has the speed after it.
+        Not to its position, which is that of the mean speed: here the whole step has the speed after it. Exact unless
+        the turn is too sharp for the distance: then the steepest step to that side, :data:`STEEPEST`.
         """
-        return displacement_to(state, after, size[..., 0], dt)
+        distance, arm = after[..., 3].clamp_min(0.0) * dt, 0.5 * WHEELBASE * size[..., 0]
+        # :func:`displacement_step` backwards: left = s (arm + forward / 2), both together as long as the distance.
+        most = STEEPEST * distance / (arm + 0.5 * distance)
+        s = torch.maximum(torch.minimum(torch.tan(wrap(after[..., 2] - state[..., 2])), most), -most)
+        square = s.square()
+        half, a = 0.5 * square * arm, 1.0 + 0.25 * square
+        root = (half.square() - a * (square * arm.square() - distance.square())).clamp_min(0.0).sqrt()
+        forward = (root - half) / a
+        return torch.stack([forward, s * (arm + 0.5 * forward)], -1)
 
 
 def _follow(
-    position: Float[Tensor, "*b T 2"],
-    heading: Float[Tensor, "*b T"],
-    speed: Float[Tensor, "*b T"],
+    log: Float[Tensor, "*b T 4"],
     valid: Bool[Tensor, "*b T"],
     advance: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
 ) -> tuple[Shaped[Tensor, "*_"], Float[Tensor, "*b T 4"]]:
@@ -327,15 +257,12 @@ def _follow(
     ``known`` says where the target and the logged state before it are valid. Where a log begins again after a
     gap, so does the state.
     """
-    logged = torch.cat([position, heading[..., None], speed[..., None]], -1)
-    time = position.ndim - 2
-    state = logged[..., 0, :]
+    time, state = log.ndim - 2, log[..., 0, :]
     states, actions = [state], []
-    for t in range(1, position.shape[-2]):
-        target = logged[..., t, :]
-        action, state = advance(state, target, valid[..., t - 1] & valid[..., t])
+    for t in range(1, log.shape[-2]):
+        action, state = advance(state, log[..., t, :], valid[..., t - 1] & valid[..., t])
         restart = valid[..., t] & ~valid[..., t - 1]
-        state = torch.where(restart[..., None], target, state)
+        state = torch.where(restart[..., None], log[..., t, :], state)
         states.append(state)
         actions.append(action)
     return torch.stack(actions, time), torch.stack(states, time)

@@ -47,8 +47,9 @@ def map_edge(graph: LaneGraph) -> MapEdge:
         if not any(graph.successors[other] for other in together):
             before, end = graph.lines[lane][-2:]
             exits.append(np.concatenate([end, (end - before) / np.linalg.norm(end - before)]))
-    points = np.concatenate([graph.lines[lane] for lane in graph.usable_lanes] or [np.zeros((0, 2))])
-    outline = shapely.MultiPoint(points).convex_hull.buffer(MARGIN, join_style="mitre", cap_style="square")
+    outline = shapely.MultiPoint(graph.lane_points[0]).convex_hull.buffer(
+        MARGIN, join_style="mitre", cap_style="square"
+    )
     corners = np.asarray(shapely.orient_polygons(outline).exterior.coords)
     side = np.diff(corners, axis=0)
     normal = np.stack([side[:, 1], -side[:, 0]], -1) / np.linalg.norm(side, axis=-1, keepdims=True)

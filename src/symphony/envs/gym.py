@@ -14,10 +14,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
 
 from symphony import keys
-from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv, Event
 from symphony.envs.dynamics import Bicycle, Displacement
@@ -60,6 +58,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         ConfigError: an unknown kind of action, or a negative duration.
     """
 
+    _now: TensorDictBase
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own
 
     def __init__(
@@ -82,18 +81,15 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         self.dynamics: Bicycle | Displacement = Bicycle() if action == "discrete" else Displacement()
         self.observation = ObservationConfig() if observation is None else observation
         self.reward, self.ends_on, self.duration = reward, tuple(ends_on), duration
-        number = next((i for i in range(len(self.store)) if _usable(self.store[i])), None)
+        number = next((i for i in range(len(self.store)) if self._usable(i)), None)
         if number is None:
             raise DataError("the ego is seen at the first step of no segment", file=self.store.path)
         self._open(number)
-        self.observation_space: spaces.Space[Any] = spaces.Dict(
-            {name: _space(value) for name, value in self._observed(self._start()).items()}
-        )
-        self.action_space: spaces.Space[Any] = (
-            spaces.Discrete(self.dynamics.num_actions)
-            if isinstance(self.dynamics, Bicycle)
-            else spaces.Box(-1.0, 1.0, (2,), np.float32)
-        )
+        seen = {name: _space(value) for name, value in self._observed().items()}
+        self.observation_space: spaces.Space[Any] = spaces.Dict(seen)
+        self.action_space: spaces.Space[Any] = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        if isinstance(self.dynamics, Bicycle):
+            self.action_space = spaces.Discrete(self.dynamics.num_actions)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -108,19 +104,18 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         wanted = (options or {}).get("segment")
         if wanted is None:
             number = int(self.np_random.integers(len(self.store)))
-            while not _usable(self.store[number]):
+            while not self._usable(number):
                 number = int(self.np_random.integers(len(self.store)))
         else:
             named = wanted if isinstance(wanted, str) else _whole(wanted)
             if named is None:
                 raise ConfigError(f"a segment is an id or a number, not {wanted!r}")
             number = self.store.index_of(named)
-            if not _usable(self.store[number]):
+            if not self._usable(number):
                 name = self.store.ids[number]
                 raise DataError("the ego is not seen at the first step", segment=name, field="valid")
         self._open(number)
-        self._now = self._start()
-        return self._observed(self._now), self._info(0.0)
+        return self._observed(), self._info(0.0)
 
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Drive one step.
@@ -137,41 +132,35 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             numbers = np.asarray(action, np.float32)
             if numbers.shape != (2,) or not np.isfinite(numbers).all():
                 raise ConfigError(f"an action is two finite numbers, not {action}")
-            reach = TOP_SPEED * self.env.dt
-            chosen = torch.as_tensor(numbers.clip(-1.0, 1.0) * reach)[None]
+            chosen = torch.as_tensor(numbers.clip(-1.0, 1.0) * (TOP_SPEED * self.env.dt))[None]
         before = self._now.get(keys.STATE)[0, :2]
-        stepped = self.env.step(self._now.set(keys.ACTION, chosen))
-        after = stepped.get("next")
-        reward = float(after.get(keys.REWARD))
-        ended, cut = bool(after.get("terminated")), bool(after.get("truncated"))
-        self._now = step_mdp(stepped, exclude_reward=True)
+        after = self.env.step(self._now.set(keys.ACTION, chosen)).get("next")
+        reward, ended, cut = (after.get(key).item() for key in (keys.REWARD, "terminated", "truncated"))
+        self._now = after.exclude(keys.REWARD)
         driven = float((self._now.get(keys.STATE)[0, :2] - before).norm())
-        return self._observed(self._now), reward, ended, cut, self._info(driven)
+        return self._observed(), reward, ended, cut, self._info(driven)
+
+    def _usable(self, number: int) -> bool:
+        segment = self.store[number]
+        return bool(segment.valid[segment.ego, 0])
 
     def _open(self, number: int) -> None:
+        """Start a segment of the store."""
         segment = self.store[number]
         if self.duration:
             steps = round(self.duration / segment.dt) + 1
             timed = ("position", "heading", "velocity", "valid", "signal_state")
             segment = segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
-        self.segment_id = segment.segment_id
         graph = LaneGraph(segment.road) if self.observation.route else None
-        self.env = DrivingEnv(
-            scene(segment, [segment.ego], graph, number=number),
-            self.dynamics,
-            self.observation,
-            reward=self.reward,
-            ends_on=self.ends_on,
-        )
+        made = scene(segment, [segment.ego], graph, number=number)
+        self.segment_id, ends = segment.segment_id, self.ends_on
+        self.env = DrivingEnv(made, self.dynamics, self.observation, reward=self.reward, ends_on=ends)
+        self._now = self.env.start(torch.tensor(0), goal=made.route_logged[0] if graph else None)
 
-    def _start(self) -> TensorDictBase:
-        row = torch.tensor(0)
-        return self.env.start(row, goal=self.env.scenes.route_logged[row] if self.observation.route else None)
-
-    def _observed(self, state: TensorDictBase) -> Observed:
+    def _observed(self) -> Observed:
         """The ego's observation, as NumPy arrays."""
         seen: Observed = {}
-        for name, value in state.get(("agents", "observation")).items():
+        for name, value in self._now.get(("agents", "observation")).items():
             array = value[0].numpy()
             flags = array.dtype == np.bool_
             seen[name] = array.astype(np.int8) if flags else array.clip(-BOUND, BOUND).astype(np.float32)
@@ -186,10 +175,6 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             "offroad": bool(self._now.get(keys.OFFROAD)),
             "driven": driven,
         }
-
-
-def _usable(segment: RunSegment) -> bool:
-    return bool(segment.valid[segment.ego, 0])
 
 
 def _whole(value: Any) -> int | None:

@@ -1,10 +1,11 @@
-"""What an agent observes of others: who is nearest, where, how fast, and how far apart their boxes are.
+"""Who is where at a step, who can enter, and what an agent observes of the nearest others.
 
 Shapes: M rows (any flattened batch), N observing agents, A agents of the scene, O objects.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -15,13 +16,17 @@ from torch.nn.functional import pad
 from symphony.envs.routes import RouteWindow, along_route
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, Tables
-from symphony.geometry.boxes import gap_between
+from symphony.geometry.boxes import box_gap, gap_between
 from symphony.geometry.constants import constant
 from symphony.geometry.frames import wrap
 from symphony.geometry.levels import levels_apart
-from symphony.geometry.nearest import nearest
+from symphony.geometry.nearest import nearest, places
 
 OBJECT_FEATURES = 8 + AGENT_FEATURES
+CLEAR = 1.0
+"""Metres that an agent which enters keeps from all others."""
+FORESEEN = (0.5, 1.0)
+"""Seconds ahead at which its box would meet no other, were everyone to keep speed and course."""
 _PLACES = 1 << 22
 """Positions times logged steps that are looked at together."""
 
@@ -43,14 +48,76 @@ class Objects(NamedTuple):
     kind: Tensor
     height: Tensor | None = None
 
+    def others(self, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N A"]:
+        """Whom agents ``index`` can meet: everyone but themselves who is there, on their level."""
+        place = torch.arange(self.valid.shape[1], device=index.device)
+        other = self.valid[:, None] & (place != index[..., None])
+        if self.height is None:
+            return other
+        return other & ~levels_apart(self.height[:, None], rows_of(self.height, index)[:, :, None])
+
+
+class Observers(NamedTuple):
+    """Agents that observe at a step.
+
+    Attributes:
+        scene: [M] rows of the scene batch.
+        step: [M] logged step.
+        agent: [M, N] their rows among all agents.
+        state: [M, N, 5] x, y, heading, velocity x, velocity y.
+        size: [M, N, 2].
+        height: [M, N, 2] height and level; None where no scene has levels.
+        origin: [M, N, 2] positions in ``state``.
+        heading: [M, N] headings in ``state``.
+        speed: [M, N] along the heading, m/s.
+    """
+
+    scene: Tensor
+    step: Tensor
+    agent: Tensor
+    state: Tensor
+    size: Tensor
+    height: Tensor | None
+    origin: Tensor
+    heading: Tensor
+    speed: Tensor
+
+    @classmethod
+    def of(cls, objects: Objects, scene: Tensor, step: Tensor, index: Tensor) -> Observers:
+        """Agents ``index`` among ``objects``."""
+        state, size = rows_of(objects.state, index), rows_of(objects.size, index)
+        height = None if objects.height is None else rows_of(objects.height, index)
+        heading = state[..., 2]
+        turn = -heading
+        speed = turn.cos() * state[..., 3] - turn.sin() * state[..., 4]
+        return cls(scene, step, index, state, size, height, state[..., :2], heading, speed)
+
+
+def frame(heading: Float[Tensor, "*b"]) -> Callable[..., tuple[Tensor, Tensor]]:
+    """What turns vectors x and y into the frame of agents with these headings, and may divide them by a scale."""
+    # Component by component: operations on a last dimension of 2 are slow.
+    turn = -heading
+    cos, sin = turn.cos(), turn.sin()
+
+    def turned(x: Tensor, y: Tensor, scale: float | None = None) -> tuple[Tensor, Tensor]:
+        x, y = cos * x - sin * y, sin * x + cos * y
+        return (x, y) if scale is None else (x / scale, y / scale)
+
+    return turned
+
+
+def rows_of(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
+    """Each row's values at its own index."""
+    return values.gather(1, index[..., None].expand(*index.shape, values.shape[-1]))
+
 
 def objects_at(
     scenes: SceneBatch,
     scene: Int[Tensor, " M"],
     step: Int[Tensor, " M"],
-    state: Float[Tensor, "M N 4"] | None = None,
-    index: Int[Tensor, "M N"] | None = None,
-    index_valid: Bool[Tensor, "M N"] | None = None,
+    state: Float[Tensor, "M N 4"],
+    index: Int[Tensor, "M N"],
+    index_valid: Bool[Tensor, "M N"],
 ) -> Objects:
     """The agents of each row's scene at a step: log playback, with simulated ones put in their place.
 
@@ -64,23 +131,16 @@ def objects_at(
     """
     steps, agents = scenes.log_valid.shape[1:]
     row = scene * steps + step.clamp(max=steps - 1)
-    logged, valid, size, kind = (
-        table.index_select(0, place)
-        for table, place in (
-            (scenes.log_state.flatten(0, 1), row),
-            (scenes.log_valid.flatten(0, 1), row),
-            (scenes.box_size, scene),
-            (scenes.agent_type, scene),
-        )
+    logged, valid = (
+        table.flatten(0, 1).index_select(0, row) for table in (scenes.log_state, scenes.log_valid)
     )
+    size, kind = (table.index_select(0, scene) for table in (scenes.box_size, scenes.agent_type))
     valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
-    has_height = scenes.agent_height.shape[1] > 0
-    height = scenes.agent_height.flatten(0, 1).index_select(0, row) if has_height else None
-    if state is None or index is None or index_valid is None:
-        return Objects(logged, valid, size, kind, height)
-    if height is not None:
-        wide = index[..., None].expand(*index.shape, 2)
-        height = height.scatter(1, wide, _height(scenes, scene, state.detach()[..., :2], index))
+    height = None
+    if scenes.agent_height.shape[1]:
+        own = _height(scenes, scene, state.detach()[..., :2], index)
+        height = scenes.agent_height.flatten(0, 1).index_select(0, row)
+        height = height.scatter(1, index[..., None].expand(*index.shape, 2), own)
     x, y, heading, speed = state.unbind(-1)
     simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
     # Those not there are written to a column past the last one, which is cut off again.
@@ -111,19 +171,13 @@ def everyone_at(
 
 
 def _height(
-    scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M N 2"], index: Int[Tensor, "M N"]
+    scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M N 2"], agent: Int[Tensor, "M N"]
 ) -> Float[Tensor, "M N 2"]:
-    row, agent = scene[:, None], index
-    step = nearest_logged(scenes.log_state[row, :, agent, :2], scenes.log_valid[row, :, agent], position)
+    """Height and level of agents where the log has them nearest to positions."""
+    row = scene[:, None]
+    away = (scenes.log_state[row, :, agent, :2] - position[..., None, :]).square().sum(-1)
+    step = away.masked_fill(~scenes.log_valid[row, :, agent], torch.inf).argmin(-1)
     return scenes.agent_height[row, step, agent]
-
-
-def nearest_logged(
-    log: Float[Tensor, "*#b T 2"], valid: Bool[Tensor, "*#b T"], position: Float[Tensor, "*#b 2"]
-) -> Int[Tensor, "*b"]:
-    """Step of the log at which an agent came nearest to a position."""
-    away = (log - position[..., None, :]).square().sum(-1)
-    return away.masked_fill(~valid, torch.inf).argmin(-1)
 
 
 def rollout_heights(
@@ -146,34 +200,59 @@ def rollout_heights(
     return torch.cat(found).unflatten(0, state.shape[:3])
 
 
+@torch.no_grad()
+def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
+    """Which agents that are ready can enter, far enough from all others.
+
+    Of several that are ready at once the earlier slot goes first: a later one is kept away from where it is, even if
+    that one can't enter either.
+
+    Args:
+        objects: everyone, those that are ready at the places where they enter.
+        index: rows of A of the driven agents.
+        ready: who wants to enter.
+    """
+    agents = objects.valid.shape[1]
+    slot = torch.arange(index.shape[1], device=index.device).expand(index.shape)
+    # The place of an agent among those that are ready; all others are there already.
+    order = torch.full_like(pad(objects.valid, (0, 1)), -1, dtype=torch.int64)
+    order = order.scatter(1, torch.where(ready, index, agents), slot)[:, :agents]
+    row, slot = places(ready)
+    height = None if objects.height is None else objects.height[row]
+    state, valid, size, kind = (part[row] for part in objects[:4])
+    some = Objects(state, valid, size, kind, height)
+    agent = index[row, slot]
+    there = some.others(agent[:, None])[:, 0] & (order[row] < slot[:, None])
+    own, own_size = objects.state[row, agent][:, None], objects.size[row, agent][:, None]
+    blocked = torch.zeros_like(there)
+    for seconds, least in ((0.0, CLEAR), *((t, 0.0) for t in FORESEEN)):
+        here, others = (value[..., :2] + seconds * value[..., 3:] for value in (own, some.state))
+        gap = box_gap(here, own[..., 2], own_size, others, some.state[..., 2], some.size)
+        blocked |= there & (gap < least)
+    return ready.index_put((row, slot), ready[row, slot] & ~blocked.any(-1))
+
+
 def observed_objects(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    objects: Objects,
-    index: Int[Tensor, "M N"],
-    own: Float[Tensor, "M N 5"],
-    own_size: Float[Tensor, "M N 2"],
-    routes: RouteWindow | None,
+    tables: Tables, objects: Objects, who: Observers, routes: RouteWindow | None
 ) -> dict[str, Tensor]:
-    """What agents ``index`` in states ``own`` see of the nearest others, by the distance between centres.
+    """What agents see of the nearest others, by the distance between centres.
 
     The result holds the entries of :class:`symphony.envs.observation.Observation` that are asked for.
     """
     config, agents = tables.config, objects.valid.shape[1]
-    chosen, mask = _nearest(objects, index, own, config.num_objects)
+    chosen, mask = _nearest(objects, who, config.num_objects)
     # Places among all agents there are now, and among those of all scenes.
     now = chosen + torch.arange(0, objects.valid.numel(), agents, device=chosen.device)[:, None, None]
-    row = chosen + (scene * agents)[:, None, None]
+    row = chosen + (who.scene * agents)[:, None, None]
     # Whoever is not seen may hold anything, and neither its numbers nor their gradient may get through.
     state = objects.state.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
     state = torch.where(mask[..., None], state, 0.0)
-    seen = {"objects": _features(tables, state, row, mask, own), "objects_mask": mask}
+    seen = {"objects": _features(tables, who, state, row, mask), "objects_mask": mask}
     size = objects.size.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
     if config.along and routes is not None:
-        seen["along"] = along_route(own, own_size, state, size, routes) * mask[..., None]
+        seen["along"] = along_route(who.state, who.size, state, size, routes) * mask[..., None]
     if config.clearance or config.gaps:
-        gap = _gaps(config.foresight, own, own_size, state, size)
-        gap = torch.where(mask[..., None], gap, 0.0)
+        gap = torch.where(mask[..., None], _gaps(config.foresight, who, state, size), 0.0)
         seen["gap"] = gap[..., 0]
         if config.foresight:
             seen["gap_ahead"] = gap[..., 1:]
@@ -182,37 +261,26 @@ def observed_objects(
 
 @torch.no_grad()
 def _nearest(
-    objects: Objects, index: Int[Tensor, "M N"], own: Float[Tensor, "M N 5"], count: int
+    objects: Objects, who: Observers, count: int
 ) -> tuple[Int[Tensor, "M N O"], Bool[Tensor, "M N O"]]:
     """Places in the scene of the nearest others, and which of them exist."""
-    x, y = (objects.state[:, None, :, k] - own[..., k, None] for k in (0, 1))
-    place = torch.arange(objects.valid.shape[1], device=index.device)
-    hidden = ~objects.valid[:, None] | (place == index[..., None])
-    if objects.height is not None:
-        mine = objects.height.gather(1, index[..., None].expand(*index.shape, 2))
-        hidden |= levels_apart(objects.height[:, None], mine[:, :, None])
-    return nearest((x.square() + y.square()).masked_fill(hidden, torch.inf), count)
+    x, y = (objects.state[:, None, :, k] - who.state[..., k, None] for k in (0, 1))
+    return nearest(torch.where(objects.others(who.agent), x.square() + y.square(), torch.inf), count)
 
 
 def _features(
     tables: Tables,
+    who: Observers,
     state: Float[Tensor, "M N O 5"],
     row: Int[Tensor, "M N O"],
     mask: Bool[Tensor, "M N O"],
-    own: Float[Tensor, "M N 5"],
 ) -> Float[Tensor, "M N O F"]:
     """Features of objects in states, rows of the table of all agents."""
     config = tables.config
     static = tables.agents.index_select(0, row.flatten()).unflatten(0, row.shape)
-    # Component by component: operations on a last dimension of 2 are slow.
-    origin_x, origin_y, heading, own_x, own_y = own[..., None, :].unbind(-1)
-    cos, sin = (-heading).cos(), (-heading).sin()
-
-    def turned(x: Float[Tensor, "M N O"], y: Float[Tensor, "M N O"], scale: float) -> list[Tensor]:
-        return [(cos * x - sin * y) / scale, (sin * x + cos * y) / scale]
-
+    origin_x, origin_y, heading, own_x, own_y = who.state[..., None, :].unbind(-1)
     x, y, course, speed_x, speed_y = state.unbind(-1)
-    relative = wrap(course - heading)
+    relative, turned = wrap(course - heading), frame(heading)
     dynamic = [
         *turned(x - origin_x, y - origin_y, config.distance_scale),
         relative.cos(),
@@ -221,23 +289,21 @@ def _features(
         # Elements are encoded one by one, so each must tell how fast it is approached.
         *turned(speed_x - own_x, speed_y - own_y, config.speed_scale),
     ]
-    return torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(own.dtype)[..., None]
+    return torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(state.dtype)[..., None]
 
 
 def _gaps(
     foresight: tuple[float, ...],
-    own: Float[Tensor, "M N 5"],
-    own_size: Float[Tensor, "M N 2"],
+    who: Observers,
     state: Float[Tensor, "M N O 5"],
     size: Float[Tensor, "M N O 2"],
 ) -> Float[Tensor, "M N O H"]:
     """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
     # Times come first, and components apart, so that operations run along everything else.
-    times = constant((0.0, *foresight), own.dtype, own.device)[:, None, None, None]
-    wide = own[..., None, :]
+    times = constant((0.0, *foresight), state.dtype, state.device)[:, None, None, None]
+    own = who.state[..., None, :]
     x, y = (
-        (state[..., k] + times * state[..., 3 + k]) - (wide[..., k] + times * wide[..., 3 + k])
-        for k in (0, 1)
+        (state[..., k] + times * state[..., 3 + k]) - (own[..., k] + times * own[..., 3 + k]) for k in (0, 1)
     )
-    gap = gap_between(x, y, wide[..., 2], own_size[..., None, :], state[..., 2], size)
+    gap = gap_between(x, y, own[..., 2], who.size[..., None, :], state[..., 2], size)
     return gap.movedim(0, -1).contiguous()

@@ -6,16 +6,15 @@ Shapes: M rows (any flattened batch), N observing agents, A agents of the scene,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
-from symphony.envs.objects import OBJECT_FEATURES, Objects, everyone_at, observed_objects
+from symphony.envs.flags import road_distance
+from symphony.envs.objects import OBJECT_FEATURES, Objects, Observers, everyone_at, observed_objects
 from symphony.envs.points import observed_lights, observed_points
-from symphony.envs.road import road_distance
 from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, RouteWindow, route_ahead
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import POINT_FEATURES, Tables
@@ -77,61 +76,28 @@ class ObservationConfig:
         return cls(num_objects=0, num_points=0, own=False)
 
 
-class Observation(NamedTuple):
-    """Features of the observing agents; masked entries are zero, and what was not asked for is None.
-
-    Attributes:
-        own: [M, N, 4] speed, length, width, last logged step reached (0 or 1).
-        objects: [M, N, O, 15].
-        objects_mask: [M, N, O].
-        points: [M, N, P, 23].
-        points_mask: [M, N, P].
-        lights: [M, N, L, 23] the nearest lights, with the features of points.
-        lights_mask: [M, N, L].
-        gap: [M, N, O] metres between boxes, negative where they overlap, 0 where masked.
-        gap_ahead: [M, N, O, H] the gaps at H times ahead.
-        road: [M, N, 5] metres of centre and corners off the road, negative on it.
-        route: [M, N, Fr], see :func:`symphony.envs.routes.route_ahead`.
-        along: [M, N, O, Fa], see :func:`symphony.envs.routes.along_route`.
-    """
-
-    own: Tensor | None = None
-    objects: Tensor | None = None
-    objects_mask: Tensor | None = None
-    points: Tensor | None = None
-    points_mask: Tensor | None = None
-    lights: Tensor | None = None
-    lights_mask: Tensor | None = None
-    gap: Tensor | None = None
-    gap_ahead: Tensor | None = None
-    road: Tensor | None = None
-    route: Tensor | None = None
-    along: Tensor | None = None
-
-
 def observation_spec(config: ObservationConfig, agents: int, device: torch.device | None = None) -> Composite:
-    """Shapes of what each of N agents observes, under the names of :class:`Observation`."""
+    """Shapes of what each of N agents observes."""
     others, ahead = config.num_objects, len(config.foresight)
-    measures = others and (config.clearance or config.gaps)
+    measures = others if config.clearance or config.gaps else 0
     widths: dict[str, tuple[int, ...]] = {
-        "own": (SELF_FEATURES,) if config.own else (),
-        "objects": (others, OBJECT_FEATURES) if others else (),
-        "points": (config.num_points, POINT_FEATURES) if config.num_points else (),
-        "lights": (config.num_lights, POINT_FEATURES) if config.num_lights else (),
-        "route": (ROUTE_FEATURES,) if config.route else (),
-        "road": (5,) if config.clearance else (),
-        "gap": (others,) if measures else (),
-        "gap_ahead": (others, ahead) if measures and ahead else (),
-        "along": (others, ALONG_FEATURES) if others and config.along else (),
+        "own": (SELF_FEATURES * config.own,),
+        "objects": (others, OBJECT_FEATURES),
+        "points": (config.num_points, POINT_FEATURES),
+        "lights": (config.num_lights, POINT_FEATURES),
+        "route": (ROUTE_FEATURES * config.route,),
+        "road": (5 * config.clearance,),
+        "gap": (measures,),
+        "gap_ahead": (measures, ahead),
+        "along": (others, ALONG_FEATURES * config.along),
     }
-    asked = {name: width for name, width in widths.items() if width}
-    numbers = {name: Unbounded(shape=(agents, *width), device=device) for name, width in asked.items()}
-    flags = {
-        f"{name}_mask": Binary(shape=(agents, asked[name][0]), dtype=torch.bool, device=device)
-        for name in ("objects", "points", "lights")
-        if name in asked
-    }
-    return Composite({**numbers, **flags}, shape=(agents,))
+    spec = Composite(shape=(agents,))
+    for name, width in widths.items():
+        if all(width):
+            spec[name] = Unbounded(shape=(agents, *width), device=device)
+            if name in ("objects", "points", "lights"):
+                spec[f"{name}_mask"] = Binary(shape=(agents, width[0]), dtype=torch.bool, device=device)
+    return spec
 
 
 def observe(
@@ -143,11 +109,13 @@ def observe(
     config: ObservationConfig,
     tables: Tables | None = None,
     routes: RouteWindow | None = None,
-) -> Observation:
-    """Observation of the agents ``index`` among ``objects``.
+) -> dict[str, Tensor]:
+    """What the agents ``index`` among ``objects`` observe, by the last part of its key (see :mod:`symphony.keys`).
 
-    Nearness is the distance between centres. Lanes share their end points, so ties are common: on the CPU they go to
-    the elements that come first, whatever the padding, and elements are in the order of the scene.
+    Of itself an agent observes speed, length, width and whether the last logged step is reached (0 or 1); masked
+    entries are zero, and what was not asked for has none. Nearness is the distance between centres. Lanes share their
+    end points, so ties are common: on the CPU they go to the elements that come first, whatever the padding, and
+    elements are in the order of the scene.
 
     Args:
         scenes: the static part.
@@ -160,35 +128,31 @@ def observe(
         routes: what agents see of their routes; without, nothing of routes is observed.
     """
     if config.blind and not config.route:
-        return Observation()
+        return {}
     tables = Tables(scenes, config) if tables is None else tables
-    own, own_size = rows_of(objects.state, index), rows_of(objects.size, index)
-    height = None if objects.height is None else rows_of(objects.height, index)
-    origin, heading = own[..., :2], own[..., 2]
-    turn = -heading
-    speed = turn.cos() * own[..., 3] - turn.sin() * own[..., 4]
+    who = Observers.of(objects, scene, step, index)
     seen: dict[str, Tensor] = {}
     if config.own:
-        ends = (step >= scenes.last_step[scene]).to(own.dtype)[:, None, None].expand(*index.shape, 1)
-        seen["own"] = torch.cat(
-            [(speed / config.speed_scale)[..., None], own_size / config.size_scale, ends], -1
-        )
+        ends = (step >= scenes.last_step[scene]).to(who.size.dtype)[:, None, None].expand(*index.shape, 1)
+        speed = (who.speed / config.speed_scale)[..., None]
+        seen["own"] = torch.cat([speed, who.size / config.size_scale, ends], -1)
     if config.num_objects:
-        seen |= observed_objects(tables, scene, objects, index, own, own_size, routes)
-    pose = origin, heading, speed, height
+        seen |= observed_objects(tables, objects, who, routes)
     if config.num_points:
-        seen["points"], seen["points_mask"] = observed_points(tables, scene, step, *pose)
+        seen["points"], seen["points_mask"] = observed_points(tables, who)
     if config.num_lights:
-        seen["lights"], seen["lights_mask"] = observed_lights(tables, scene, step, *pose)
+        seen["lights"], seen["lights_mask"] = observed_lights(tables, who)
     if config.route and routes is not None:
-        state = torch.cat([own[..., :3], speed[..., None]], -1)
+        state = torch.cat([who.state[..., :3], who.speed[..., None]], -1)
         seen["route"] = route_ahead(state, routes, config.distance_scale)
     if config.clearance:
-        queried = torch.cat([origin[..., None, :], box_corners(origin, heading, own_size)], -2)
-        of_each = None if height is None else height.repeat_interleave(queried.shape[2], 1)
+        origin = who.origin
+        corners = box_corners(origin, who.heading, who.size)
+        queried = torch.cat([origin[..., None, :], corners], -2)
+        of_each = None if who.height is None else who.height.repeat_interleave(queried.shape[2], 1)
         road = road_distance(scenes, scene, queried.flatten(1, 2), tables, of_each)
         seen["road"] = road.unflatten(1, queried.shape[1:3])
-    return Observation(**seen)
+    return seen
 
 
 def observe_states(
@@ -202,7 +166,7 @@ def observe_states(
     goal: Int[Tensor, "M N"] | None = None,
     progress: Float[Tensor, "M N"] | None = None,
     tables: Tables | None = None,
-) -> tuple[Observation, Objects]:
+) -> tuple[dict[str, Tensor], Objects]:
     """What interactive agents observe in given states, and everyone whom they could see. No environment is needed.
 
     Args:
@@ -222,8 +186,3 @@ def observe_states(
         routes = scenes.routes.of(scene, goal).window(progress)
     index = scenes.interactive.index_select(0, scene)
     return observe(scenes, scene, step, objects, index, config, tables, routes), objects
-
-
-def rows_of(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
-    """Each row's values at its own index."""
-    return values.gather(1, index[..., None].expand(*index.shape, values.shape[-1]))

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from symphony.envs.tables import LIGHT_COLUMN, POINT_FEATURES, Tables
+from symphony.envs.objects import Observers, frame
+from symphony.envs.tables import LIGHT_COLUMN, Tables
 from symphony.geometry.levels import levels_apart
 from symphony.geometry.nearest import nearest, on_host
 
@@ -20,44 +21,23 @@ _DISTANCES = 1 << 16
 """Distances held at a time."""
 
 
-def observed_points(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    step: Int[Tensor, " M"],
-    origin: Float[Tensor, "M N 2"],
-    heading: Float[Tensor, "M N"],
-    speed: Float[Tensor, "M N"],
-    height: Float[Tensor, "M N 2"] | None = None,
-) -> tuple[Float[Tensor, "M N K F"], Bool[Tensor, "M N K"]]:
+def observed_points(tables: Tables, who: Observers) -> tuple[Float[Tensor, "M N K F"], Bool[Tensor, "M N K"]]:
     """Features of the nearest points in each agent's frame, on its level, and which of them exist."""
-    flat, mask = nearest_points(tables, scene, origin.detach(), height)
-    return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
+    flat, mask = nearest_points(tables, who.scene, who.state.detach()[..., :2], who.height)
+    return _features(tables, who, flat, mask), mask
 
 
-def observed_lights(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    step: Int[Tensor, " M"],
-    origin: Float[Tensor, "M N 2"],
-    heading: Float[Tensor, "M N"],
-    speed: Float[Tensor, "M N"],
-    height: Float[Tensor, "M N 2"] | None = None,
-) -> tuple[Float[Tensor, "M N L F"], Bool[Tensor, "M N L"]]:
+def observed_lights(tables: Tables, who: Observers) -> tuple[Float[Tensor, "M N L F"], Bool[Tensor, "M N L"]]:
     """Features of the nearest lights in each agent's frame, however far, on its level, and which of them exist."""
-    count, position, number = tables.config.num_lights, *tables.light_points
-    if position.shape[1] == 0:
-        shape = (*origin.shape[:2], count)
-        return origin.new_zeros(*shape, POINT_FEATURES), torch.zeros(
-            shape, dtype=torch.bool, device=origin.device
-        )
+    position, number = tables.light_points
     with torch.no_grad():
-        squared = (position[scene][:, None] - origin[..., None, :]).square().sum(-1)
-        if height is not None:
-            lights = tables.scenes.point_height.flatten(0, 1)[number[scene]]
-            squared = squared.masked_fill(levels_apart(lights[:, None], height[:, :, None]), torch.inf)
-        chosen, mask = nearest(squared, count)
-        flat = number[scene].gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
-    return _features(tables, scene, step, flat, mask, origin, heading, speed), mask
+        squared = (position[who.scene][:, None] - who.state[..., None, :2]).square().sum(-1)
+        if who.height is not None:
+            lights = tables.scenes.point_height.flatten(0, 1)[number[who.scene]]
+            squared = squared.masked_fill(levels_apart(lights[:, None], who.height[:, :, None]), torch.inf)
+        chosen, mask = nearest(squared, tables.config.num_lights)
+        flat = number[who.scene].gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
+    return _features(tables, who, flat, mask), mask
 
 
 @torch.no_grad()
@@ -87,8 +67,7 @@ def nearest_points(
         # Cells do not know of levels: where one of the nearest is on another, all are looked at.
         rest |= levels_apart(tables.scenes.point_height.flatten(0, 1)[flat], level).any(1)
     for some in rest.nonzero().squeeze(-1).split(max(_DISTANCES // total, 1)):
-        own = None if level is None else level[some]
-        found = _among_all(tables, row[some], here[some, None], own)
+        found = _among_all(tables, row[some], here[some, None], None if level is None else level[some])
         flat[some], mask[some] = (value.squeeze(1) for value in found)
     return flat.view(*origin.shape[:2], count), mask.view(*origin.shape[:2], count)
 
@@ -107,47 +86,30 @@ def _among_all(
 
 
 def _features(
-    tables: Tables,
-    scene: Int[Tensor, " M"],
-    step: Int[Tensor, " M"],
-    flat: Int[Tensor, "M N K"],
-    mask: Bool[Tensor, "M N K"],
-    origin: Float[Tensor, "M N 2"],
-    heading: Float[Tensor, "M N"],
-    speed: Float[Tensor, "M N"],
+    tables: Tables, who: Observers, flat: Int[Tensor, "M N K"], mask: Bool[Tensor, "M N K"]
 ) -> Float[Tensor, "M N K F"]:
-    """Features of the points ``flat``, for agents at a position, with a heading and a speed."""
+    """Features of the points ``flat`` as agents see them."""
     config, index = tables.config, flat.flatten()
-    cos, sin = (f(-heading)[..., None] for f in (torch.cos, torch.sin))
     # A copy of the rows, which nobody else has yet: what depends on the agent is written over it. That takes half of
     # the time of putting columns together.
     seen = tables.points.index_select(0, index).unflatten(0, flat.shape)
-    x, y = seen[..., 0] - origin[..., :1], seen[..., 1] - origin[..., 1:]
-    # Kept apart, as a gradient may still ask for it.
-    ahead_x, ahead_y = seen[..., 2:4].clone().unbind(-1)
-    written = [
-        (cos * x - sin * y) / config.distance_scale,
-        (sin * x + cos * y) / config.distance_scale,
-        cos * ahead_x - sin * ahead_y,
-        sin * ahead_x + cos * ahead_y,
-    ]
+    x, y = seen[..., 0] - who.origin[..., :1], seen[..., 1] - who.origin[..., 1:]
+    # Directions are kept apart, as a gradient may still ask for them.
+    ahead = seen[..., 2:4].clone().unbind(-1)
+    turned = frame(who.heading[..., None])
+    written = (*turned(x, y, config.distance_scale), *turned(*ahead))
     for column, values in enumerate(written):
         seen[..., column] = values
-    seen[..., 5] = (speed / config.speed_scale)[..., None]
+    seen[..., 5] = (who.speed / config.speed_scale)[..., None]
     if tables.light is not None:
         light = tables.light.index_select(0, index).unflatten(0, flat.shape).long()
-        now = _light_now(tables, scene, step)
+        scenes = tables.scenes
+        # Places in the flattened [B, steps]; after the log its last state stays.
+        row = who.scene * scenes.light.shape[1] + torch.minimum(who.step, scenes.last_step[who.scene])
+        now = scenes.light.flatten(0, 1).index_select(0, row).long()
         state = now.gather(1, light.clamp_min(0).flatten(1)).unflatten(1, light.shape[1:])
         shown = (light >= 0).to(seen.dtype)[..., None]
         dark = torch.zeros_like(seen[..., LIGHT_COLUMN:])
         seen[..., LIGHT_COLUMN:] = dark.scatter(-1, state[..., None], shown)
     # Most maps have enough points, and then there is nothing to mask.
     return seen if on_host(mask) and bool(mask.all()) else seen * mask[..., None]
-
-
-def _light_now(tables: Tables, scene: Int[Tensor, " M"], step: Int[Tensor, " M"]) -> Int[Tensor, "M Q"]:
-    """State [M, Q] int64 of the lights of each row."""
-    scenes = tables.scenes
-    # Places in the flattened [B, steps]; after the log its last state stays.
-    row = scene * scenes.light.shape[1] + torch.minimum(step, scenes.last_step[scene])
-    return scenes.light.flatten(0, 1).index_select(0, row).long()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from symphony.geometry.frames import rotate
 from symphony.geometry.levels import LEVEL
 from symphony.geometry.nearest import on_host
 from symphony.geometry.stations import stations_along
-from symphony.roadgraph import LaneGraph, Route, ground_truth_routes, route_lines, routes, starting_lanes
+from symphony.roadgraph import LaneGraph, ground_truth_routes, route_lines, routes, starting_lanes
 from symphony.roadgraph.routes import HORIZON
 from symphony.streams import stream_of
 
@@ -104,7 +104,7 @@ def route_table(
         reach: of :func:`drivable`, where that is known.
     """
     try:
-        first, _, lines = agent_routes(segment, graph, agent, begin, reach)
+        first, lines = _agent_routes(segment, graph, agent, begin, reach)
     except DataError as error:
         warnings.warn(f"{error}; it has none", DataWarning, stacklevel=2)
         return NO_ROUTES
@@ -117,51 +117,60 @@ def route_table(
     return RouteTable(np.concatenate(lines).astype(np.float32), count, right, int(tied[draw]))
 
 
-def agent_routes(
+def _agent_routes(
     segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0, reach: float | None = None
-) -> tuple[int, list[Route], list[NDArray[np.float64]]]:
-    """The step at which an agent's routes begin, the routes, and their lines; see :func:`route_table`.
+) -> tuple[int, list[NDArray[np.float64]]]:
+    """The step at which an agent's routes begin, and their lines; see :func:`route_table`.
 
     Raises:
         DataError: the routes cannot be built; names segment and agent.
     """
     steps = begin + np.flatnonzero(segment.valid[agent, begin:])
     for first in steps if begin else steps[:1]:
-        position, heading = segment.position[agent, first, :2], float(segment.heading[agent, first])
-        starts = _on_level(segment, agent, first, graph, starting_lanes(graph, position, heading))
-        if starts:
+        if starts := _starts(segment, graph, agent, int(first)):
             break
     else:
-        return 0, [], []
+        return 0, []
     reach = drivable(segment) if reach is None else reach
     horizon = max(HORIZON, reach)
     found = routes(graph, starts, horizon=horizon, onward=max(reach + ONWARD - horizon, 0.0))
     length, speed = max(horizon, reach + ONWARD), float(np.linalg.norm(segment.velocity[agent, first]))
     try:
-        kept, lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)
+        _, lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)
         if not all(np.isfinite(line).all() for line in lines):
             raise ValueError("points that are not finite")
     except (ValueError, IndexError, ArithmeticError) as error:
         message = f"the routes of agent {int(segment.agent_id[agent])} can't be built: {error}"
         raise DataError(message, segment=segment.segment_id, field="road.lanes") from error
-    return int(first), kept, lines
+    return int(first), lines
 
 
-def _on_level(
-    segment: RunSegment, agent: int, step: int, graph: LaneGraph, starts: list[tuple[int, float]]
-) -> list[tuple[int, float]]:
-    """Of the lanes that an agent may be on those of its height, where the map has any."""
-    lanes = segment.road.lanes
+def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> list[tuple[int, float]]:
+    """Lanes that an agent may be on, and metres along them: those of its height, where the map has any."""
+    position, lanes = segment.position[agent, step], segment.road.lanes
+    starts = starting_lanes(graph, position[:2], float(segment.heading[agent, step]))
     if len(starts) < 2 or np.ptp(lanes.points[:, 2]) < LEVEL:
         return starts
-    ground = segment.position[agent, step, 2] - 0.5 * segment.size[agent, 2]
-    kept = []
+    ground, kept = position[2] - 0.5 * segment.size[agent, 2], []
     for lane, along in starts:
-        points = lanes[lane]
-        arc = np.append(0.0, np.hypot(*np.diff(points[:, :2], axis=0).T).cumsum())
-        if abs(np.interp(along, arc, points[:, 2]) - ground) < LEVEL:
+        arc = np.append(0.0, np.hypot(*np.diff(lanes[lane][:, :2], axis=0).T).cumsum())
+        if abs(np.interp(along, arc, lanes[lane][:, 2]) - ground) < LEVEL:
             kept.append((lane, along))
     return kept or starts
+
+
+def packed(tables: Sequence[RouteTable], least: int = 0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Points [R, 2] of all routes of N agents, the place among them of each route's first [N, G], and how many it
+    has [N, G], 0 for padding; G is at least ``least``.
+    """
+    most = max([least, *(len(table.count) for table in tables)])
+    first, count = np.zeros((2, len(tables), most), np.int64)
+    begin = 0
+    for k, table in enumerate(tables):
+        count[k, : len(table.count)] = table.count
+        first[k, : len(table.count)] = begin + np.cumsum(table.count) - table.count
+        begin += len(table.points)
+    return np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in tables)]), first, count
 
 
 def logged_progress(
@@ -170,13 +179,12 @@ def logged_progress(
     """Metres that agents have come along the routes that they took, at each step; 0 where that is not known."""
     found = np.zeros(valid.shape, np.float32)
     rows = [row for row, table in enumerate(tables) if table.logged >= 0]
-    if not rows:
-        return found
-    lines = [tables[row].line(tables[row].logged) for row in rows]
-    most = max(2, *map(len, lines))
-    padded = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in lines])
-    places = stations_along(padded.astype(np.float64), position[rows].astype(np.float64), valid[rows])
-    found[rows] = np.nan_to_num(places)
+    if rows:
+        lines = [tables[row].line(tables[row].logged) for row in rows]
+        most = max(2, *map(len, lines))
+        padded = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in lines])
+        places = stations_along(padded.astype(np.float64), position[rows].astype(np.float64), valid[rows])
+        found[rows] = np.nan_to_num(places)
     return found
 
 
@@ -202,99 +210,85 @@ class Routes(NamedTuple):
         agent = torch.arange(agents, device=goal.device)
         # Places in the flattened [B, N, G], and then in the flattened [B, R].
         row = ((scene[:, None] * agents + agent) * number + goal.clamp(0, number - 1)).flatten()
-        first = self.first.flatten().index_select(0, row).unflatten(0, goal.shape)
-        count = self.length.flatten().index_select(0, row).unflatten(0, goal.shape)
+        first, count = (
+            part.flatten().index_select(0, row).unflatten(0, goal.shape) for part in (self.first, self.length)
+        )
         exists = (goal >= 0) & (goal < number)
         begin = first + (scene * self.point.shape[1])[:, None]
         return FollowedRoutes(self.point.flatten(0, 1), begin, torch.where(exists, count, 0))
 
+    def among(self, scene: Int[Tensor, " M"]) -> FollowedRoutes:
+        """All routes [M, N, G] that the agents of scenes can choose from."""
+        begin = self.first[scene] + (scene * self.point.shape[1])[:, None, None]
+        return FollowedRoutes(self.point.flatten(0, 1), begin, self.length[scene])
+
     def beginnings(self) -> tuple[Float[Tensor, "B N G K 2"], Int[Tensor, "B N G"]]:
         """The first :data:`POINTS` points of all routes, by which one is chosen, and how many of them exist."""
-        shift = self.point.shape[1] * torch.arange(len(self.point), device=self.first.device)[:, None, None]
-        points = _beginnings(self.point.flatten(0, 1), self.first + shift, self.length)
-        return points, self.length.clamp_max(POINTS)
+        every = self.among(torch.arange(len(self.point), device=self.first.device))
+        return every.points(POINTS), self.length.clamp_max(POINTS)
 
 
 class FollowedRoutes(NamedTuple):
-    """One route for each of some agents.
+    """Some routes, such as the one that each agent follows; leading dimensions [*b], such as [M, N].
 
     Attributes:
         point: [Q, 2] points of many routes.
-        begin: [M, N] int64 place of the first point of each agent's.
-        length: [M, N] int64 points of it; 0 for none.
+        begin: [*b] int64 place of the first point of each.
+        length: [*b] int64 points of each; 0 for none.
     """
 
     point: Tensor
     begin: Tensor
     length: Tensor
 
+    def points(self, place: Int[Tensor, "*b K"] | int) -> Float[Tensor, "*b K 2"]:
+        """Points at places of each route, or so many first ones; past the end the last one again, zeros for none."""
+        if isinstance(place, int):
+            place = torch.arange(place, device=self.begin.device).expand(*self.begin.shape, place)
+        if not len(self.point):
+            return self.point.new_zeros(*place.shape, 2)
+        row = self.begin[..., None] + place.minimum((self.length[..., None] - 1).clamp_min(0))
+        found = self.point.index_select(0, row.clamp_max(len(self.point) - 1).flatten())
+        return found.unflatten(0, place.shape) * (self.length > 0)[..., None, None]
+
+    def lines(self) -> tuple[Float[Tensor, "*b K 2"], Int[Tensor, "*b"]]:
+        """All points of the routes, those past the end as the last one, and their number. On a device this waits."""
+        return self.points(max(2, int(self.length.max())) if self.length.numel() else 2), self.length
+
     def window(self, progress: Float[Tensor, "M N"]) -> RouteWindow:
         """What is seen of the routes by agents that have come so many metres along them."""
         own = (progress / SPACING).round().long().minimum((self.length - 2).clamp_min(0))
         start = (own - BEHIND).clamp_min(0)
         place = start[..., None] + torch.arange(WINDOW, device=start.device)
-        points = _points_at(self.point, self.begin, self.length, place)
-        return RouteWindow(points, place < self.length[..., None], own - start)
+        return RouteWindow(self.points(place), place < self.length[..., None], own - start)
 
+    @torch.no_grad()
     def progress(
-        self,
-        position: Float[Tensor, "M N 2"],
-        about: Float[Tensor, "M N"],
-        moved: Float[Tensor, "M N"] | None = None,
+        self, position: Float[Tensor, "M N 2"], about: Float[Tensor, "M N"], moved: Float[Tensor, "M N"]
     ) -> Float[Tensor, "M N"]:
         """Metres along the routes of the places nearest to agents, looked for around where they were before.
 
         Args:
             position: of the agents.
             about: where they were, in metres along.
-            moved: metres that they have driven since; nothing by default.
+            moved: metres that they have driven since.
         """
-        with torch.no_grad():
-            reach = _SLACK if moved is None else _CUT * moved[..., None] + _SLACK
-            start = ((about / SPACING).long() - _BACK).clamp_min(0)
-            place = start[..., None] + torch.arange(_SEARCHED, device=start.device)
-            x, y = _points_at(self.point, self.begin, self.length, place).unbind(-1)
-            first, way = (x[..., :-1], y[..., :-1]), (x.diff(dim=-1), y.diff(dim=-1))
-            length = (way[0].square() + way[1].square()).sqrt()
-            away = [position[..., k, None] - first[k] for k in (0, 1)]
-            along = (away[0] * way[0] + away[1] * way[1]) / length.clamp_min(1e-6)
-            along = along.clamp_min(0.0).minimum(length)
-            share = along / length.clamp_min(1e-6)
-            squared = (away[0] - share * way[0]).square() + (away[1] - share * way[1]).square()
-            arc = SPACING * place[..., :-1].to(about.dtype)
-            near = (arc <= about[..., None] + reach) & (arc + SPACING >= about[..., None] - reach)
-            near &= place[..., 1:] < self.length[..., None]
-            which = squared.masked_fill(~near, torch.inf).argmin(-1, keepdim=True)
-            found = (arc + along).gather(-1, which)[..., 0]
-            return torch.where(near.any(-1), found, about)
-
-    def lines(self) -> tuple[Float[Tensor, "M N K 2"], Int[Tensor, "M N"]]:
-        """All points of the routes, those past the end as the last one, and their number. On a device this waits."""
-        most = max(2, int(self.length.max())) if self.length.numel() else 2
-        place = torch.arange(most, device=self.begin.device).expand(*self.begin.shape, most)
-        return _points_at(self.point, self.begin, self.length, place), self.length
-
-
-def _points_at(
-    point: Float[Tensor, "Q 2"],
-    begin: Int[Tensor, "*b"],
-    count: Int[Tensor, "*b"],
-    place: Int[Tensor, "*b K"],
-) -> Float[Tensor, "*b K 2"]:
-    """Points of routes at their own places; past the end the last one again, zeros without a route."""
-    if not len(point):
-        return point.new_zeros(*place.shape, 2)
-    row = begin[..., None] + place.minimum((count[..., None] - 1).clamp_min(0))
-    found = point.index_select(0, row.clamp_max(len(point) - 1).flatten()).unflatten(0, place.shape)
-    return found * (count > 0)[..., None, None]
-
-
-def _beginnings(
-    point: Float[Tensor, "Q 2"], begin: Int[Tensor, "*b"], count: Int[Tensor, "*b"]
-) -> Float[Tensor, "*b K 2"]:
-    """The first :data:`POINTS` points of routes."""
-    place = torch.arange(POINTS, device=begin.device).expand(*begin.shape, POINTS)
-    return _points_at(point, begin, count, place)
+        reach, about = _CUT * moved[..., None] + _SLACK, about[..., None]
+        start = ((about / SPACING).long() - _BACK).clamp_min(0)
+        place = start + torch.arange(_SEARCHED, device=start.device)
+        x, y = self.points(place).unbind(-1)
+        way_x, way_y = x.diff(dim=-1), y.diff(dim=-1)
+        length = (way_x.square() + way_y.square()).sqrt()
+        away_x, away_y = position[..., :1] - x[..., :-1], position[..., 1:] - y[..., :-1]
+        along = (away_x * way_x + away_y * way_y) / length.clamp_min(1e-6)
+        along = along.clamp_min(0.0).minimum(length)
+        share = along / length.clamp_min(1e-6)
+        squared = (away_x - share * way_x).square() + (away_y - share * way_y).square()
+        arc = SPACING * place[..., :-1].to(about.dtype)
+        near = (arc <= about + reach) & (arc + SPACING >= about - reach)
+        near &= place[..., 1:] < self.length[..., None]
+        which = squared.masked_fill(~near, torch.inf).argmin(-1, keepdim=True)
+        return torch.where(near.any(-1, keepdim=True), (arc + along).gather(-1, which), about).squeeze(-1)
 
 
 class RouteWindow(NamedTuple):
@@ -330,16 +324,13 @@ def route_ahead(
     seen = routes.points.gather(2, which[..., None].expand(*which.shape, 2))
     local = rotate(seen - position[..., None, :], -heading[..., None])
     along = local[..., 1, :] - local[..., 0, :]
-    length = along.norm(dim=-1, keepdim=True)
-    along = along / length.clamp_min(1e-3)
+    along = along / along.norm(dim=-1, keepdim=True).clamp_min(1e-3)
     offset = along[..., 0] * local[..., 0, 1] - along[..., 1] * local[..., 0, 0]
     has = routes.exists[..., 1:2].to(state.dtype)
     ahead = torch.cat([local / distance_scale, there[..., None].to(state.dtype)], -1)
     ahead = ahead[..., 1:, :] * there[..., 1:, None]
-    features = torch.cat(
-        [torch.ones_like(has), (offset / 5.0).clamp(-2.0, 2.0)[..., None], along, ahead.flatten(-2)], -1
-    )
-    return features * has
+    beside = (offset / 5.0).clamp(-2.0, 2.0)[..., None]
+    return torch.cat([torch.ones_like(has), beside, along, ahead.flatten(-2)], -1) * has
 
 
 def along_route(
@@ -367,7 +358,7 @@ def along_route(
     # Component by component: operations on a last dimension of 2 are slow.
     x, y, speed_x, speed_y = (torch.cat([own[..., k, None], others[..., k]], -1) for k in (0, 1, 3, 4))
     points_x, points_y = routes.points.unbind(-1)
-    count, last = routes.exists.sum(-1), routes.points.shape[2] - 1
+    count = routes.exists.sum(-1)[..., None]
     with torch.no_grad():
         # |p - q|^2 less |p|^2, about the agent so that numbers stay small: [M, N, 1 + O, K]
         here = torch.stack([x - x[..., :1], y - y[..., :1]], -1)
@@ -376,8 +367,8 @@ def along_route(
         # The agent's own place is where it has come to, which on a route that passes itself is not the nearest one.
         nearest = (own_part[..., None, :] - 2.0 * here[..., 1:, :] @ line).argmin(-1)
         nearest = torch.cat([routes.own[..., None], nearest], -1)
-        start = nearest.minimum((count[..., None] - 2).clamp_min(0))
-        following = (start + 1).clamp_max(last)
+        start = nearest.minimum((count - 2).clamp_min(0))
+        following = (start + 1).clamp_max(routes.points.shape[2] - 1)
     first_x, first_y = points_x.gather(2, start), points_y.gather(2, start)
     along_x, along_y = points_x.gather(2, following) - first_x, points_y.gather(2, following) - first_y
     length = (along_x.square() + along_y.square()).sqrt().clamp_min(1e-3)
@@ -386,43 +377,32 @@ def along_route(
     along = SPACING * start + (away_x * along_x + away_y * along_y)
     left = along_x * away_y - along_y * away_x
     speed = speed_x * along_x + speed_y * along_y
-    end = SPACING * (count[..., None] - 1)
-    known = (along > -SPACING) & (along < end + SPACING) & (left.abs() < BESIDE) & (count[..., None] > 1)
+    end = SPACING * (count - 1)
+    known = (along > -SPACING) & (along < end + SPACING) & (left.abs() < BESIDE) & (count > 1)
     known = known[..., 1:] & known[..., :1]
-    ahead = along[..., 1:] - along[..., :1]
+    ahead, left, faster = along[..., 1:] - along[..., :1], left[..., 1:], speed[..., 1:] - speed[..., :1]
     half = 0.5 * (size[..., 0] + own_size[..., None, 0])
     gap = ahead - half * (ahead / half).clamp(-1.0, 1.0)
-    beside = left[..., 1:].abs() - 0.5 * (size[..., 1] + own_size[..., None, 1])
-    faster = speed[..., 1:] - speed[..., :1]
+    beside = left.abs() - 0.5 * (size[..., 1] + own_size[..., None, 1])
     brake = (-faster).clamp_min(0.0).square() / (2.0 * gap.clamp_min(0.5))
     in_front = (ahead > 0).to(own.dtype)
-    features = torch.stack(
-        [
-            torch.ones_like(gap),
-            (gap / 3.0).tanh(),
-            (gap / 12.0).tanh(),
-            (gap / 50.0).tanh(),
-            (left[..., 1:] / 1.5).tanh(),
-            (left[..., 1:] / 6.0).tanh(),
-            (beside / 0.5).tanh(),
-            (faster / 2.0).tanh(),
-            (faster / 8.0).tanh(),
-            brake / (brake + 2.0) * in_front,
-            in_front,
-        ],
-        -1,
-    )
-    return torch.where(known[..., None], features, 0.0)
+    scaled = [
+        (gap, 3.0),
+        (gap, 12.0),
+        (gap, 50.0),
+        (left, 1.5),
+        (left, 6.0),
+        (beside, 0.5),
+        (faster, 2.0),
+        (faster, 8.0),
+    ]
+    bounded = [(value / scale).tanh() for value, scale in scaled]
+    features = [torch.ones_like(gap), *bounded, brake / (brake + 2.0) * in_front, in_front]
+    return torch.where(known[..., None], torch.stack(features, -1), 0.0)
 
 
 def route_choices(
-    state: Float[Tensor, "M N 4"],
-    point: Float[Tensor, "Q 2"],
-    first: Int[Tensor, "M N G"],
-    count: Int[Tensor, "M N G"],
-    distance_scale: float,
-    *,
-    turns: bool = False,
+    state: Float[Tensor, "M N 4"], routes: FollowedRoutes, distance_scale: float, *, turns: bool = False
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
     """Every feasible route as features in the agent's frame, and which of them exist.
 
@@ -432,51 +412,38 @@ def route_choices(
 
     Args:
         state: x, y, heading, speed of the agents.
-        point: of many routes.
-        first: place of the first point of each agent's routes.
-        count: points of each; 0 for padding.
+        routes: [M, N, G] what each can choose from.
         distance_scale: metres that become 1.
         turns: whether to say more of a route.
     """
+    (point, first, count), mask = routes, routes.length > 1
     state = state[..., None, :].expand(*count.shape, state.shape[-1])
-    there = (count > 0).flatten().nonzero().squeeze(-1) if on_host(count) else None
-    if there is None:
-        line = _beginnings(point, first, count)
-        shape = _shape_of_routes(state, line, count.clamp_max(POINTS), distance_scale, turns=turns)
-        return shape, count > 1
+    if not on_host(count):
+        return _shape_of_routes(state, routes, distance_scale, turns), mask
     # Some agents have ten times as many routes as most.
-    lead = count.ndim - 1
-    chosen, begin, number = (part.flatten(0, lead)[there] for part in (state, first, count))
-    line = _beginnings(point, begin, number)
-    found = _shape_of_routes(chosen, line, number.clamp_max(POINTS), distance_scale, turns=turns)
+    there = (count > 0).flatten().nonzero().squeeze(-1)
+    some = FollowedRoutes(point, first.flatten()[there], count.flatten()[there])
+    found = _shape_of_routes(state.flatten(0, -2)[there], some, distance_scale, turns)
     features = found.new_zeros(count.numel(), found.shape[-1]).index_copy(0, there, found)
-    return features.unflatten(0, count.shape), count > 1
+    return features.unflatten(0, count.shape), mask
 
 
 def _shape_of_routes(
-    state: Float[Tensor, "*b 4"],
-    points: Float[Tensor, "*b K 2"],
-    count: Int[Tensor, "*b"],
-    distance_scale: float,
-    *,
-    turns: bool,
+    state: Float[Tensor, "*b 4"], routes: FollowedRoutes, distance_scale: float, turns: bool
 ) -> Float[Tensor, "*b F"]:
     """Features of routes, each in the frame of its agent."""
-    kept = points[..., ::STRIDE, :]
-    angle = -state[..., None, 2]
+    points, count = routes.points(POINTS), routes.length.clamp_max(POINTS)[..., None]
+    kept, angle = points[..., ::STRIDE, :], -state[..., None, 2]
     local = rotate(kept - state[..., None, :2], angle)
     following = points[..., 1::STRIDE, :] - kept
     direction = rotate(following / following.norm(dim=-1, keepdim=True).clamp_min(1e-3), angle)
-    order = torch.arange(0, points.shape[-2], STRIDE, device=points.device)
-    there = (order < count[..., None])[..., None].to(state.dtype)
+    place = torch.arange(POINTS, device=points.device)
+    there = (place[::STRIDE] < count)[..., None].to(state.dtype)
     seen = torch.cat([local / distance_scale, direction, torch.ones_like(there)], -1) * there
-    features = seen.flatten(-2)
-    if turns:
-        step = points[..., 1:, :] - points[..., :-1, :]
-        x, y = (step / step.norm(dim=-1, keepdim=True).clamp_min(1e-3)).unbind(-1)
-        exists = count[..., None]
-        turn = x[..., :-1] * y[..., 1:] - y[..., :-1] * x[..., 1:]
-        inner = torch.arange(2, points.shape[-2], device=points.device) < exists
-        begin = (local[..., 0, :] / 3.0).tanh()
-        features = torch.cat([features, begin * (exists > 0), torch.where(inner, turn, 0.0)], -1)
-    return features
+    if not turns:
+        return seen.flatten(-2)
+    step = points.diff(dim=-2)
+    x, y = (step / step.norm(dim=-1, keepdim=True).clamp_min(1e-3)).unbind(-1)
+    turn = x[..., :-1] * y[..., 1:] - y[..., :-1] * x[..., 1:]
+    begin = (local[..., 0, :] / 3.0).tanh() * (count > 0)
+    return torch.cat([seen.flatten(-2), begin, torch.where(place[2:] < count, turn, 0.0)], -1)

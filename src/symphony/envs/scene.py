@@ -21,7 +21,7 @@ from symphony.data.levels import Levels, agent_heights, levels_of
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.envs.edge import MapEdge, beyond
-from symphony.envs.routes import Routes, RouteTable, drivable, route_table
+from symphony.envs.routes import NO_ROUTES, Routes, drivable, packed, route_table
 from symphony.errors import DataError
 from symphony.geometry.polylines import segments_of
 from symphony.geometry.spans import spans
@@ -55,13 +55,10 @@ _MARKS = {
 
 
 class SceneSource(Protocol):
-    """Where an environment draws its scenes from, such as a store that is larger than memory.
-
-    Attributes:
-        interactive: N, interactive agents per scene.
-    """
+    """Where an environment draws its scenes from, such as a store that is larger than memory."""
 
     interactive: int
+    """N, interactive agents per scene."""
 
     @property
     def open_traffic(self) -> bool:
@@ -78,83 +75,56 @@ class SceneSource(Protocol):
 
 
 class SceneBatch(TensorClass):
-    """B run segments as padded tensors; a mask travels with every padded field.
+    """B run segments as padded tensors; a mask travels with every padded field. Fields are commented in the source.
 
-    Attributes:
-        log_state: [B, T, A, 5] x, y, heading, velocity x, velocity y (step-major, so that one step is one row).
-        log_valid: [B, T, A].
-        box_size: [B, A, 2] length, width.
-        agent_type: [B, A] int64.
-        persona: [B, A, 2] headway and speed of each agent among those of the log, from -1 to 1; 0 where not measured.
-        interactive: [B, N] int64 rows of A; 0 for padding.
-        interactive_valid: [B, N].
-        enter: [B, N] int64 step at which the log brings an interactive agent in; 0 for those there from the start.
-        background: [B, N] agents that a rule drives, which nobody evaluates.
-        exits: [B, X, 4] where agents leave the map, see :class:`symphony.envs.edge.MapEdge`; zeros for padding.
-            None, nor any hull, where the same agents are driven from the first step to the last.
-        hull: [B, H, 3] outline of the map, see :class:`symphony.envs.edge.MapEdge`.
-        last_step: [B] int64, the segment's last logged step.
-        point: [B, P, 2].
-        point_direction: [B, P, 2] unit vector along the line; for lights from the stop point to where their lane
-            leads.
-        point_type: [B, P] uint8, :class:`PointType`.
-        point_speed: [B, P] speed limit of the lane, m/s, 0 where unknown.
-        point_light: [B, P] int16 row of Q for lights, else -1.
-        point_valid: [B, P].
-        light: [B, T, Q] uint8, ``SignalState``.
-        edge_start: [B, E, 2] boundary segments, the drivable side on their left.
-        edge_end: [B, E, 2].
-        edge_previous: [B, E] int32 segment that ends where this one starts, -1 if none.
-        edge_following: [B, E] int32.
-        edge_valid: [B, E].
-        agent_height: [B, T, A, 2] height on the ground and level of logged agents, see :mod:`symphony.data.levels`;
-            empty, as are the next two, where no map has roads above each other.
-        point_height: [B, P, 2] those of points.
-        edge_height: [B, E, 2] those of the middle of boundary segments.
-        stream: [B] int64 hash of the segment id, the root of the scene's random numbers.
-        segment: [B] int64 number of the run segment among those that scenes are drawn from.
-        dt: [B] float64 seconds per step, the same in all scenes of a batch.
-        route_point: [B, R, 2] points of the feasible routes of the interactive agents, one route after the other;
-            R = 0 where not asked for.
-        route_first: [B, N, G] int64 place of the first point of each route.
-        route_count: [B, N, G] int64 points of each; 0 for padding.
-        route_logged: [B, N] int64 the route nearest to what the log shows, -1 for none.
+    Fields begin with the batch dimension, which their comments leave out. Routes are empty (R = 0) where not asked
+    for. Heights and levels, see :mod:`symphony.data.levels`, are empty where no map has roads above each other; exits
+    and hull, see :class:`symphony.envs.edge.MapEdge`, where the same agents are driven from the first step to the
+    last.
     """
 
-    log_state: Tensor
-    log_valid: Tensor
-    box_size: Tensor
-    agent_type: Tensor
-    persona: Tensor
-    interactive: Tensor
-    interactive_valid: Tensor
-    enter: Tensor
-    background: Tensor
-    exits: Tensor
-    hull: Tensor
-    last_step: Tensor
-    point: Tensor
-    point_direction: Tensor
-    point_type: Tensor
-    point_speed: Tensor
-    point_light: Tensor
-    point_valid: Tensor
-    light: Tensor
-    edge_start: Tensor
-    edge_end: Tensor
-    edge_previous: Tensor
-    edge_following: Tensor
-    edge_valid: Tensor
-    agent_height: Tensor
-    point_height: Tensor
-    edge_height: Tensor
-    stream: Tensor
-    segment: Tensor
-    dt: Tensor
-    route_point: Tensor
-    route_first: Tensor
-    route_count: Tensor
-    route_logged: Tensor
+    log_state: (
+        Tensor  # [T, A, 5] x, y, heading, velocity x, velocity y (step-major, so that one step is one row)
+    )
+    log_valid: Tensor  # [T, A]
+    box_size: Tensor  # [A, 2] length, width
+    agent_type: Tensor  # [A] int64
+    persona: (
+        Tensor  # [A, 2] headway and speed among the agents of the log, from -1 to 1; 0 where not measured
+    )
+    interactive: Tensor  # [N] int64 rows of A; 0 for padding
+    interactive_valid: Tensor  # [N]
+    enter: Tensor  # [N] int64 step at which the log brings an agent in; 0 for those there from the start
+    background: Tensor  # [N] agents that a rule drives, which nobody evaluates
+    exits: Tensor  # [X, 4] where agents leave the map; zeros for padding
+    hull: Tensor  # [H, 3] outline of the map
+    last_step: Tensor  # [] int64, the segment's last logged step
+    point: Tensor  # [P, 2]
+    point_direction: (
+        Tensor  # [P, 2] unit vector along the line; of a light from its stop point along its lane
+    )
+    point_type: Tensor  # [P] uint8, PointType
+    point_speed: Tensor  # [P] speed limit of the lane, m/s, 0 where unknown
+    point_light: Tensor  # [P] int16 row of Q for lights, else -1
+    point_valid: Tensor  # [P]
+    light: Tensor  # [T, Q] uint8, SignalState
+    edge_start: Tensor  # [E, 2] boundary segments, the drivable side on their left
+    edge_end: Tensor  # [E, 2]
+    edge_previous: Tensor  # [E] int32 segment that ends where this one starts, -1 if none
+    edge_following: Tensor  # [E] int32
+    edge_valid: Tensor  # [E]
+    agent_height: Tensor  # [T, A, 2] height on the ground and level
+    point_height: Tensor  # [P, 2]
+    edge_height: Tensor  # [E, 2] of the middle of boundary segments
+    stream: Tensor  # [] int64 hash of the segment id, the root of the scene's random numbers
+    segment: Tensor  # [] int64 number of the run segment among those that scenes are drawn from
+    dt: Tensor  # [] float64 seconds per step, the same in all scenes of a batch
+    route_point: (
+        Tensor  # [R, 2] points of the feasible routes of the interactive agents, one route after the other
+    )
+    route_first: Tensor  # [N, G] int64 place of the first point of each route
+    route_count: Tensor  # [N, G] int64 points of each; 0 for padding
+    route_logged: Tensor  # [N] int64 the route nearest to what the log shows, -1 for none
 
     @property
     def open_traffic(self) -> bool:
@@ -198,53 +168,43 @@ def scene(
         DataError: if the segment has fewer usable agents.
     """
     if isinstance(interactive, int):
-        chosen = interactive_agents(segment, interactive)
-    else:
-        chosen = np.asarray(interactive, dtype=np.int64)
-        if edge is None and not segment.valid[chosen, 0].all():
-            raise DataError(
-                "an interactive agent is not valid at the first step",
-                segment=segment.segment_id,
-                field="interactive",
-            )
-    enter = np.zeros(len(chosen), np.int64) if edge is None else _first_inside(segment, chosen, edge)
-    reach = drivable(segment) if graph else 0.0
-    tables = [
-        route_table(segment, graph, int(a), int(at), reach=reach)
-        for a, at in zip(chosen, enter, strict=True)
-        if graph
-    ]
-    log = np.concatenate(
-        [segment.position[..., :2], segment.heading[..., None], segment.velocity], axis=-1
-    ).swapaxes(0, 1)
+        interactive = interactive_agents(segment, interactive).tolist()
+    chosen = np.asarray(interactive, np.int64)
+    there = segment.valid[chosen] if edge else segment.valid[chosen, :1]
+    if edge:
+        there = there & ~beyond(segment.position[chosen, :, :2], edge)
+    if not there.any(1).all():
+        where = "never within the map" if edge else "not valid at the first step"
+        raise DataError(f"an interactive agent is {where}", segment=segment.segment_id, field="interactive")
+    enter = there.argmax(1)
+    tables = [NO_ROUTES] * len(chosen)
+    if graph is not None:
+        pairs, reach = zip(chosen.tolist(), enter.tolist(), strict=True), drivable(segment)
+        tables = [route_table(segment, graph, agent, at, reach=reach) for agent, at in pairs]
+    moving = segment.position[..., :2], segment.heading[..., None], segment.velocity
     levels = levels_of(segment)
-    start, end, previous, following, middle = _edges(segment.road.boundary, levels)
-    fields: dict[str, NDArray[Any]] = {
-        "log_state": log,
+    fields: dict[str, Any] = {
+        "log_state": np.concatenate(moving, axis=-1).swapaxes(0, 1),
         "log_valid": segment.valid.T,
         "box_size": segment.size[:, :2],
         "agent_type": segment.agent_type.astype(np.int64),
         "persona": np.zeros((segment.num_agents, 2), np.float32) if persona is None else persona,
-        "interactive": chosen.astype(np.int64),
+        "interactive": chosen,
         "interactive_valid": np.ones(len(chosen), bool),
         "enter": enter,
         "background": np.zeros(len(chosen), bool) if background is None else np.asarray(background, bool),
         "exits": np.zeros((0, 4), np.float32) if edge is None else edge.exits,
         "hull": np.zeros((0, 3), np.float32) if edge is None else edge.hull,
-        "last_step": np.array(segment.num_steps - 1),
+        "last_step": segment.num_steps - 1,
         "light": segment.signal_state.T.astype(np.uint8),
-        "edge_start": start,
-        "edge_end": end,
-        "edge_previous": previous.astype(np.int32),
-        "edge_following": following.astype(np.int32),
-        "edge_valid": np.ones(len(start), bool),
         "agent_height": agent_heights(segment, levels),
-        "edge_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(middle),
-        "stream": np.array(stream_of(segment.segment_id)),
-        "segment": np.array(number),
-        "dt": np.array(segment.dt, np.float64),
+        "stream": stream_of(segment.segment_id),
+        "segment": number,
+        "dt": np.float64(segment.dt),
+        **_edges(segment.road.boundary, levels),
         **_points(segment, levels),
-        **_routes(tables, len(chosen)),
+        **dict(zip(("route_point", "route_first", "route_count"), packed(tables), strict=True)),
+        "route_logged": np.array([table.logged for table in tables], np.int64),
     }
     return SceneBatch(
         **{name: torch.from_numpy(np.array(value))[None] for name, value in fields.items()}, batch_size=[1]
@@ -288,69 +248,34 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
 
 
 _INDEX_FIELDS = {"point_light", "edge_previous", "edge_following"}
-_AGENT_FIELDS = {
-    "interactive",
-    "interactive_valid",
-    "enter",
-    "background",
-    "route_first",
-    "route_count",
-    "route_logged",
-}
+_ROUTES = {"route_first", "route_count", "route_logged"}
+_AGENT_FIELDS = {"interactive", "interactive_valid", "enter", "background", *_ROUTES}
 
 
-def _routes(tables: Sequence[RouteTable], agents: int) -> dict[str, NDArray[Any]]:
-    most = max((len(table.count) for table in tables), default=0)
-    first, count = np.zeros((2, agents, most), np.int64)
-    points, begin = [np.zeros((0, 2), np.float32)], 0
-    for k, table in enumerate(tables):
-        count[k, : len(table.count)] = table.count
-        first[k, : len(table.count)] = begin + np.cumsum(table.count) - table.count
-        points.append(table.points)
-        begin += len(table.points)
-    logged = np.array([table.logged for table in tables] or [-1] * agents, np.int64)
-    return {
-        "route_point": np.concatenate(points),
-        "route_first": first,
-        "route_count": count,
-        "route_logged": logged,
-    }
-
-
-def _first_inside(segment: RunSegment, chosen: NDArray[np.int64], edge: MapEdge) -> NDArray[np.int64]:
-    """The first step at which the log has agents within the map.
-
-    Raises:
-        DataError: there is none.
-    """
-    there = segment.valid[chosen] & ~beyond(segment.position[chosen, :, :2], edge)
-    if not there.any(1).all():
-        raise DataError(
-            "an interactive agent is never within the map", segment=segment.segment_id, field="interactive"
-        )
-    return there.argmax(1)
-
-
-def _edges(boundary: Polylines, levels: Levels) -> tuple[NDArray[Any], ...]:
-    """Segments as :func:`segments_of` has them, and the middle [E, 3] of each where there are levels."""
+def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
+    """The simplified boundary as segments, with the heights of their middles where there are levels."""
     numbers = boundary.points[:, : 2 if levels.flat else 3].astype(np.float64)
     lines = shapely.simplify(shapely.linestrings(numbers, indices=boundary.line_index), BOUNDARY_TOLERANCE)
     found, line = shapely.get_coordinates(lines, include_z=not levels.flat, return_index=True)
     points = found.astype(np.float32)
-    edges = segments_of(points, np.searchsorted(line, np.arange(len(boundary) + 1)))
+    start, end, previous, following = segments_of(points, np.searchsorted(line, np.arange(len(boundary) + 1)))
     # Of two points of a line that differ one after the other.
     pair = np.flatnonzero((line[1:] == line[:-1]) & (points[1:, :2] != points[:-1, :2]).any(-1))
-    return *edges, (points[pair] + points[pair + 1]) / 2
+    middle = (points[pair] + points[pair + 1]) / 2
+    return {
+        "edge_start": start,
+        "edge_end": end,
+        "edge_previous": previous.astype(np.int32),
+        "edge_following": following.astype(np.int32),
+        "edge_valid": np.ones(len(start), bool),
+        "edge_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(middle),
+    }
 
 
 def _no_heights(part: dict[str, Tensor]) -> dict[str, Tensor]:
     """Heights of a scene without levels, beside others that have some."""
-    sizes = {
-        "agent": part["log_valid"].shape,
-        "point": part["point_valid"].shape,
-        "edge": part["edge_valid"].shape,
-    }
-    return {f"{name}_height": torch.zeros(*shape, 2) for name, shape in sizes.items()}
+    sizes = {"agent": "log_valid", "point": "point_valid", "edge": "edge_valid"}
+    return {f"{name}_height": torch.zeros(*part[like].shape, 2) for name, like in sizes.items()}
 
 
 def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
@@ -363,29 +288,23 @@ def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
         (road.boundary, np.full(len(road.boundary), PointType.BOUNDARY), np.zeros(len(road.boundary))),
         (road.marks, marks, np.zeros(len(road.marks))),
     ]
-    point, direction, kind, speed = [], [], [], []
+    lights = len(segment.signal_lane)
+    ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32)
+    ahead = _unit(ends.reshape(-1, 2) - segment.signal_point[:, :2])
+    parts = []
     for lines, types, limits in groups:
         where, along, line = resample_lines(lines, SPACING)
-        point.append(where)
-        direction.append(along)
-        kind.append(types[line])
-        speed.append(limits[line])
-    lights = len(segment.signal_lane)
-    ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32).reshape(
-        -1, 2
-    )
-    point.append(segment.signal_point)
-    direction.append(_unit(ends - segment.signal_point[:, :2]))
-    kind.append(np.full(lights, PointType.LIGHT))
-    speed.append(np.zeros(lights))
-    light = np.concatenate([np.full(sum(map(len, point[:-1])), -1), np.arange(lights)])
-    place = np.concatenate(point).astype(np.float32)
+        parts.append((where, along, types[line], limits[line], np.full(len(line), -1)))
+    number = np.arange(lights)
+    parts.append((segment.signal_point, ahead, np.full(lights, PointType.LIGHT), np.zeros(lights), number))
+    point, direction, kind, speed, light = map(np.concatenate, zip(*parts, strict=True))
+    place = point.astype(np.float32)
     return {
         "point": place[:, :2],
         "point_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(place),
-        "point_direction": np.concatenate(direction).astype(np.float32),
-        "point_type": np.concatenate(kind).astype(np.uint8),
-        "point_speed": np.concatenate(speed).astype(np.float32),
+        "point_direction": direction.astype(np.float32),
+        "point_type": kind.astype(np.uint8),
+        "point_speed": speed.astype(np.float32),
         "point_light": light.astype(np.int16),
         "point_valid": np.ones(len(light), bool),
     }
@@ -401,28 +320,25 @@ def resample_lines(
     owner = lines.line_index
     if len(xy) == 0:
         return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
-    step = np.zeros(len(xy))
-    inside = owner[1:] == owner[:-1]
-    step[1:][inside] = np.linalg.norm(np.diff(xy[:, :2], axis=0), axis=-1)[inside]
     # One running arc length over all lines, a metre apart, lets one interpolation serve all.
-    step[1:][~inside] = 1.0
-    arc = np.cumsum(step)
+    inside, steps = owner[1:] == owner[:-1], np.linalg.norm(np.diff(xy[:, :2], axis=0), axis=-1)
+    arc = np.append(0.0, np.where(inside, steps, 1.0)).cumsum()
     first, last = arc[lines.offsets[:-1]], arc[lines.offsets[1:] - 1]
     length = last - first
     # A length within a thousandth of a multiple counts as that multiple, so that rounding adds no point.
     pieces = np.maximum(np.ceil(length / spacing - 1e-3).astype(np.int64), 1)
     count = np.where(length > 0, pieces + 1, 1)
     line = np.repeat(np.arange(len(lines)), count)
-    rank = spans(0, count)
-    share = rank / np.maximum(count[line] - 1, 1)
-    at = first[line] + share * length[line]
-    point = np.stack([np.interp(at, arc, xy[:, axis]) for axis in (0, 1, 2)], -1)
+    share = spans(0, count) / np.maximum(count[line] - 1, 1)
+    place = first[line] + share * length[line]
     half = np.minimum(0.5 * spacing, 0.5 * length[line])
-    ahead, behind = np.minimum(at + half, last[line]), np.maximum(at - half, first[line])
-    chord = np.stack(
-        [np.interp(ahead, arc, xy[:, axis]) - np.interp(behind, arc, xy[:, axis]) for axis in (0, 1)], -1
-    )
-    return point.astype(np.float32), _unit(chord).astype(np.float32), line
+    ends = np.minimum(place + half, last[line]), np.maximum(place - half, first[line])
+
+    def at(where: NDArray[np.float64], axes: int) -> NDArray[np.float64]:
+        return np.stack([np.interp(where, arc, xy[:, axis]) for axis in range(axes)], -1)
+
+    chord = at(ends[0], 2) - at(ends[1], 2)
+    return at(place, 3).astype(np.float32), _unit(chord).astype(np.float32), line
 
 
 def _unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -63,12 +63,12 @@ class Tables:
     @cached_property
     def light_points(self) -> tuple[Tensor, Tensor]:
         """Positions [B, Q, 2] of the points that are lights, infinity where a scene has fewer, and their numbers
-        [B, Q] among all points.
+        [B, Q] among all points; Q is at least 1.
         """
         scenes = self.scenes
         is_light = (scenes.point_light >= 0) & scenes.point_valid
-        most = scenes.light.shape[2]  # a light is one point
-        # Lights first, each kind in the order of the scene.
+        # A light is one point; lights come first, each kind in the order of the scene.
+        most = max(1, scenes.light.shape[2])
         order = is_light.to(torch.int8).argsort(stable=True, dim=1, descending=True)[:, :most]
         position = scenes.point.gather(1, order[..., None].expand(*order.shape, 2))
         position = position.masked_fill(~is_light.gather(1, order)[..., None], torch.inf)
@@ -78,8 +78,7 @@ class Tables:
     @cached_property
     def position(self) -> tuple[Tensor, Tensor]:
         """x and y [B, P] of the points; infinity where there is none."""
-        nowhere = ~self.scenes.point_valid
-        x, y = self.scenes.point.masked_fill(nowhere[..., None], torch.inf).unbind(-1)
+        x, y = self.scenes.point.masked_fill(~self.scenes.point_valid[..., None], torch.inf).unbind(-1)
         return x.contiguous(), y.contiguous()
 
     @cached_property
@@ -95,8 +94,8 @@ class Tables:
     def edges(self) -> dict[str, Shaped[Tensor, "1 BE ..."]]:
         """The boundary as one scene of B * E segments: start, end, valid, previous, following."""
         scenes = self.scenes
-        scene_count, per_scene = scenes.edge_valid.shape
-        base = torch.arange(scene_count, device=scenes.edge_valid.device)[:, None] * per_scene
+        count, each = scenes.edge_valid.shape
+        base = each * torch.arange(count, device=scenes.edge_valid.device)[:, None]
 
         def flat(index: Int[Tensor, "B E"]) -> Int[Tensor, "1 BE"]:
             return torch.where(index >= 0, index + base, -1).flatten()[None]

@@ -19,7 +19,7 @@ from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle
 from symphony.envs.scene import scene
 from symphony.errors import DataError
-from symphony.geometry.frames import forward_speed
+from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph, visited_regions
 from symphony.roadgraph.lines import turn_between
 from symphony.rollouts.driving import playback
@@ -164,11 +164,11 @@ def _add_fits(sums: _Sums, chosen: list[tuple[RunSegment, NDArray[np.int64]]], d
             torch.from_numpy(np.concatenate([getattr(segment, name)[rows] for segment, rows in group]))
             for name in ("position", "heading", "velocity", "valid", "size")
         )
-        position, speed = position[..., :2], forward_speed(velocity, heading)
-        _, states = dynamics.fit(position, heading, speed, valid, size[:, :2], dt)
+        log = with_speed(torch.cat([position[..., :2], heading[..., None], velocity], -1))
+        _, states = dynamics.fit(log, valid, size[:, :2], dt)
         last = steps - 1 - valid.flip(1).int().argmax(1)
         which = torch.arange(len(last))
-        away = states[which, last, :2] - position[which, last]
+        away = states[which, last, :2] - log[which, last, :2]
         sums["fit_error"].append(away.norm(dim=-1).double().numpy())
 
 

@@ -23,6 +23,15 @@ def on_host(tensor: Tensor) -> bool:
     return torch._C._functorch.peek_interpreter_stack() is None
 
 
+def places(flags: Bool[Tensor, "M N"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """Row and column of what is set; on a device, which would wait to tell, of everything."""
+    if on_host(flags):
+        row, column = flags.nonzero(as_tuple=True)
+        return row, column
+    row, column = (torch.arange(size, device=flags.device) for size in flags.shape)
+    return row.repeat_interleave(len(column)), column.repeat(len(row))
+
+
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     """Places, in the flattened array, of the ``count`` smallest elements of each row [R, W], ascending.
 

@@ -23,7 +23,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
-from symphony.envs.routes import RouteWindow, route_choices
+from symphony.envs.routes import FollowedRoutes, RouteWindow, packed, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError, DataWarning
 from symphony.geometry.frames import with_speed
@@ -344,15 +344,10 @@ class SceneDataset:
         chosen = [found[k] for k in pick]
         when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
         tables = [e.routes[k] for _, e, k in chosen]
-        most = max(1, *(len(table.count) for table in tables))
-        firsts, counts = np.zeros((2, count, most), np.int64)
-        right, begin = np.zeros((count, most), np.bool_), 0
+        points, first, length = (torch.from_numpy(part).to(device) for part in packed(tables, 1))
+        right = np.zeros(length.shape, np.bool_)
         for row, table in enumerate(tables):
-            counts[row, : len(table.count)] = table.count
-            firsts[row, : len(table.count)] = begin + np.cumsum(table.count) - table.count
-            right[row, : len(table.count)] = table.right
-            begin += len(table.points)
-        points = np.concatenate([table.points for table in tables])
+            right[row, : len(table.right)] = table.right
         state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
             device
         )
@@ -366,9 +361,7 @@ class SceneDataset:
         )
         features, mask = route_choices(
             state[:, None],
-            torch.from_numpy(points).to(device),
-            torch.from_numpy(firsts)[:, None].to(device),
-            torch.from_numpy(counts)[:, None].to(device),
+            FollowedRoutes(points, first[:, None], length[:, None]),
             observation.distance_scale,
             turns=observation.turns,
         )

@@ -25,7 +25,7 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.routes import RouteTable, drivable, logged_progress, route_table
 from symphony.errors import DataError
 from symphony.files import replacing
-from symphony.geometry.frames import forward_speed
+from symphony.geometry.frames import with_speed
 from symphony.roadgraph import LaneGraph, lane_of
 
 IN_LANE = 1.0
@@ -162,14 +162,8 @@ def _fit_together(
     position, heading, velocity, valid = map(joined, ("position", "heading", "velocity", "valid"))
     size = torch.from_numpy(np.concatenate([segments[k].size[rows[k], :2] for k in group]))
     # An agent that appears later is fitted from its first valid state; its rows before that are masked.
-    actions, states = dynamics.fit(
-        position[..., :2],
-        heading,
-        forward_speed(velocity[..., :2], heading),
-        valid,
-        size,
-        segments[group[0]].dt,
-    )
+    log = with_speed(torch.cat([position[..., :2], heading[..., None], velocity[..., :2]], -1))
+    actions, states = dynamics.fit(log, valid, size, segments[group[0]].dt)
     actions = actions.to(torch.int16) if dynamics.discrete else actions
     counts, found = [len(rows[k]) for k in group], {}
     for k, action, state in zip(group, actions.split(counts), states.split(counts), strict=True):

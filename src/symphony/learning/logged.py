@@ -66,9 +66,8 @@ def expert_batch(
     batch.set(keys.STATE, here)
     if observation.persona:
         batch.set(keys.PERSONA, scenes.persona[scene_of, agent][:, None])
-    for name, value in seen._asdict().items():
-        if value is not None:
-            batch.set(("agents", "observation", name), value)
+    for name, value in seen.items():
+        batch.set(("agents", "observation", name), value)
     if action is not None:
         batch.set(keys.ACTION, action[:, None])
     return batch
