@@ -34,7 +34,7 @@ from symphony.agents.choice import choose, split_name
 from symphony.agents.included import CARD, CARD_FORMAT, FOLDER, PREFIX, read_card, run_folder
 from symphony.cli.shared import COLUMNS
 from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, to_json
-from symphony.data.plans import PRESETS
+from symphony.data.generate import PRESETS
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation.records import FOLDER as EVALUATIONS

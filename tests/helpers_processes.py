@@ -33,14 +33,14 @@ def serve_from_here() -> None:
         listener.listen()
         alive, ended_with_us = os.pipe()
         warnings.simplefilter("ignore", DeprecationWarning)  # a thread of xdist's stays behind
-        with engine._no_interrupts():  # as in the product
+        with engine._starting():  # as in the product
             pid = os.fork()
         if pid == 0:
             try:
                 os.close(ended_with_us)
                 if "torch" in sys.modules:  # not imported here: what shall hold for it is not yet set
                     sys.modules["torch"].set_num_threads(1)
-                engine._mask(signal.SIG_BLOCK)
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
                 forkserver.main(os.dup(listener.fileno()), alive, [])
             finally:
                 os._exit(0)
@@ -97,7 +97,9 @@ def _run(function: Callable[..., Any], given: tuple[Any, ...], said: Path | None
         for stream, name in enumerate((str(said), f"{said}.err"), 1):
             os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), stream)
     status = 1
-    engine._mask(signal.SIG_UNBLOCK)  # the server was started while interrupts were put off
+    signal.pthread_sigmask(
+        signal.SIG_UNBLOCK, {signal.SIGINT}
+    )  # the server was started while interrupts were put off
     try:
         status = int(function(*given) or 0)
     except BaseException:

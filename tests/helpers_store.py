@@ -10,10 +10,11 @@ from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 
 
-def fill(path: Path, found: list[RunSegment], *, append: bool = False) -> None:
+def fill(path: Path, found: list[RunSegment], *, append: bool = False) -> SegmentStore:
     with StoreWriter(path, append=append) as writer:
         for segment in found:
             writer.append(segment)
+    return SegmentStore(path)
 
 
 def hashes(found: SegmentStore | list[RunSegment]) -> list[str]:

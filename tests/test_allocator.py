@@ -32,24 +32,18 @@ print(int(set_), resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
-def outcome(**more: str) -> tuple[bool, int]:
+def outcome(program: str, *words: str, **more: str) -> list[int]:
+    """The numbers that a program prints."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "SYMPHONY_MALLOPT"))}
-    done = subprocess.run(
-        [sys.executable, "-c", FAULTS],
-        env={**environment, **more},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    tuned, faults = done.stdout.split()
-    return tuned == "1", int(faults)
+    command = [sys.executable, "-c", program, *words]
+    return [int(n) for n in subprocess.check_output(command, env={**environment, **more}, text=True).split()]
 
 
 @pytest.mark.skipif(not GLIBC, reason="not glibc")
 def test_memory_is_kept_once_it_is_set() -> None:
-    tuned, kept = outcome()
-    untuned, returned = outcome(SYMPHONY_MALLOPT="0")
-    assert (tuned, untuned) == (True, False)
+    tuned, kept = outcome(FAULTS)
+    untuned, returned = outcome(FAULTS, SYMPHONY_MALLOPT="0")
+    assert (tuned, untuned) == (1, 0)
     # 5 x 64 MiB are 81 920 pages of 4 KiB; pages of the kernel's choice may be larger.
     assert kept < 100
     assert returned > 100
@@ -71,11 +65,7 @@ print(*re.findall(r"VmRSS:\\s+(\\d+)", open("/proc/self/status").read()))
 
 @pytest.mark.skipif(not GLIBC, reason="not glibc")
 def test_memory_that_is_free_between_what_stays_is_given_back() -> None:
-    given = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "SYMPHONY_MALLOPT"))}
-    kept, released = (
-        int(subprocess.check_output([sys.executable, "-c", BESIDE, how], env=given, text=True))
-        for how in ("keep", "release")
-    )
+    (kept,), (released,) = outcome(BESIDE, "keep"), outcome(BESIDE, "release")
     # 256 MiB were freed.
     assert released < kept - (200 << 10)
 

@@ -30,7 +30,7 @@ from symphony.data.sources.tfrecord import write_records
 from symphony.errors import DataError
 
 IN_FOLDER = settings(
-    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 GOOD = commonroad(ROAD, driver(7), driver(8, x=20))
@@ -90,8 +90,8 @@ def test_womd_cut_anywhere(data: st.DataObject, shard: bytes, tmp_path: Path) ->
     path.write_bytes(shard[:size])
     items = read_all("womd", path)
     good = [item for item in items if isinstance(item, RunSegment)]
-    assert [g.segment_id for g in good] == [
-        w.segment_id for w in whole[: len(good)] if isinstance(w, RunSegment)
+    assert [hashes([each.replace(file="")]) for each in good] == [
+        hashes([each.replace(file="")]) for each in whole[: len(good)] if isinstance(each, RunSegment)
     ]
     bad = items[len(good) :]
     assert len(bad) == 1 or (not bad and size in ends(shard))
@@ -145,7 +145,7 @@ def test_womd_one_bad_record_among_good_ones(tmp_path: Path) -> None:
 # CommonRoad
 
 
-@pytest.mark.parametrize("share", [0.01, 0.3, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
 def test_commonroad_cut(share: float, tmp_path: Path) -> None:
     path = tmp_path / "a.xml"
     path.write_text(GOOD[: int(len(GOOD) * share)])
@@ -162,12 +162,7 @@ def laughs() -> str:
 
 @pytest.mark.parametrize(
     "attack",
-    [
-        laughs(),
-        '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>',
-        '<!DOCTYPE a SYSTEM "http://localhost/a.dtd">',
-        "<!DOCTYPE commonRoad>",
-    ],
+    [laughs(), '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>', "<!DOCTYPE commonRoad>"],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_commonroad_document_types_are_refused(attack: str, encoding: str, tmp_path: Path) -> None:
@@ -189,14 +184,8 @@ NO_DRIVERS = commonroad(ROAD, obstacle(7, [state(0, 0, 0)], role="static"))
         (LANELESS, "lanelet", "has no lanes"),
         (NO_DRIVERS, "dynamicObstacle", "has no dynamic obstacles"),
         (commonroad(ROAD, driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
-        (commonroad(ROAD, driver(7, steps=range(1))), "dynamicObstacle", "no moving vehicle"),
-        (
-            GOOD.replace("2020a", "2017a"),
-            "commonRoadVersion",
-            "2018b, 2020a",
-        ),
+        (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b, 2020a"),
         (GOOD.replace('timeStepSize="0.1"', ""), "timeStepSize", "not a number"),
-        (GOOD.replace('timeStepSize="0.1"', 'timeStepSize="-0.1"'), "timeStepSize", "positive"),
         (GOOD.replace('timeStepSize="0.1"', 'timeStepSize="nan"'), "timeStepSize", "not finite"),
         (GOOD.replace("<exact>3</exact>", "<exact>90000</exact>", 1), "time", "at most"),
         (GOOD.replace("<length>4.5", "<length>0", 1), "size", "must be positive"),
@@ -222,20 +211,12 @@ def test_commonroad_errors_name_segment_and_field(
     [
         ("<exact>3</exact>", "<exact>2</exact>", NO_OBSTACLE, "obstacle 7: time: two states at step 2"),
         ("<x>1.0</x>", "<x>NaN</x>", NO_OBSTACLE, "obstacle 7: position: nan is not finite"),
-        ("<x>1.0</x>", "", NO_OBSTACLE, "obstacle 7: position: '' is not a number"),
         ("<velocity><exact>10.0", "<velocity><exact>fast", NO_OBSTACLE, "obstacle 7: velocity: 'fast'"),
-        (
-            "<orientation><exact>0.0</exact></orientation>",
-            "",
-            NO_OBSTACLE,
-            "obstacle 7: orientation: missing",
-        ),
         (RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: no rectangle"),
         ('Obstacle id="7"', 'Obstacle id="99999999999999999999"', NO_OBSTACLE, "64 bits"),
         ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: leftBound: inf is not finite"),
         ('ref="11"', 'ref="next"', NO_LANELET, "lanelet 10: successor: 'next' is not an integer"),
         ("<color>red", "<color>pink", NO_LIGHT, "trafficLight 30: color: unknown color 'pink'"),
-        ("<duration>3", "<duration>0", NO_LIGHT, "trafficLight 30: cycle: needs elements"),
         ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),
     ],
 )

@@ -211,18 +211,6 @@ def test_convert_passes_its_options_on(logs: list[str], tmp_path: Path) -> None:
     assert (settings["rate"], settings["interactive"], settings["smooth"]) == (2.5, 3, 0.1)
 
 
-def test_convert_appends_only_when_told(
-    logs: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["data", "convert", "womd", "--out", str(tmp_path / "out")]
-    assert main([*command, logs[0]]) == 0
-    assert main([*command, logs[1]]) == 1
-    assert capsys.readouterr().err.splitlines()[-1].startswith("symphony: error: ")
-    assert main([*command, *logs, "--append"]) == 0
-    assert SegmentStore(tmp_path / "out").ids == ["one", "two"]
-    assert "there already" in capsys.readouterr().out
-
-
 def test_convert_fails_when_nothing_could_be_used(
     logs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -82,11 +82,7 @@ CASES: dict[str, tuple[Context, Paths]] = {
     ),
     "leads around a corner": (
         Context.LEADER,
-        [
-            (TURN_LEFT_OFF_NORTH, north(-45)),
-            (TURN_LEFT_OFF_NORTH, north(-25)),
-            (BESIDE, north(-43)),
-        ],
+        [(TURN_LEFT_OFF_NORTH, north(-45)), (TURN_LEFT_OFF_NORTH, north(-25)), (BESIDE, north(-43))],
     ),
     "leads in a queue": (
         Context.LEADER,
@@ -104,10 +100,7 @@ CASES: dict[str, tuple[Context, Paths]] = {
     "next lane": (Context.NEAREST, [(NORTH, north(-40)), (BESIDE, north(-30)), (NORTH, north(40))]),
     "head on": (Context.NEAREST, [(NORTH, north(-40)), (NORTH[::-1], 200 + 8 * TIME)]),
     "oncoming": (Context.NEAREST, [(NORTH, north(-40)), (ONCOMING, 200 + 8 * TIME)]),
-    "crosses long before": (
-        Context.NEAREST,
-        [(NORTH, north(-60)), (EAST, 200 - 8 + 8 * TIME)],
-    ),
+    "crosses long before": (Context.NEAREST, [(NORTH, north(-60)), (EAST, 200 - 8 + 8 * TIME)]),
     "far ahead": (Context.NEAREST, [(NORTH, north(-60, 8)), (NORTH, north(-20, 8))]),
 }
 
@@ -120,7 +113,7 @@ def test_the_context_is_what_happens(case: str) -> None:
     assert choice.agents.tolist() == [0, 1]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.sampled_from(sorted(CASES)),
     st.floats(-np.pi, np.pi),
@@ -146,7 +139,7 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
     assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.floats(3, 25),
     st.floats(3, 25),
@@ -167,13 +160,8 @@ def test_crossing_is_a_matter_of_time(
     heading = np.pi / 2 + (-angle if right else angle)
     way = np.asarray([np.cos(heading), np.sin(heading)])
     path = np.stack([-400 * way, 400 * way])
-    long_north = NORTH * 2
-    segment = scene(
-        [
-            (long_north, 400 + speed * (TIME - arrival)),
-            (path, 400 + other_speed * (TIME - other_arrival)),
-        ]
-    )
+    paths = [(2 * NORTH, 400 + speed * (TIME - arrival)), (path, 400 + other_speed * (TIME - other_arrival))]
+    segment = scene(paths)
     expected = Context.CROSSING if abs(gap) <= CONFLICT_GAP else Context.NEAREST
     assert interactive_choice(segment, 2).context == expected
     found = relations(segment, np.asarray([1])).crossing[0]
@@ -221,22 +209,15 @@ def test_choices_are_counted_and_named() -> None:
         assert found["segments"][name] == {"context": context, "agents": [7, 8]}
 
 
-@pytest.mark.parametrize("tile", [1, 60, 5 * STEPS, 3 * STEPS**2])
+@pytest.mark.parametrize("tile", [60, 5 * STEPS])
 def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    cars = scene(
-        [
-            (NORTH, 30 * TIME + 50),
-            (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60),
-            (EAST, 15 * TIME + 120),
-            (NORTH, 80),
-        ]
-    )
+    turns, crosses = (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60), (EAST, 15 * TIME + 120)
+    cars = scene([(NORTH, 30 * TIME + 50), turns, crosses, (NORTH, 80)])
     segments = [cars, crossing(6, steps=60, seed=3), straight_road(9, steps=40)]
     whole = [relations(each, np.arange(1, each.num_agents)) for each in segments]
     monkeypatch.setattr(contexts, "TILE", tile)
     for segment, expected in zip(segments, whole, strict=True):
         found = relations(segment, np.arange(1, segment.num_agents))
-        for name in ("merge", "crossing", "leader", "follower"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        np.testing.assert_array_equal(found, expected)
     assert any(np.isfinite(each.merge).any() for each in whole)
     assert any(np.isfinite(each.crossing).any() for each in whole)

@@ -77,5 +77,5 @@ def test_a_conversion_crops(tmp_path: Path) -> None:
     # The ego drives 24 m along the first lane: the last one, from 60 m on, is gone.
     assert (len(whole.road.lanes), len(near.road.lanes)) == (4, 2)
     assert (near.num_agents, whole.num_agents) == (4, 5)
-    with pytest.raises(ConfigError, match="radius must be positive"):
+    with pytest.raises(ConfigError, match="radius must be between"):
         convert("scenarionet", [file], tmp_path / "no", radius=0)

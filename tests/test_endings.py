@@ -9,14 +9,15 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from helpers_convert import FakeReader
 from helpers_segments import straight_road
 from helpers_sources import ROAD, commonroad, driver
-from helpers_store import fill
 from symphony.cli import main
+from symphony.data import store_writer
 from symphony.data.convert import convert
 from symphony.data.sources.base import Item
 from symphony.data.sources.sumo import process
@@ -24,8 +25,6 @@ from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import DataError
 from symphony.files import replacing, write_file, write_json
-
-FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_control_characters_do_not_reach_the_terminal(
@@ -55,47 +54,40 @@ def test_reports_show_no_control_characters(tmp_path: Path, capsys: pytest.Captu
 
 def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*arguments: object) -> None:
-        raise FULL
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with StoreWriter(tmp_path / "store") as writer:
         writer.append(straight_road(seed=1))
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full)
-            with pytest.raises(OSError, match="No space left") as caught:
-                writer.write_report({})
-            assert str(caught.value.filename).startswith(str(tmp_path / "store"))
-            FULL.filename = None
-            for write in (
-                lambda: write_file(tmp_path / "a.json", "{}"),
-                lambda: write_json(tmp_path / "a.json", {}),
+            for path, write in (
+                (tmp_path / "store" / "report.json", lambda: writer.write_report({})),
+                (tmp_path / "a.json", lambda: write_json(tmp_path / "a.json", {})),
             ):
-                with pytest.raises(DataError, match="No space left") as error:
+                with pytest.raises(DataError, match="can't be written: No space left") as error:
                     write()
-                assert error.value.file == tmp_path / "a.json"
+                assert error.value.file == path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["store"]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_column_on_a_full_disk_is_named(tmp_path: Path) -> None:
-    fill(tmp_path / "store", [straight_road(seed=1)])
-    with StoreWriter(tmp_path / "store", append=True) as writer:
-        name = str(tmp_path / "store" / "columns" / "position.bin")
-        full = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115 - closed with the writer
+def test_a_conversion_ends_where_a_column_finds_the_disk_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And is not told as one more bad record."""
+    (tmp_path / "a.scene").write_text("straight 1\nstraight 2")
+    write = store_writer._write_at
 
-        class Full:
-            name = str(tmp_path / "store" / "columns" / "position.bin")
+    def full(file: Any, *rest: Any) -> None:
+        with Path("/dev/full").open("r+b", buffering=0) as other:
+            write(other if "position" in file.name else file, *rest)
 
-            def __getattr__(self, attribute: str) -> object:
-                return getattr(full, attribute)
-
-        kept = writer._segments._files["position"]
-        writer._segments._files["position"] = Full()  # type: ignore[assignment]
-        with pytest.raises(OSError, match="No space left") as caught:
-            writer.append(straight_road(seed=2))
-        assert caught.value.filename == name
-        writer._segments._files["position"] = kept
-        full.close()
-    assert SegmentStore(tmp_path / "store").ids == ["straight-1"]
+    monkeypatch.setattr(store_writer, "_write_at", full)
+    with pytest.raises(DataError, match="can't be written: No space left"):
+        convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "store")
+    monkeypatch.undo()
+    convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "store")
+    assert SegmentStore(tmp_path / "store").ids == ["straight-1", "straight-2"]
 
 
 def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
@@ -113,37 +112,18 @@ def test_a_worker_that_is_killed_is_told() -> None:
     assert not multiprocessing.active_children()
 
 
-PRELOADED = """
-import json, os, sys
-from symphony.parallel import ordered_map
-from preloaded import what
-names = ["symphony.data.store", "numpy", "symphony.no_such_module"]
-if __name__ == "__main__":  # else workers would import it, too
-    import symphony.data.store
-    print(json.dumps([os.getpid(), *ordered_map(what, [names] * 8, workers=2)]))
-"""
-TASK = """
-import os, sys
-IMPORTED_BY = os.getpid()
-def what(names):
-    return IMPORTED_BY, os.getpid(), [name in sys.modules for name in names]
-"""
+def imported(names: list[str]) -> tuple[int, int, list[bool]]:
+    return os.getppid(), os.getpid(), [name in sys.modules for name in names]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
-def test_workers_share_what_was_imported_for_them(tmp_path: Path) -> None:
-    # Also what the process had imported that they need nothing of: what evaluates needs seconds to import, and a
-    # conversion may have been the first.
-    (tmp_path / "preloaded.py").write_text(TASK)
-    (tmp_path / "script.py").write_text(PRELOADED)
-    path = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, tmp_path / "script.py"]
-    done = subprocess.run(command, env=path, capture_output=True, text=True, check=True)
-    this, *found = json.loads(done.stdout)
-    servers, workers = {importer for importer, _, _ in found}, {worker for _, worker, _ in found}
+def test_workers_share_what_was_imported_for_them() -> None:
+    names = ["symphony.data.store", "numpy", "symphony.no_such_module"]
+    found = list(ordered_map(imported, [names] * 8, workers=2))
+    servers, workers = {server for server, _, _ in found}, {worker for _, worker, _ in found}
     assert len(servers) == 1
-    assert not servers & {*workers, this}
-    assert all(imported == [True, True, False] for _, _, imported in found)
+    assert not servers & {*workers, os.getpid()}
+    assert all(there == [True, True, False] for _, _, there in found)
 
 
 def mark_unless_stopped(path: Path) -> Path:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import make_road, straight_road
-from symphony.data.convert import convert, info
+from symphony.data.convert import convert, info, merge
 from symphony.data.joins import REACH, SAME, TURN, joined
 from symphony.data.report import Report
 from symphony.data.segment import LaneType, RoadMap
@@ -144,5 +144,6 @@ def test_conversion_joins_and_counts_them(workers: int, tmp_path: Path) -> None:
     del old["joined_gaps"]
     assert Report.from_json(old).joined_gaps == 0
     (tmp_path / "c.cut").write_text("4")
-    convert(Cut(), [tmp_path / "c.cut"], tmp_path / "out", workers=workers, append=True)
-    assert info(tmp_path / "out")["joined_gaps"] == 4 * each
+    convert(Cut(), [tmp_path / "c.cut"], tmp_path / "more", workers=workers)
+    merge([tmp_path / "out", tmp_path / "more"], tmp_path / "both")
+    assert info(tmp_path / "both")["joined_gaps"] == 4 * each

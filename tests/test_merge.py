@@ -8,8 +8,7 @@ import pytest
 
 from helpers_convert import FakeReader
 from symphony.data.builtin import builtin_store
-from symphony.data.convert import convert
-from symphony.data.merge import merge
+from symphony.data.convert import convert, merge
 from symphony.data.report import Report, Skip
 from symphony.data.segment import content_hash
 from symphony.data.store import SegmentStore
@@ -87,13 +86,10 @@ def test_the_same_segment_twice_another_time_step_and_what_is_there_are_refused(
         merge(PARTS, tmp_path / "slow")
 
 
-def test_a_store_that_is_not_finished_is_neither_merged_nor_added_to(tmp_path: Path) -> None:
+def test_a_store_that_is_not_finished_is_not_merged(tmp_path: Path) -> None:
     store = SegmentStore(PARTS[0])
     with StoreWriter(tmp_path / "half") as writer:
         writer.copy(store, 0)
         writer.write_report({"settings": {"segments": 9}, "generation": {"complete": False}})
     with pytest.raises(DataError, match=r"half: holds 1 of 9 segments"):
         merge([PARTS[1], tmp_path / "half"], tmp_path / "all")
-    (tmp_path / "x.xml").write_text("<x/>")
-    with pytest.raises(DataError, match=r"half: holds 1 of 9 segments"):
-        convert("commonroad", [tmp_path / "x.xml"], tmp_path / "half", append=True)

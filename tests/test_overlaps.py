@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers_segments import hide, random_segment, straight_road
-from symphony.data.convert import convert, info
+from symphony.data.convert import convert, info, merge
 from symphony.data.overlaps import overlapping
 from symphony.data.report import Report
 from symphony.data.segment import AgentType, RunSegment
@@ -111,8 +111,9 @@ def test_a_conversion_counts_and_tells(workers: int, tmp_path: Path) -> None:
     assert info(tmp_path / "all")["overlaps"] == 2
     assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
     (tmp_path / "more.mixed").write_text("6 x7")
-    convert(Mixed(), [tmp_path / "more.mixed"], tmp_path / "all", append=True, workers=workers)
-    assert info(tmp_path / "all")["overlaps"] == 3
+    convert(Mixed(), [tmp_path / "more.mixed"], tmp_path / "more", workers=workers)
+    merge([tmp_path / "all", tmp_path / "more"], tmp_path / "both")
+    assert info(tmp_path / "both")["overlaps"] == 3
 
     without = convert(Mixed(), [tmp_path], tmp_path / "clean", exclude_overlaps=True, workers=workers)
     assert (without.converted, without.overlaps, without.warning) == (4, 0, "")

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from symphony.data.generate import generate
-from symphony.data.plans import Plan
+from symphony.data.generate import Plan, generate
 from symphony.data.sources.sumo.networks import kind_name, own_network, town
 from symphony.data.sources.sumo.process import run_program
 from symphony.data.sources.sumo.roads import read_network

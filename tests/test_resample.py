@@ -17,7 +17,7 @@ from symphony.errors import ConfigError, DataError
 PER_STEP = ("position", "heading", "velocity", "valid", "signal_state")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(segments(), st.integers(1, 4))
 def test_whole_multiples_pick_and_keep_everything_else(log: RunSegment, every: int) -> None:
     picked = log.valid[:, ::every]
@@ -28,7 +28,7 @@ def test_whole_multiples_pick_and_keep_everything_else(log: RunSegment, every: i
     np.testing.assert_array_equal(new.valid, picked)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(segments(), st.floats(0.15, 3))
 def test_any_ratio_gives_a_valid_segment_of_the_same_span(log: RunSegment, ratio: float) -> None:
     dt = log.dt * ratio
@@ -81,7 +81,7 @@ def test_lights_keep_the_latest_logged_state() -> None:
         lambda rows: np.array(rows, np.uint8)
     )
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_held_lights_are_never_unknown_if_they_were_ever_known(state: NDArray[np.uint8]) -> None:
     log = crossing(2, steps=7, dt=0.2).replace(signal_state=state)
     held = hold_lights(log)
@@ -161,7 +161,7 @@ def test_headings_stay_on_the_logged_branch() -> None:
     np.testing.assert_allclose(new.heading, 4 * np.pi, atol=1e-5)
 
 
-@pytest.mark.parametrize("every", [1, 2, 3, 5])
+@pytest.mark.parametrize("every", [1, 3])
 def test_a_light_seen_between_picked_steps_is_not_lost(every: int) -> None:
     """Against a plain loop: the latest known state since the picked step before, if it is unknown now."""
     rng = np.random.default_rng(every)
@@ -174,7 +174,7 @@ def test_a_light_seen_between_picked_steps_is_not_lost(every: int) -> None:
             assert found.signal_state[light, k] == (known[-1] if known else 0)
 
 
-@pytest.mark.parametrize("block", [1, 100, 700])
+@pytest.mark.parametrize("block", [1, 700])
 def test_smoothing_in_blocks_gives_the_same(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     log = hide(crossing(4, steps=91, dt=0.1), 2, slice(20, 31))
     noise = np.random.default_rng(0).normal(0, 0.2, log.position.shape).astype(np.float32)

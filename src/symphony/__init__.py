@@ -7,46 +7,27 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from symphony._version import __version__
+from symphony._version import __version__ as __version__
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.agents.agent import load_agent
-    from symphony.collectors import BeamSearchCollector, beam_search
-    from symphony.config.evaluation import EvaluateConfig
-    from symphony.config.training import TrainConfig
-    from symphony.data.builtin import builtin_store
-    from symphony.data.store import SegmentStore
-    from symphony.envs.driving import DrivingEnv
-    from symphony.envs.observation import ObservationConfig
-    from symphony.evaluation.evaluator import evaluate
-    from symphony.objectives.bc import BCLoss
-    from symphony.objectives.discriminator import DiscriminatorLoss
-    from symphony.objectives.distillation import DistillationLoss
-    from symphony.objectives.goal import GoalLoss
-    from symphony.objectives.mgail import MGAILLoss
-    from symphony.recipes import train
-    from symphony.rollouts.unroll import simulate
-
-__all__ = [
-    "BCLoss",
-    "BeamSearchCollector",
-    "DiscriminatorLoss",
-    "DistillationLoss",
-    "DrivingEnv",
-    "EvaluateConfig",
-    "GoalLoss",
-    "MGAILLoss",
-    "ObservationConfig",
-    "SegmentStore",
-    "TrainConfig",
-    "__version__",
-    "beam_search",
-    "builtin_store",
-    "evaluate",
-    "load_agent",
-    "simulate",
-    "train",
-]
+    from symphony.agents.agent import load_agent as load_agent
+    from symphony.collectors import BeamSearchCollector as BeamSearchCollector
+    from symphony.collectors import beam_search as beam_search
+    from symphony.config.evaluation import EvaluateConfig as EvaluateConfig
+    from symphony.config.training import TrainConfig as TrainConfig
+    from symphony.data.builtin import builtin_store as builtin_store
+    from symphony.data.store import SegmentStore as SegmentStore
+    from symphony.envs.driving import DrivingEnv as DrivingEnv
+    from symphony.envs.observation import ObservationConfig as ObservationConfig
+    from symphony.evaluation.evaluator import evaluate as evaluate
+    from symphony.objectives.bc import BCLoss as BCLoss
+    from symphony.objectives.discriminator import DiscriminatorLoss as DiscriminatorLoss
+    from symphony.objectives.distillation import DistillationLoss as DistillationLoss
+    from symphony.objectives.goal import GoalLoss as GoalLoss
+    from symphony.objectives.mgail import MGAILLoss as MGAILLoss
+    from symphony.recipes import train as train
+    from symphony.rollouts.unroll import simulate as simulate
 
 __getattr__, __dir__ = lazily(__name__)
+__all__ = __dir__()  # noqa: PLE0605

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Self
+
 
 class SymphonyError(Exception):
     """Base of every error this package raises on bad input; the command line prints it without a traceback."""
 
 
-def printable(text: str, keep: str = "") -> str:
-    """Text with everything escaped that a terminal would act on, or that can't be shown, but for what is to be kept.
-
-    What files hold may be meant to move the cursor, to clear the screen or to turn the direction of writing around.
-    """
-    return "".join(
-        letter
-        if letter.isprintable() or letter in keep
-        else letter.encode("unicode_escape", "surrogatepass").decode("ascii")
-        for letter in text
-    )
-
-
 class AllFailedError(SymphonyError):
-    """Every run failed: there are results, but they only say why. The command line ends with a status of its own."""
+    """Every run failed: there are results, but they only say why."""
 
 
 class ThresholdError(SymphonyError):
@@ -29,18 +19,19 @@ class ThresholdError(SymphonyError):
 
 
 class CouldNotRunError(SymphonyError):
-    """A suite could not run at all. The command line ends with the status of wrong usage."""
+    """A suite could not run at all."""
+
+
+class ConfigError(SymphonyError):
+    """An argument or a saved configuration that can't be used."""
+
+
+class DataWarning(UserWarning):
+    """Data that can be used, but may not be what was meant; the command line prints it in one line."""
 
 
 class DataError(SymphonyError):
-    """Bad or unusable data.
-
-    Args:
-        message: what is wrong.
-        file: the file it was read from.
-        segment: the id of the run segment.
-        field: the field of the segment, as written in the schema or the format.
-    """
+    """Bad or unusable data: what is wrong, in which file, run segment and field of the schema or the format."""
 
     def __init__(
         self, message: str, *, file: object = None, segment: str | None = None, field: str | None = None
@@ -54,22 +45,17 @@ class DataError(SymphonyError):
         message = printable(self.message, keep="\n")
         return f"{where}: {message}" if where else message
 
-    def at(self, *, file: object = None, segment: str | None = None) -> DataError:
-        """The same error (same class) with the places that were still unknown filled in."""
-        error = type(self).__new__(type(self))
-        DataError.__init__(
-            error,
-            self.message,
-            file=self.file if self.file is not None else file,
-            segment=self.segment if self.segment is not None else segment,
-            field=self.field,
-        )
+    def at(self, *, file: object = None, segment: str | None = None) -> Self:
+        """Return the same error with the places that were still unknown filled in."""
+        error = copy.copy(self)
+        error.file = file if self.file is None else self.file
+        error.segment = segment if self.segment is None else self.segment
         return error
 
 
-class DataWarning(UserWarning):
-    """Data that can be used, but may not be what was meant; the command line prints it in one line."""
-
-
-class ConfigError(SymphonyError):
-    """An argument or a saved configuration that can't be used."""
+def printable(text: str, keep: str = "") -> str:
+    """Escape everything in a text but ``keep`` that can't be shown, or on which a terminal would act."""
+    return "".join(
+        c if c.isprintable() or c in keep else c.encode("unicode_escape", "surrogatepass").decode()
+        for c in text
+    )

@@ -28,25 +28,24 @@ def load_object(path: str, *, here: bool = True) -> Any:
     """
     module, _, name = path.rpartition(":")
     try:
-        if module.endswith(".py"):
-            found: Any = _file(Path(module).resolve())
-        else:
-            try:
-                found = importlib.import_module(module)
-            except ModuleNotFoundError:
-                if not here or os.getcwd() in sys.path or "" in sys.path:
-                    raise
-                sys.path.append(os.getcwd())
-                found = importlib.import_module(module)
+        found: Any = _file(Path(module).resolve()) if module.endswith(".py") else _module(module, here)
         for part in name.split("."):
             found = getattr(found, part)
-    except ConfigError:
-        raise
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"can't import '{path}': {error}") from error
     except (Exception, SystemExit) as error:  # whatever a user's module raises
         raise ConfigError(f"can't import '{path}': {type(error).__name__}: {error}") from error
     return found
+
+
+def _module(name: str, here: bool) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError:
+        if not here or os.getcwd() in sys.path or "" in sys.path:
+            raise
+        sys.path.append(os.getcwd())
+        return importlib.import_module(name)
 
 
 def _file(path: Path) -> ModuleType:
@@ -55,7 +54,7 @@ def _file(path: Path) -> ModuleType:
         return sys.modules[str(path)]
     spec = importlib.util.spec_from_file_location(str(path), path)
     if not path.is_file() or spec is None or spec.loader is None:
-        raise ConfigError(f"{path}: no such file")
+        raise ImportError(f"{path}: no such file")
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
     module = sys.modules[str(path)] = importlib.util.module_from_spec(spec)
@@ -67,41 +66,20 @@ def _file(path: Path) -> ModuleType:
     return module
 
 
-def build_object(path: str, *args: Any, **kwargs: Any) -> Any:
-    """Call what an import path names.
-
-    Raises:
-        ConfigError: if it can't be imported or called so.
-    """
-    found = load_object(path)
-    try:
-        return found(*args, **kwargs)
-    except TypeError as error:
-        raise ConfigError(f"'{path}' can't be called as needed: {error}") from error
-
-
 def lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for.
+    """Return ``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for.
 
     Where they are from is what its ``if TYPE_CHECKING`` block says, so that nothing is written twice. A name that is
     also that of a module of the package does not work: Python would give the module to whoever imported that before.
-
-    Args:
-        package: its name.
     """
     source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
-    rooms = {
-        alias.name: node.module
-        for block in ast.parse(source).body
-        if isinstance(block, ast.If)
-        for node in block.body
-        if isinstance(node, ast.ImportFrom) and node.module is not None
-        for alias in node.names
-    }
+    blocks = [block for block in ast.parse(source).body if isinstance(block, ast.If)]
+    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def get(name: str) -> Any:
-        if name not in rooms:
+        if name not in homes:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(importlib.import_module(rooms[name]), name)
+        return getattr(importlib.import_module(homes[name]), name)
 
-    return get, lambda: sorted(sys.modules[package].__all__)
+    return get, lambda: sorted(homes)

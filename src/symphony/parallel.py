@@ -1,4 +1,4 @@
-"""One function over many tasks, in other processes of this machine or on a Ray cluster."""
+"""A function applied to many tasks, in other processes of this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from symphony.errors import ConfigError, SymphonyError
 
 T = TypeVar("T")
 R = TypeVar("R")
-
+Results = Generator[R, None, None]
 Engine = Literal["local", "ray"]
 
 IN_FLIGHT = 2
@@ -34,11 +34,7 @@ _START: Literal["forkserver", "spawn"] = "forkserver" if sys.platform == "linux"
 
 
 class WorkerError(SymphonyError):
-    """A worker process ended before its task was done.
-
-    Args:
-        tasks: numbers, from 0, of those that were under way, one of which it was.
-    """
+    """A worker process ended before its task was done: one of ``tasks``, numbers from 0 of those under way."""
 
     def __init__(self, tasks: list[int]) -> None:
         self.tasks = tasks
@@ -55,12 +51,11 @@ def ordered_map(
     workers: int = 1,
     engine: Engine = "local",
     imports: Sequence[str] = (),
-) -> Generator[R, None, None]:
+) -> Results[R]:
     """Apply a function to every task; results come in the order of the tasks, whoever is done first.
 
-    Lazy: tasks are taken from the iterable as results are asked for, at most ``2 * workers`` ahead. One local
-    worker is this very process. When an error, an interrupt or the end of the caller's loop cuts it short, the
-    tasks under way are abandoned.
+    Tasks are taken from the iterable as results are asked for, at most ``2 * workers`` ahead. One local worker is
+    this very process. When an error, an interrupt or ``close`` cuts it short, the tasks under way are abandoned.
 
     Args:
         function: a function of a module (it is pickled, and so are tasks and results).
@@ -69,9 +64,6 @@ def ordered_map(
         engine: ``local`` for processes of this machine, ``ray`` for Ray: the cluster at ``RAY_ADDRESS`` or the
             one ``ray.init`` was called for, else one on this machine.
         imports: modules that the tasks need beside the function's own, see :func:`get_ready`.
-
-    Returns:
-        An iterator over the results; its ``close`` abandons the rest.
 
     Raises:
         ConfigError: ``workers`` or ``engine`` can't be used, or Ray is not installed.
@@ -92,20 +84,35 @@ def ordered_map(
 def get_ready(imports: Sequence[str]) -> None:
     """Begin to import what local workers need, in a process of its own from which all of them are forked (Linux).
 
-    Modules are imported once instead of once a worker; a program that calls this before its own imports has both done
-    at the same time. Workers that come after find imported what the first call asked for and what of this package its
-    process had imported until then, whatever they need themselves.
+    A program that calls this before its own imports has both done at the same time. Workers that come after find
+    imported what the first call asked for and what of this package its process had imported until then.
     """
     if _START == "forkserver":
-        context = multiprocessing.get_context(_START)
         ours = [name for name in sys.modules if name.startswith("symphony.")]
+        context = multiprocessing.get_context(_START)
         context.set_forkserver_preload([name for name in (*ours, *imports) if name != "__main__"])
-        with _environment(WORKER_ENVIRONMENT), _no_interrupts():
+        with _starting():
             forkserver.ensure_running()
 
 
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """Processes started inside have the environment of workers and put off interrupts: the parent's are enough."""
+    before = {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
+    try:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        os.environ.update(WORKER_ENVIRONMENT)
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
 def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterator[deque[Any]]:
-    """Before each result, the submitted tasks, the one whose turn it is first."""
+    """Yield before each result the submitted tasks, the one whose turn it is first."""
     pending = deque(map(submit, itertools.islice(tasks, count)))
     while pending:
         yield pending
@@ -115,7 +122,7 @@ def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterat
 
 def _local_map(
     function: Callable[[T], R], tasks: Iterator[T], workers: int, imports: Sequence[str]
-) -> Generator[R, None, None]:
+) -> Results[R]:
     get_ready(imports)
     context = multiprocessing.get_context(_START)
     lifeline, ours = context.Pipe(duplex=False)
@@ -124,10 +131,7 @@ def _local_map(
     pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
 
     def submit(task: T) -> Any:
-        with (
-            _environment(WORKER_ENVIRONMENT),
-            _no_interrupts(),
-        ):  # processes are started here, as they are needed
+        with _starting():  # processes are started here, as they are needed
             return pool.submit(function, task)
 
     pending: deque[Any] = deque()
@@ -146,10 +150,7 @@ def _local_map(
 
 
 def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
-    """End at once, whatever the task, when the parent closes its end of the pipe or ends, in whatever way.
-
-    Interrupts stay put off, as they were when the process was started: the parent's are enough.
-    """
+    """End at once, whatever the task, when the parent closes its end of the pipe or ends, in whatever way."""
     os.environ.update(environment)
 
     def watch() -> None:
@@ -160,41 +161,12 @@ def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _mask(how: int) -> None:
-    signal.pthread_sigmask(how, {signal.SIGINT})
-
-
-@contextlib.contextmanager
-def _no_interrupts() -> Iterator[None]:
-    """Put off interrupts; processes started inside put them off too, and do not complain while they start."""
-    try:
-        _mask(signal.SIG_BLOCK)
-        yield
-    finally:
-        _mask(signal.SIG_UNBLOCK)
-
-
-@contextlib.contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
 def _ray(workers: int) -> Any:
     """Ray, connected."""
     try:
         import ray  # noqa: PLC0415 (optional)
     except ImportError as error:
-        message = "the engine 'ray' needs Ray: pip install 'symphony-traffic[ray]'"
-        raise ConfigError(message) from error
+        raise ConfigError("the engine 'ray' needs Ray: pip install 'symphony-traffic[ray]'") from error
     if not ray.is_initialized():
         address = os.environ.get("RAY_ADDRESS")
         size: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
@@ -205,16 +177,13 @@ def _ray(workers: int) -> Any:
     return ray
 
 
-def _ray_map(
-    ray: Any, function: Callable[[T], R], tasks: Iterator[T], count: int
-) -> Generator[R, None, None]:
+def _ray_map(ray: Any, function: Callable[[T], R], tasks: Iterator[T], count: int) -> Results[R]:
     remote = ray.remote(num_cpus=1, runtime_env={"env_vars": WORKER_ENVIRONMENT})(function)
     pending: deque[Any] = deque()
     try:
         for pending in _ahead(remote.remote, tasks, count):
             yield ray.get(pending[0])
-    except ray.exceptions.RayTaskError as error:
-        # Unwrapped, so that callers catch what the function raised.
+    except ray.exceptions.RayTaskError as error:  # unwrapped, so that callers catch what the function raised
         raise error.cause if isinstance(error.cause, Exception) else SymphonyError(str(error)) from error
     except ray.exceptions.RayError as error:
         raise SymphonyError(f"a Ray worker failed: {error}") from error

@@ -1,8 +1,7 @@
 """Random numbers as a function of (seed, stream, step).
 
-A generator's state ties a rollout's numbers to how many others were drawn before, hence to its batch. Here
-nothing is kept: the number is a hash of what it is for, so that a rollout is the same in any batch, branch
-layout, process or device.
+A generator's state ties a rollout's numbers to how many others were drawn before, hence to its batch. Here a number
+is a hash of what it is for, so that a rollout is the same in any batch, branch layout, process or device.
 """
 
 from __future__ import annotations
@@ -23,18 +22,12 @@ class Stream(IntEnum):
     streams. A number stays with its use, or a seed would give other rollouts: 2 belonged to a use that is gone.
     """
 
-    GOALS = 1 << 40
-    """Routes of the agents of a scene."""
-    PRUNING = (1 << 40) + 1
-    """Which branches go on."""
-    PLANNERS = (1 << 40) + 3
-    """Seeds of the planners of egos."""
-    PERSONAS = (1 << 40) + 4
-    """Styles of driving."""
-    WALKS = (1 << 40) + 5
-    """How people walk whom nobody drives."""
-    BACKTRACKING = 1 << 41
-    """Lines that go back, each of its tries: this and how many there were."""
+    GOALS = 1 << 40  # routes of the agents of a scene
+    PRUNING = (1 << 40) + 1  # which branches go on
+    PLANNERS = (1 << 40) + 3  # seeds of the planners of egos
+    PERSONAS = (1 << 40) + 4  # styles of driving
+    WALKS = (1 << 40) + 5  # how people walk whom nobody drives
+    BACKTRACKING = 1 << 41  # lines that go back, each of its tries: this and how many there were
 
 
 # SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.
@@ -68,13 +61,12 @@ def fold_in(stream: Int[Tensor, "*#b"], index: Int[Tensor, "*#b"] | int) -> Int[
 
 
 def stream_of(text: str) -> int:
-    """The int64 stream of a name such as a segment's id, the same in every process."""
+    """Return the int64 stream of a name such as a segment's id, the same in every process."""
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big", signed=True)
 
 
 def uniform(seed: int, stream: Int[Tensor, "*#b"], step: Int[Tensor, "*#b"] | int) -> Float[Tensor, "*b"]:
-    """Uniform float32 numbers in the open interval (0, 1), a pure function of the three arguments, with the same bits
-    on every device.
+    """Draw uniform float32 numbers in the open interval (0, 1), with the same bits on every device.
 
     Args:
         seed: of the whole run.

@@ -3,36 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import pickle
+import tempfile
 import xml.etree.ElementTree as ET
+import zlib
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 Rng = np.random.Generator
+Files = dict[str, bytes]
+ACCEPTED, REFUSED, ABSURD, FOREIGN = "accepted", "refused", "absurd", "foreign"
 
-NUMBERS: tuple[Any, ...] = (
-    *(0, 1, -1, 2, 3, 7, 100, 4_999, 5_001, 9_999, 36_000, 10**6, 9.9e7, 2**31 - 1, 2**31, 2**53, 2**62),
-    *(
-        2**63 - 1,
-        2**63,
-        -(2**63),
-        2**64,
-        10**30,
-        0.5,
-        1e-6,
-        1e-300,
-        5e-324,
-        1e4,
-        2.1e4,
-        1e8,
-        1e30,
-        3e38,
-        1e300,
-    ),
-    *(float("inf"), float("-inf"), float("nan")),
+NUMBERS: list[Any] = json.loads(
+    "[0, 1, -1, 2, 3, 7, 100, 4999, 5001, 9999, 36000, 1000000, 99000000.0, 2147483647, 2147483648, 9007199254740992,"
+    " 4611686018427387904, 9223372036854775807, 9223372036854775808, -9223372036854775808, 18446744073709551616,"
+    " 1000000000000000000000000000000, 0.5, 1e-6, 1e-300, 5e-324, 1e4, 2.1e4, 1e8, 1e30, 3e38, 1e300, Infinity,"
+    " -Infinity, NaN]"
 )
 TEXTS = (
     "",
@@ -52,6 +43,36 @@ TEXTS = (
 )
 SMALL = 1 << 20
 """Bytes that a changed file may have at most: what is asked for is that small files stay harmless."""
+
+
+class Target(NamedTuple):
+    """One thing that reads files.
+
+    ``good`` gives its files by name, the first of which is opened; ``mutate`` changes some; ``run`` reads them from a
+    folder and says what came of it and what is wrong, or raises whatever it raises.
+    """
+
+    good: Callable[[], Files]
+    mutate: Callable[[Rng, Files], Files]
+    run: Callable[[Path, str], tuple[str, str]]
+
+
+def one_in(many: int, folder: Path) -> bool:
+    """Whether the files of a folder are among the one in so many that more is done with; the same ones always."""
+    return zlib.crc32(b"".join(each.read_bytes() for each in sorted(folder.rglob("*.*")))) % many == 0
+
+
+def written(write: Callable[[Path], Path]) -> Callable[[], Files]:
+    """The files that a function writes into a folder, the one it returns first."""
+
+    @functools.cache
+    def files() -> Files:
+        with tempfile.TemporaryDirectory() as folder:
+            log = write(Path(folder))
+            paths = sorted((p for p in Path(folder).rglob("*") if p.is_file()), key=lambda path: path != log)
+            return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+    return files
 
 
 def pick(rng: Rng, options: Any) -> Any:
@@ -88,11 +109,8 @@ def bytes_(rng: Rng, data: bytes) -> bytes:
             kind = pick(rng, ("<f4", "<f8", "<i4", "<i8"))
             with np.errstate(all="ignore"):
                 value = np.float64(pick(rng, NUMBERS))
-                raw = (
-                    (np.float64(0) if "i" in kind and not np.isfinite(value) else value)
-                    .astype(kind)
-                    .tobytes()
-                )
+                safe = np.float64(0) if "i" in kind and not np.isfinite(value) else value
+                raw = safe.astype(kind).tobytes()
             at -= at % len(raw)
             changed[at : at + len(raw)] = raw
     return bytes(changed[:SMALL])
@@ -137,17 +155,9 @@ def leaf(rng: Rng, value: Any) -> Any:
         return number(rng) if rng.random() < 0.7 else value * pick(rng, (-1, 1e3, 1e-3, 1 + 1e-7))
     if isinstance(value, str) and rng.random() < 0.7:
         return pick(rng, TEXTS)
-    others: tuple[Callable[[], Any], ...] = (
-        lambda: None,
-        lambda: number(rng),
-        lambda: pick(rng, TEXTS),
-        lambda: [],
-        lambda: {},
-        lambda: [value] * 3,
-        lambda: {"a": value},
-        lambda: True,
-    )
-    return pick(rng, others)()
+    others = (None, number, TEXTS, [], {}, [value] * 3, {"a": value}, True)
+    other = pick(rng, others)
+    return number(rng) if other is number else pick(rng, TEXTS) if other is TEXTS else other
 
 
 def _array(rng: Rng, value: Any) -> Any:
@@ -158,9 +168,8 @@ def _array(rng: Rng, value: Any) -> Any:
         with np.errstate(all="ignore"):
             wanted = float(number(rng)) if rng.random() < 0.5 else float(copy.flat[0]) * 1e3
             safe = wanted if value.dtype.kind == "f" or abs(wanted) < 2**31 else 0.0
-            copy.flat[rng.integers(copy.size, size=int(rng.integers(1, 4)))] = np.float64(safe).astype(
-                copy.dtype
-            )
+            places = rng.integers(copy.size, size=int(rng.integers(1, 4)))
+            copy.flat[places] = np.float64(safe).astype(copy.dtype)
         return copy
     if way < 0.7:
         return value[: int(rng.integers(len(value) + 1))] if value.ndim else value
@@ -168,15 +177,8 @@ def _array(rng: Rng, value: Any) -> Any:
         return np.concatenate([value] * int(rng.integers(2, 30))) if value.ndim else value
     if way < 0.9:
         return value[..., None] if rng.random() < 0.5 else value.reshape(-1)
-    return (
-        value.astype(pick(rng, ("f4", "f8", "i8", "?", "O", "U8")))
-        if np.isfinite(_plain(value)).all()
-        else value
-    )
-
-
-def _plain(value: Any) -> Any:
-    return value if value.dtype.kind in "fiub" else np.zeros(0)
+    sound = value.dtype.kind not in "fiub" or np.isfinite(value).all()
+    return value.astype(pick(rng, ("f4", "f8", "i8", "?", "O", "U8"))) if sound else value
 
 
 def pickle_(rng: Rng, data: bytes) -> bytes:

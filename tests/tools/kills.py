@@ -15,8 +15,10 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,14 +30,8 @@ PATIENCE = 600
 """Seconds without progress after which a life is given up."""
 
 
-@dataclass(frozen=True)
-class Target:
-    """Something that is killed.
-
-    Attributes:
-        work: begins, or goes on with, work in a folder; in a process of its own, which may start others.
-        left: what it leaves in the end, by name; equal work leaves equal bytes.
-    """
+class Target(NamedTuple):
+    """Something that is killed: ``work`` begins, or goes on, in a folder, of which ``left`` gives files by name."""
 
     work: Callable[[Path], None]
     left: Callable[[Path], dict[str, bytes]]
@@ -43,14 +39,7 @@ class Target:
 
 @dataclass
 class Counts:
-    """What came of a target.
-
-    Attributes:
-        kills: how often it was killed.
-        finished: times that it came to its end, after kills or without any.
-        failed: how it ended in other ways, or what it left that undisturbed work does not.
-        seconds: CPU time of undisturbed work.
-    """
+    """How often work was killed, how often it came to its end, how it failed, and its CPU time undisturbed."""
 
     kills: int = 0
     finished: int = 0
@@ -79,15 +68,11 @@ def torment(target: Target, folder: Path, kills: int, seed: int) -> Counts:
             counts.failed.append(f"after {counts.kills} kills: status {status}")
         else:
             counts.finished += 1
-            counts.failed += compared(whole, target.left(place))
+            other = target.left(place)
+            names = sorted(whole.keys() | other.keys())
+            counts.failed += [f"{name} differs" for name in names if whole.get(name) != other.get(name)]
         shutil.rmtree(place)
     return counts
-
-
-def compared(whole: dict[str, bytes], other: dict[str, bytes]) -> list[str]:
-    """Names of what differs."""
-    names = sorted(whole.keys() | other.keys())
-    return [f"{name} differs" for name in names if whole.get(name) != other.get(name)]
 
 
 def live(target: Target, place: Path, limit: float = np.inf) -> tuple[int, float]:
@@ -110,46 +95,18 @@ def live(target: Target, place: Path, limit: float = np.inf) -> tuple[int, float
     while os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
         used = max(used, spent(child))
         if used >= limit or time.monotonic() > until:
+            os.kill(child, signal.SIGKILL)
             break
         time.sleep(0.01)  # as often as the clock of processes moves on
-    if used >= limit:
-        end(child)
-        return -signal.SIGKILL, used
-    if time.monotonic() > until:
-        end(child)
-        return signal.SIGALRM, used
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    end_group(child)
-    return code, used
-
-
-def end(child: int) -> None:
-    """Kill a process and all that it has started."""
-    end_group(child)
-    os.kill(child, signal.SIGKILL)  # it may not have had a group yet
-    os.waitpid(child, 0)
-
-
-def end_group(group: int) -> None:
-    """Kill those of a group that are left."""
-    try:
-        os.killpg(group, signal.SIGKILL)
-    except ProcessLookupError:
-        return
-
-
-def spent_alone(process: int) -> float:
-    """CPU seconds of a process."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return sum(map(int, fields[11:13])) / TICKS
+    with suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)  # what it has started
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), used
 
 
 def spent(group: int) -> float:
     """CPU seconds of the processes of a group, those that have ended included."""
     total = 0
-    for place in Path("/proc").iterdir():
-        if not place.name.isdecimal():
-            continue
+    for place in Path("/proc").glob("[0-9]*"):
         try:
             fields = (place / "stat").read_text().rpartition(")")[2].split()
         except (FileNotFoundError, ProcessLookupError):
@@ -172,18 +129,13 @@ def main(args: list[str] | None = None) -> int:
     import kills_targets
 
     found = {}
+    given.out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="symphony-kills-") as place:
         for name, target in kills_targets.targets(Path(place)).items():
             if given.targets and not name.startswith(tuple(given.targets)):
                 continue
-            counts = torment(target, Path(place) / name, given.kills, given.seed)
-            found[name] = asdict(counts)
-            print(
-                f"{name:16}{counts.kills:4} kills{counts.finished:4} finished, {counts.seconds:.2f} s undisturbed"
-            )
-            for text in counts.failed:
-                print(f"    {text}")
-            given.out.parent.mkdir(parents=True, exist_ok=True)
+            found[name] = asdict(torment(target, Path(place) / name, given.kills, given.seed))
+            print(name, found[name])
             given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 1 if any(each["failed"] for each in found.values()) else 0
 

@@ -20,11 +20,9 @@ from kills import Target
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig, ValidationConfig
 from symphony.data import generate as generation
-from symphony.data import plans
 from symphony.data.builtin import builtin_store
 from symphony.data.convert import convert
-from symphony.data.generate import Harvest
-from symphony.data.plans import Plan, Task
+from symphony.data.generate import Harvest, Plan, Task
 from symphony.data.store import SegmentStore
 from symphony.evaluation import evaluate
 from symphony.evaluation.pictures import RolloutKeeper
@@ -36,15 +34,15 @@ from symphony.saved.folder import About, RolloutWriter
 from symphony.saved.saving import save_simulation
 
 AGENT = "pretrained:bc_ts_h"
+CONFIG = EvaluateConfig(rollouts=2, branches=4, batch=1)
 TIMES = ("seconds", "updates_per_second", "cost", "out", "path")
 """Names of what is a matter of the clock or of the folder."""
-PASSING = ("run.lock", "store.lock", "rollouts.lock")
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """All files of a folder; of JSON all but what is a matter of the clock or of the folder."""
+    """All files of a folder but locks; of JSON all but what is a matter of the clock or of the folder."""
     found = {}
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in PASSING):
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix != ".lock"):
         data = path.read_bytes()
         if path.suffix in (".json", ".jsonl"):
             lines = [data] if path.suffix == ".json" else data.splitlines()
@@ -66,18 +64,17 @@ def _generate(out: Path) -> None:
     def give(task: Task) -> Harvest:
         names = [f"{task.name}-{k}" for k in range(task.seed % 4)]
         made = [held[(task.seed + k) % 6].replace(segment_id=name) for k, name in enumerate(names)]
-        return Harvest(task, made, accepted=len(made), reasons=Counter(overlap=1), seconds=0.0)
+        return Harvest(task, made, accepted=len(made), reasons=Counter(overlap=1))
 
     generation.harvest = give
-    plans.sumo_version = lambda: "0.0"
+    generation.sumo_version = lambda: "0.0"
     generation.generate(Plan(60), out / "store")
 
 
 def _convert(logs: Path, out: Path) -> None:
     # It was done when it was killed, and would be refused, unless it had not tidied up.
-    if (out / "store").exists() and not (out / "store.partial" / "job.json").exists():
-        return
-    convert(FakeReader(), sorted(logs.glob("*.scene")), out / "store")
+    if not (out / "store").exists() or (out / "store.partial" / "job.json").exists():
+        convert(FakeReader(), sorted(logs.glob("*.scene")), out / "store")
 
 
 def _train(method: Any, store: Path, out: Path) -> None:
@@ -104,26 +101,20 @@ def _train_by_two(method: Any, store: Path, out: Path) -> None:
 def _simulate(store: Path, out: Path) -> None:
     agent = load_agent(AGENT)
     dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
-    save_simulation(out / "rollouts", agent, dataset, EvaluateConfig(rollouts=2, branches=4, batch=1))
+    save_simulation(out / "rollouts", agent, dataset, CONFIG)
 
 
 def _evaluate(store: Path, out: Path) -> None:
-    agent, segments, config = (
-        load_agent(AGENT),
-        SegmentStore(store),
-        EvaluateConfig(rollouts=2, branches=4, batch=1),
-    )
-    keeper = RolloutKeeper(RolloutWriter(out / "rollouts", About.of(AGENT, segments, config)))
-    found = evaluate(agent, segments, config, baselines=True, observe=keeper)
+    agent, segments = load_agent(AGENT), SegmentStore(store)
+    keeper = RolloutKeeper(RolloutWriter(out / "rollouts", About.of(AGENT, segments, CONFIG)))
+    found = evaluate(agent, segments, CONFIG, baselines=True, observe=keeper)
     write_json(out / "found.json", evaluation_record(agent, found, segments))
 
 
 def targets(folder: Path) -> dict[str, Target]:
     """Everything, with the data that it works on in a folder."""
     store, logs = folder / "store", folder / "logs"
-    fill(
-        store, [straight_road(4, seed=0, steps=9), crossing(4, seed=0, steps=9), crossing(4, seed=1, steps=8)]
-    )
+    fill(store, [straight_road(4, steps=9), crossing(4, steps=9), crossing(4, seed=1, steps=8)])
     logs.mkdir()
     for k in range(4):
         kinds = (f"straight {2 * k}", f"broken {k}", f"crossing {2 * k + 1}")

@@ -36,11 +36,12 @@ def python(*folders: Path) -> Iterator[tuple[Path, int]]:
 
 def long_files(root: Path) -> list[str]:
     """What is wrong with single files."""
-    limits = [
-        (file, lines, RECIPE if file.parent.name == "recipes" else LIMIT)
-        for file, lines in python(*(root / folder for folder in FOLDERS))
-    ]
-    return [f"{file.relative_to(root)}: {n} lines, may have {most}" for file, n, most in limits if n > most]
+    found = []
+    for file, lines in python(*(root / folder for folder in FOLDERS)):
+        most = RECIPE if file.parent.name == "recipes" else LIMIT
+        if lines > most:
+            found.append(f"{file.relative_to(root)}: {lines} lines, may have {most}")
+    return found
 
 
 def words(root: Path) -> int:

@@ -47,7 +47,7 @@ from symphony.errors import (
     SymphonyError,
     printable,
 )
-from symphony.files import check_writable, lock_file
+from symphony.files import lock_file
 
 __all__ = ["main"]
 
@@ -57,6 +57,7 @@ GONE = {
     "plot tree": "`symphony simulate RUN --data DIR --out SIM` and `symphony view SIM` show the branches of a search",
     "plot rollouts": "`symphony evaluate RUN --data DIR --figure FILE` draws rollouts, and so does `symphony view`",
     "plot curvature --data": "evaluate the runs first: `symphony evaluate RUN --data DIR`",
+    "data convert --append": "convert into another store, and put the two together by `symphony data merge`",
     "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
 }
 """Commands and options that are gone, and what takes their place."""
@@ -124,7 +125,6 @@ def main(args: Sequence[str] | None = None) -> int:
     def run() -> None:
         with contextlib.ExitStack() as held:
             for path in results_of(chosen):
-                check_writable(path)
                 held.enter_context(lock_file(path))
             chosen.run()
 

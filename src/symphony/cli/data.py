@@ -23,8 +23,7 @@ from symphony.cli.shared import (
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.data.generate import Generation
-    from symphony.data.plans import Plan
+    from symphony.data.generate import Generation, Plan
 
 WINDOWS = ("window", "stride", "motion")
 """Options of the INTERACTION reader alone."""
@@ -79,7 +78,7 @@ class Generate:
 
     def _plans(self) -> dict[str, tuple[Plan, Path]]:
         """The stores to make, by split, and where."""
-        from symphony.data.plans import PRESETS, Plan
+        from symphony.data.generate import PRESETS, Plan
 
         if self.preset is not None:
             return {split: (plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()}
@@ -89,8 +88,7 @@ class Generate:
 
     def run(self) -> None:
         """Make what is missing, measure, report."""
-        from symphony.data.generate import generate
-        from symphony.data.plans import MADE_WITH, PRESETS
+        from symphony.data.generate import MADE_WITH, PRESETS, generate
         from symphony.data.sources.sumo import sumo_version
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
@@ -188,9 +186,9 @@ class Hardest:
 class Convert:
     """Convert logs into a store of run segments.
 
-    A record that can't be used is skipped, counted and reported. The store appears, or changes, once everything is
-    converted; until then the work lies in OUT.partial. A conversion that was interrupted or killed goes on where it
-    stopped when the same command is given again.
+    A record that can't be used is skipped, counted and reported. The store appears once everything is converted;
+    until then the work lies in OUT.partial. A conversion that was interrupted or killed goes on where it stopped when
+    the same command is given again.
     """
 
     format: tyro.conf.Positional[Literal["womd", "commonroad", "argoverse2", "interaction", "scenarionet"]]
@@ -230,8 +228,6 @@ class Convert:
     strict: bool = False
     """Skip a record of which something odd would be left out (an agent without a size, a state that no car can have,
     a node that the map lacks), instead of reading the rest of it."""
-    append: bool = False
-    """Add to a store that exists; what it holds already is left as it is."""
     workers: int = 1
     """Processes that convert files; the store does not depend on their number."""
     engine: Literal["local", "ray"] = "local"
@@ -287,7 +283,6 @@ class Convert:
         }
         rows = {
             "converted": report.converted,
-            "there already": report.present,
             "excluded": _excluded(report.exclusions),
             "skipped": report.problems,
             "odd": firsts,
@@ -318,8 +313,7 @@ class Merge:
 
     def run(self) -> None:
         """Copy, showing how far it is, and print what there is."""
-        from symphony.data.convert import info
-        from symphony.data.merge import merge
+        from symphony.data.convert import info, merge
 
         with progress("copying") as advance:
             merge(self.stores, self.out, advance)
@@ -414,7 +408,7 @@ def _print_info(found: dict[str, Any]) -> None:
     shown |= {"skipped": sum(found["problems"].values()), **found["problems"]}
     more = {"odd": found["odd"], "boxes overlap in the log of": found["overlaps"]}
     more |= {"gaps between lanes joined": found["joined_gaps"]}
-    more |= {"unfinished conversion": found["unfinished"], "unfinished": found["unfinished_generation"]}
+    more |= {"unfinished": found["unfinished_generation"]}
     print_facts(shown | {name: value for name, value in more.items() if value}, found["path"])
 
 

@@ -8,38 +8,23 @@ from __future__ import annotations
 
 from symphony.errors import DataError
 
-MAX_COORDINATE = 20_000.0
-"""Metres from the origin beyond which float32 no longer resolves a millimetre; segments must be re-centred."""
-MAX_HEIGHT = 10_000.0
-"""Metres above or below the origin."""
-MAX_ORIGIN = 1e8
-"""Metres; map projections count in the millions."""
-MIN_DT, MAX_DT = 0.005, 5.0
-"""Seconds per step."""
-MAX_SPEED = 350.0
-"""m/s; nothing on wheels was ever faster."""
-MAX_JUMP = 1000.0
-"""Metres from one step to the next."""
-MIN_SIZE, MAX_SIZE = 0.05, 100.0
-"""Metres of a box's side."""
-MAX_HEADING = 1000.0
-"""Radians: headings need not be wrapped, but nobody turns that often."""
-MAX_WIDTH = 1000.0
-"""Metres of a lane."""
-MAX_NAME = 200
-"""Characters of a segment's id, its source, its group and the name of its file."""
+MAX_COORDINATE = 20_000.0  # metres from the origin, beyond which float32 no longer resolves a millimetre
+MAX_HEIGHT = 10_000.0  # metres above or below the origin
+MAX_ORIGIN = 1e8  # metres; map projections count in the millions
+MIN_DT, MAX_DT = 0.005, 5.0  # seconds per step
+MAX_SPEED = 350.0  # m/s; nothing on wheels was ever faster
+MAX_JUMP = 1000.0  # metres from one step to the next
+MIN_SIZE, MAX_SIZE = 0.05, 100.0  # metres of a box's side
+MAX_HEADING = 1000.0  # radians: headings need not be wrapped, but nobody turns that often
+MAX_WIDTH = 1000.0  # metres of a lane
+MAX_NAME = 200  # characters of a segment's id, its source, its group and the name of its file
 
-MAX_STEPS = 10_000
-"""Steps of a segment: a quarter of an hour at 10 Hz."""
+MAX_STEPS = 10_000  # a quarter of an hour at 10 Hz
 MAX_AGENTS = 5_000
-MAX_STATES = 2_000_000
-"""Agents times steps."""
-MAX_POINTS = 1_000_000
-"""Points of a map."""
-MAX_LENGTH = 5e6
-"""Metres of all lines of a map."""
-MAX_FILE = 64 << 20
-"""Bytes of a file that is read as a whole (CommonRoad, Argoverse 2)."""
+MAX_STATES = 2_000_000  # agents times steps
+MAX_POINTS = 1_000_000  # of a map
+MAX_LENGTH = 5e6  # metres of all lines of a map
+MAX_FILE = 64 << 20  # bytes of a file that is read as a whole (CommonRoad, Argoverse 2)
 
 
 def check_counts(agents: int, steps: int, field: str) -> None:

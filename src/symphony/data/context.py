@@ -6,17 +6,16 @@ be slow to build and is not exact for every source.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import RunSegment
+from symphony.data.segment import Bools, RunSegment, wrap
 
 Reals = NDArray[np.floating[Any]]
-Bools = NDArray[np.bool_]
+Rows = NDArray[np.integer[Any]]
 
 HALF_LANE, APART = 1.5, 2.5
 """Metres sideways within which two paths are one, and from which on they are in different lanes before that."""
@@ -39,31 +38,19 @@ TILE = 1_000_000
 class Context(StrEnum):
     """Why the partner of the ego was chosen; the later ones say what it is to the ego. Best first."""
 
-    INTEREST = "interest"
-    """The source marks it as interacting (WOMD: objects of interest)."""
-    PREDICT = "predict"
-    """The source marks it for prediction (WOMD: tracks to predict)."""
-    MERGE = "merge"
-    """Both come into one lane from different lanes (a junction, a ramp, a lane change), shortly after each other."""
-    CROSSING = "crossing"
-    """The paths cross, and the two pass there shortly after each other."""
-    LEADER = "leader"
-    """It drives ahead on the ego's path, a short time gap away."""
-    FOLLOWER = "follower"
-    """It drives behind on the ego's path, a short time gap away."""
-    NEAREST = "nearest"
-    """None of these: the nearest that moves."""
+    INTEREST = "interest"  # the source marks it as interacting (WOMD: objects of interest)
+    PREDICT = "predict"  # the source marks it for prediction (WOMD: tracks to predict)
+    MERGE = "merge"  # both come into one lane from different lanes, shortly after each other
+    CROSSING = "crossing"  # the paths cross, and the two pass there shortly after each other
+    LEADER = "leader"  # it drives ahead on the ego's path, a short time gap away
+    FOLLOWER = "follower"  # it drives behind on the ego's path, a short time gap away
+    NEAREST = "nearest"  # none of these: the nearest that moves
 
 
-@dataclass(frozen=True)
-class Relations:
+class Relations(NamedTuple):
     """What each of K vehicles is to the ego: seconds [K] between the two, infinite where it is not.
 
-    Attributes:
-        merge: where their paths become one.
-        crossing: where their paths cross.
-        leader: smallest time gap to it, on the path in common.
-        follower: smallest time gap from it to the ego.
+    Where their paths become one, where they cross, the smallest time gap to it and from it on the path in common.
     """
 
     merge: Reals
@@ -72,14 +59,14 @@ class Relations:
     follower: Reals
 
 
-def relations(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Relations:
+def relations(segment: RunSegment, others: Rows) -> Relations:
     """Relate vehicles [K] to the ego, which is none of them, by the paths that were logged."""
     merge, crossing = np.full(len(others), np.inf), np.full(len(others), np.inf)
     leader, follower = _queue_gap(segment, others, -1), _queue_gap(segment, others, 1)
     rows = np.flatnonzero(_boxes_meet(segment, others))
     if len(rows):
-        meeting = _Meeting.of(segment, others[rows])
-        together = meeting.length_in_common() >= SHARED
+        meeting = _Meeting(segment, others[rows])
+        together = meeting.shared @ meeting.spacing >= SHARED
         for on_path, field in ((meeting.before, leader), (meeting.after, follower)):
             field[rows] = np.minimum(np.where(together, on_path, np.inf), field[rows])
         # Two paths that become one, or stop being one, cross on the way: those relations have their own names.
@@ -91,7 +78,6 @@ def relations(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Relation
     return Relations(*(np.where(gaps <= limit + 1e-6, gaps, np.inf) for gaps, limit in limits))
 
 
-@dataclass(frozen=True)
 class _Meeting:
     """K vehicles and the ego, each of T steps with each: found a tile at a time, as T squared may be large.
 
@@ -103,31 +89,18 @@ class _Meeting:
         crossing: [K] smallest time in seconds between the two at a place where they pass at an angle.
     """
 
-    spacing: Reals
-    shared: Bools
-    first: NDArray[np.int64]
-    before: Reals
-    after: Reals
-    crossing: Reals
-
-    @classmethod
-    def of(cls, segment: RunSegment, others: NDArray[np.integer[Any]]) -> _Meeting:
+    def __init__(self, segment: RunSegment, others: Rows) -> None:
         agents, steps = len(others), segment.num_steps
-        spacing = _spacing(segment.position[segment.ego, :, :2], segment.valid[segment.ego])
-        found = cls(
-            spacing,
-            np.zeros((agents, steps), bool),
-            np.zeros((agents, 2), np.int64),
-            *(np.full(agents, np.inf) for _ in range(3)),
-        )
+        self.spacing = _spacing(segment.position[segment.ego, :, :2], segment.valid[segment.ego])
+        self.shared, self.first = np.zeros((agents, steps), bool), np.zeros((agents, 2), np.int64)
+        self.before, self.after, self.crossing = (np.full(agents, np.inf) for _ in range(3))
         rows = max(TILE // steps, 1)
         group = max(rows // steps, 1)
         for a in range(0, agents, group):
             for t in range(0, steps, rows):
-                found._add(segment, others, slice(a, a + group), slice(t, t + rows))
-        return found
+                self._add(segment, others, slice(a, a + group), slice(t, t + rows))
 
-    def _add(self, segment: RunSegment, others: NDArray[np.integer[Any]], group: slice, steps: slice) -> None:
+    def _add(self, segment: RunSegment, others: Rows, group: slice, steps: slice) -> None:
         """Look at some of the others [k] and some of the ego's steps [t]."""
         along, shared, crossing = _places(segment, others[group], steps, self.spacing[steps])
         time = np.arange(segment.num_steps) * segment.dt
@@ -146,14 +119,8 @@ class _Meeting:
         self.first[group][new] = np.stack([steps.start + mine, theirs], -1)
         self.shared[group, steps] = there
 
-    def length_in_common(self) -> Reals:
-        """[K] metres of the ego's path that are the other's, too."""
-        return self.shared @ self.spacing
 
-
-def _places(
-    segment: RunSegment, others: NDArray[np.integer[Any]], steps: slice, spacing: Reals
-) -> tuple[Reals, Bools, Bools]:
+def _places(segment: RunSegment, others: Rows, steps: slice, spacing: Reals) -> tuple[Reals, Bools, Bools]:
     """Each of the ego's steps [t] with each of the others' [k, t, T].
 
     Gives metres the ego is ahead, whether both are at one place the same way, and whether both are there at an angle.
@@ -161,11 +128,8 @@ def _places(
     ego, position = segment.ego, segment.position[..., :2]
     delta = position[ego, None, steps, None] - position[others][:, None]
     heading = segment.heading[others]
-    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    along = np.abs(cos * delta[..., 0] + sin * delta[..., 1])
-    aside = np.abs(cos * delta[..., 1] - sin * delta[..., 0])
-    turn = segment.heading[ego, None, steps, None] - heading[:, None]
-    turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    along, aside = map(np.abs, _turned(delta, heading[:, None]))
+    turn = np.abs(wrap(segment.heading[ego, None, steps, None] - heading[:, None]))
     theirs = _spacing(position[others], segment.valid[others])[:, None]
     both = segment.valid[ego, None, steps, None] & segment.valid[others][:, None]
     # A place lies between two logged steps as a rule: half the way to the next one is added.
@@ -173,6 +137,12 @@ def _places(
     shared = both & (turn < SAME_WAY) & (aside <= HALF_LANE)
     crosses = (turn >= SAME_WAY) & (turn <= np.pi - SAME_WAY)
     return along, shared, both & crosses & (aside <= spacing[:, None] / 2 + 0.5)
+
+
+def _turned(delta: Reals, heading: Reals) -> tuple[Reals, Reals]:
+    """Parts of vectors [..., 2] along headings and to their left."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
 
 
 def _spacing(position: Reals, valid: Bools) -> Reals:
@@ -183,7 +153,7 @@ def _spacing(position: Reals, valid: Bools) -> Reals:
     return (padded[..., 1:] + padded[..., :-1]) / 2
 
 
-def _boxes_meet(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Bools:
+def _boxes_meet(segment: RunSegment, others: Rows) -> Bools:
     """[K] whether the boxes around the two paths come close: cheap, and leaves few."""
     position, valid = segment.position[..., :2], segment.valid[..., None]
     rows = np.append(others, segment.ego)
@@ -192,21 +162,18 @@ def _boxes_meet(segment: RunSegment, others: NDArray[np.integer[Any]]) -> Bools:
     return ((low[:-1] <= high[-1]) & (low[-1] <= high[:-1])).all(1)
 
 
-def _queue_gap(segment: RunSegment, others: NDArray[np.integer[Any]], sign: int) -> Reals:
+def _queue_gap(segment: RunSegment, others: Rows, sign: int) -> Reals:
     """[K] smallest time gap kept for a while by two in one lane at the same step; infinite if they don't.
 
     In a queue, paths in common are too short to tell and time gaps grow without limit: there the distance counts,
     as if the one behind drove ``QUEUE_SPEED``. The sign is -1 for those ahead of the ego, 1 for those behind it.
     """
-    ego = segment.ego
+    ego, heading = segment.ego, segment.heading[others]
     delta = sign * (segment.position[ego, :, :2] - segment.position[others, :, :2])
-    heading = segment.heading[others]
-    cos, sin = np.cos(heading), np.sin(heading)
-    along, aside = cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
-    behind = [ego] if sign < 0 else others
-    speed = np.linalg.norm(segment.velocity[behind], axis=-1)
+    along, aside = _turned(delta, heading)
+    speed = np.linalg.norm(segment.velocity[[ego] if sign < 0 else others], axis=-1)
     gap = along / np.maximum(speed, QUEUE_SPEED)
-    turn = np.abs((segment.heading[ego] - heading + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.abs(wrap(segment.heading[ego] - heading))
     kept = segment.valid[ego] & segment.valid[others] & (along > 0) & (gap <= TIME_GAP)
     kept &= (np.abs(aside) <= HALF_LANE) & (turn < SAME_WAY)
     long_enough = kept.sum(1) * segment.dt >= KEPT
@@ -219,14 +186,10 @@ def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float
     Both paths are followed backwards from that place by the same distances: they must have been apart or at an angle.
     """
     ahead, beside = _way_back(segment, segment.ego, mine), _way_back(segment, other, theirs)
-    reach = min(ahead[0][-1], beside[0][-1], LOOKBACK)
-    back = np.arange(1.0, reach + 1e-6)
-    if len(back) == 0:
-        return np.inf
+    back = np.arange(1.0, min(ahead[0][-1], beside[0][-1], LOOKBACK) + 1e-6)
     ego, partner = (np.stack([np.interp(back, way[0], row) for row in way[1:]]) for way in (ahead, beside))
-    turn = np.abs((ego[2] - partner[2] + np.pi) % (2 * np.pi) - np.pi)
     apart = np.hypot(*(ego[:2] - partner[:2])) >= APART
-    if not (apart | (turn >= 1.5 * SAME_WAY)).any():
+    if not (apart | (np.abs(wrap(ego[2] - partner[2])) >= 1.5 * SAME_WAY)).any():
         return np.inf
     return abs(theirs - mine) * segment.dt
 

@@ -8,39 +8,146 @@ the order of the plan, so a store depends on the plan alone.
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
+from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from symphony.data import store_format
-from symphony.data.plans import Plan, Task
 from symphony.data.segment import RunSegment
-from symphony.data.selection import usable
-from symphony.data.sources.sumo import crop_rule, generate_run
+from symphony.data.selection import exclusion
+from symphony.data.sources.sumo import KINDS, crop_rule, generate_run, is_own, kind_name, sumo_version
 from symphony.data.store import SegmentStore
+from symphony.data.store_format import HEADER
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.parallel import Engine, ordered_map
 
-_BEFORE = {"parked": 0.0, "pedestrians": 0}
-"""What settings that are gone must have been in a store that is continued."""
-PER_NETWORK = 8
-"""Segments taken from one network."""
-RECORDED = 90.0
-"""Simulated seconds per network, for segments of 10 s."""
-STRAIGHT = 5.0
-"""How many times likelier routes go straight on than they take one of the turns; walks without a preference would
-turn far more often than people do."""
-TURN_INTEREST = 0.2
-"""What a turn adds to a vehicle's chance of being the ego (see ``CropRule``)."""
-BARREN = 50
-"""Networks in a row that may give nothing before the plan is given up."""
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+DURATIONS = (10, 20, 30)  # seconds a segment may last
+
+VERSION = 1
+"""Of this generator: another one may give other segments for the same plan, so a store is not continued by it."""
+FIRST_NETWORK = 1_000_000  # seeds of networks below this are left to the built-in set and to experiments
+BLOCK = 100_000  # networks that a seed has for each split
+MAX_SEED = 9_999
+
+
+class Task(NamedTuple):
+    """One network: its kind and seed, the seconds of a segment, and N_I."""
+
+    kind: str
+    seed: int
+    duration: float
+    interactive: int
+
+    @property
+    def name(self) -> str:
+        """Name of the network in the segments' tags."""
+        return f"{kind_name(self.kind)}-{self.seed}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that decides what is in a generated store.
+
+    Attributes:
+        segments: how many.
+        seed: another seed is another set of networks.
+        split: training, validation and test sets never share a network, whatever their seeds.
+        kinds: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
+            kind, too; its roads are the same for every split and seed, the traffic is another.
+        duration: seconds of a segment, one of :data:`DURATIONS`.
+        interactive: moving vehicles a segment must have at its first step (N_I).
+
+    Raises:
+        ConfigError: a value out of range; names the field.
+    """
+
+    segments: int
+    seed: int = 0
+    split: Split = "train"
+    kinds: tuple[str, ...] = ("town",)
+    duration: int = 10
+    interactive: int = 2
+
+    def __post_init__(self) -> None:
+        unknown = [kind for kind in self.kinds if kind not in KINDS and not is_own(kind)]
+        missing = [kind for kind in self.kinds if is_own(kind) and not Path(kind).is_file()]
+        known = f"(known: {', '.join(KINDS)}, and files of roads: .xodr, .osm, .net.xml)"
+        for wrong, message in (
+            (self.segments < 1, f"segments must be at least 1, is {self.segments}"),
+            (not 0 <= self.seed <= MAX_SEED, f"seed must be between 0 and {MAX_SEED}, is {self.seed}"),
+            (self.split not in SPLITS, f"unknown split {self.split!r} (known: {', '.join(SPLITS)})"),
+            (unknown or not self.kinds, f"kinds: unknown kind of network {', '.join(unknown)!r} {known}"),
+            (self.duration not in DURATIONS, f"duration must be one of {DURATIONS}, is {self.duration}"),
+            (self.interactive < 2, f"interactive must be at least 2, is {self.interactive}"),
+            (missing, f"kinds: there is no file {', '.join(missing)}"),
+        ):
+            if wrong:
+                raise ConfigError(message)
+
+    def networks(self, start: int = 0) -> Iterator[Task]:
+        """Yield the plan's networks from one number on, counted from 0."""
+        first = FIRST_NETWORK + (self.seed * len(SPLITS) + SPLITS.index(self.split)) * BLOCK
+        for number in range(start, BLOCK):
+            kind = self.kinds[number % len(self.kinds)]
+            yield Task(kind, first + number, float(self.duration), self.interactive)
+        raise ConfigError(f"one seed has {BLOCK} networks for each split: make more stores instead")
+
+    def settings(self) -> dict[str, Any]:
+        """Return what is kept with the store: the arguments, and the versions that decide what they give."""
+        own = {kind: sha256(Path(kind).read_bytes()).hexdigest() for kind in self.kinds if is_own(kind)}
+        found = {**asdict(self), "kinds": list(self.kinds), **({"roads": own} if own else {})}
+        return found | {"reader": "generate", "generator": VERSION, "sumo": sumo_version()}
+
+
+class Preset(NamedTuple):
+    """A standard set: its three plans, and the checksums of the stores they give."""
+
+    plans: dict[Split, Plan]
+    checksums: dict[Split, str]
+
+
+MADE_WITH = "SUMO 1.28.0 on Linux, x86-64"
+"""What the checksums of the standard sets were taken with: other versions or processors may give others."""
+
+
+def _preset(counts: tuple[int, int, int], *checksums: str) -> Preset:
+    plans = {split: Plan(count, split=split) for split, count in zip(SPLITS, counts, strict=True)}
+    return Preset(plans, dict(zip(SPLITS, checksums, strict=True)))
+
+
+# Both use seed 0, so the smaller set is the beginning of the larger one.
+PRESETS: dict[str, Preset] = {
+    "town-small": _preset(
+        (2_000, 200, 500),
+        "bc250bfc215864d18e132821f7a9eb786dd5ed51f20f3a06aba403eabf700a07",
+        "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
+        "0cfa3e8c082441702d7cc19962bbda606b9941f7434c8c8837f5ef39ad20bbe2",
+    ),
+    "town": _preset(
+        (10_000, 200, 1_000),
+        "5fcd71bef8cc5ea81c118cd28b933280b344eb492a98caba9fcc3a8e1235b141",
+        "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
+        "c2c4a0677f9b780f20f23af5d57b00dc5961d840bcc8b4d95eacc7ff3f0d032d",
+    ),
+}
+"""The standard sets: towns with signals, all kinds of unsignalled control and roundabouts, 10 s, N_I = 2."""
+
+
+PER_NETWORK = 8  # segments taken from one network
+RECORDED = 90.0  # simulated seconds per network, for segments of 10 s
+STRAIGHT = (
+    5.0  # how many times likelier routes go straight on than they take one of the turns, as people's do
+)
+TURN_INTEREST = 0.2  # what a turn adds to a vehicle's chance of being the ego (see ``CropRule``)
+BARREN = 50  # networks in a row that may give nothing before the plan is given up
 
 
 @dataclass(frozen=True)
@@ -60,29 +167,19 @@ class Harvest:
 
 def harvest(task: Task) -> Harvest:
     """Make one network, simulate it, and take :data:`PER_NETWORK` segments from as many of its maps as there are."""
-    begin = _cpu_seconds()
+    begin = sum(os.times()[:4])  # of this process and the programs it ran, whoever else is there
     rule = replace(crop_rule(task.kind, task.duration, task.interactive), turn_interest=TURN_INTEREST)
     recorded = max(RECORDED, 5 * task.duration)
     try:
         run = generate_run(task.kind, task.seed, recorded, rule=rule, straight=STRAIGHT)
     except DataError as error:
-        return Harvest(task, [], seconds=_cpu_seconds() - begin, error=error.message)
-    good = []
-    for segment in run.segments:
-        try:
-            usable(segment, task.interactive)
-            good.append(segment)
-        except DataError as error:
-            run.reasons[f"{error.field}: excluded by the paper's limits"] += 1
+        return Harvest(task, [], seconds=sum(os.times()[:4]) - begin, error=error.message)
+    found = [exclusion(segment, task.interactive) for segment in run.segments]
+    run.reasons.update(f"{error.field}: excluded by the paper's limits" for _, error in filter(None, found))
+    good = [segment for segment, excluded in zip(run.segments, found, strict=True) if excluded is None]
     taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
     taken = [segment.replace(group=task.name) for segment in taken]
-    return Harvest(task, taken, len(good), run.reasons, _cpu_seconds() - begin)
-
-
-def _cpu_seconds() -> float:
-    """Seconds of this process and the programs it ran: unlike the clock, they don't depend on who else is there."""
-    # Windows does not know its children's.
-    return sum(os.times()[:4]) if os.name == "posix" else time.perf_counter()
+    return Harvest(task, taken, len(good), run.reasons, sum(os.times()[:4]) - begin)
 
 
 def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
@@ -118,18 +215,14 @@ class Generation:
     seconds: float = 0.0
     complete: bool = False
 
-    def add(self, found: Harvest) -> None:
-        """Count one more network."""
-        self.networks += 1
+    def add(self, found: Harvest, complete: bool) -> None:
+        """Count one more network, and note whether it was the last."""
+        self.networks, self.complete = self.networks + 1, complete
         self.accepted += found.accepted
         self.reasons = dict((Counter(self.reasons) + found.reasons).most_common())
         self.seconds = round(self.seconds + found.seconds, 3)
         if found.error:
             self.failed[found.task.name] = found.error
-
-
-Progress = Callable[[int, Generation], None]
-"""Called with the segments in the store, and how far the plan is, after each network."""
 
 
 def generate(
@@ -138,27 +231,23 @@ def generate(
     *,
     workers: int = 1,
     engine: Engine = "local",
-    progress: Progress | None = None,
+    progress: Callable[[int, Generation], None] | None = None,
 ) -> Generation:
     """Carry out a plan, or continue one that was interrupted at any moment; a finished store is left as it is.
 
     The number of workers changes nothing in the store; for where they are, see :func:`symphony.parallel.ordered_map`.
-    Returns how the store was made, from its beginning.
+    ``progress`` is told the segments in the store, and how far the plan is, after each network. Returns how the store
+    was made, from its beginning.
 
     Raises:
         ConfigError: the store is being made with other arguments; names the first that differs.
         DataError: ``out`` holds something else, SUMO is not installed, or the networks give no segments.
     """
     settings = plan.settings()
-    if (Path(out) / store_format.HEADER).is_file():
-        state = _begun(SegmentStore(out), settings)
-        if state.complete:
-            return state
+    if (Path(out) / HEADER).is_file() and (state := _begun(SegmentStore(out), settings)).complete:
+        return state
     with StoreWriter(out, append=True) as writer:
-        # Read once more under the lock: another run may have gone on in between.
         state = _begun(SegmentStore(out), settings)
-        if state.complete:
-            return state
         _report(writer, settings, state)
         barren = 0
         tasks = plan.networks(state.networks)
@@ -168,10 +257,8 @@ def generate(
                 for segment in result.segments:
                     # A network under way when a run was killed is made anew: what is there of it is skipped.
                     if len(writer) < plan.segments and not writer.has(segment.segment_id):
-                        tags = {"kind": result.task.kind, "network": result.task.name}
-                        writer.append(segment, tags=tags)
-                state.add(result)
-                state.complete = len(writer) == plan.segments
+                        writer.append(segment, tags={"kind": result.task.kind, "network": result.task.name})
+                state.add(result, len(writer) == plan.segments)
                 _report(writer, settings, state)
                 if progress is not None:
                     progress(len(writer), state)
@@ -195,8 +282,9 @@ def _begun(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
     if "generation" not in report or there.get("reader") != "generate":
         message = "is a segment store that was not generated: refusing to write into it"
         raise DataError(message, file=store.path)
-    for name, value in {**_BEFORE, **settings}.items():
-        made = there.get(name, _BEFORE.get(name))
+    gone = {"parked": 0.0, "pedestrians": 0}  # what settings of earlier releases must have been
+    for name, value in {**gone, **settings}.items():
+        made = there.get(name, gone.get(name))
         if made != value:
             old, new = (",".join(map(str, v)) if isinstance(v, list) else v for v in (made, value))
             raise ConfigError(

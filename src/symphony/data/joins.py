@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, RoadMap
 
-REACH, TURN = 1.5, np.deg2rad(30)
-"""Metres (heights count) and radians within which the start of a lane goes on from the end of another."""
-SAME = 0.1
-"""Metres within which two places are one: of candidates that are equally near all are joined, and an end that leads
-somewhere gets a further branch only there."""
-STEP = 1e-3
-"""Metres below which two neighbouring points of a lane have no direction."""
-
-TAG = "joined_gaps"
-"""Tag of a stored segment in whose map lanes were joined: how many links were added."""
+REACH, TURN = (
+    1.5,
+    np.deg2rad(30),
+)  # metres (heights count) and radians within which one lane goes on from another
+SAME = 0.1  # metres within which two places are one
+STEP = 1e-3  # metres below which two neighbouring points of a lane have no direction
+TAG = "joined_gaps"  # of a stored segment: how many links were added to its map
 
 
 def joined(road: RoadMap) -> tuple[RoadMap, int]:
@@ -28,9 +25,8 @@ def joined(road: RoadMap) -> tuple[RoadMap, int]:
 
     A lane goes on into another where its end lies within :data:`REACH` and :data:`TURN` of the other's start, nearer
     to that than to the other's end and nearer than its own start does, and either both or none are for bicycles. Only
-    ends without a successor are joined, to the nearest such start, and starts without a predecessor, to an end that
-    lies within :data:`SAME`: no branch is invented where lanes are linked. Lanes without a direction (single points)
-    stay as they are.
+    ends without a successor are joined, to the nearest such starts, and starts without a predecessor, to an end
+    within :data:`SAME`: no branch is invented where lanes are linked. Lanes of a single point stay as they are.
     """
     first, last, inward, outward, known = _ends(road)
     if not known.any():

@@ -16,19 +16,18 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import Polylines, RunSegment
 
-LEVEL = 2.5
-"""Metres of height, at one place, from which on two things are on different levels (as in ``symphony.geometry``)."""
-CELL = 5.0
-"""Metres of the columns in which heights are compared."""
-RISE = 1.5
-"""Metres by which a surface may rise from one column to one of its neighbours, two columns away at most."""
-SPACING = 2.0
-"""Metres between the points at which the lines of a map are looked at, at most."""
-NOWHERE = 99
-"""Number of what is a level away from every line at its place, such as a car on a bridge that the map lacks."""
+LEVEL = (
+    2.5  # metres of height, at one place, from which on two things are on different levels (as in geometry)
+)
+CELL = 5.0  # metres of the columns in which heights are compared
+RISE = 1.5  # metres by which a surface may rise from one column to a neighbour, two columns away at most
+SPACING = 2.0  # metres between the points at which the lines of a map are looked at, at most
+NOWHERE = (
+    99  # number of what is a level away from every line at its place: a car on a bridge that the map lacks
+)
 
 _NEAR = sorted(
-    ((dx, dy) for dx in range(-2, 3) for dy in range(-2, 3)), key=lambda step: step[0] ** 2 + step[1] ** 2
+    ((x, y) for x in range(-2, 3) for y in range(-2, 3)), key=lambda step: step[0] ** 2 + step[1] ** 2
 )
 _WIDE = 1 << 20
 

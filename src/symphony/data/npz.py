@@ -23,10 +23,8 @@ def read_npz(path: Path, names: Collection[str] = (), *, most: int = MOST) -> di
     """The arrays of an archive by their names; nothing is unpickled.
 
     How much memory they take is checked before any of it is asked for: what their headers claim must be what the
-    archive holds, and that no more than is allowed.
-
-    With ``names``, only these are read. A :class:`DataError` names file and field of what is no archive, damaged,
-    or of more than ``most`` bytes in all.
+    archive holds, and that at most ``most`` bytes in all, or a :class:`DataError` names file and field. With
+    ``names``, only these are read.
     """
     found: dict[str, NDArray[Any]] = {}
     left, name = most, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from symphony.data.bounds import (
     MAX_SPEED,
     MIN_SIZE,
 )
-from symphony.data.segment import Bools, Polylines, RunSegment, jumps, largest
+from symphony.data.segment import STATES, Bools, Polylines, RunSegment, jumps, largest
 from symphony.data.subset import lines_of, with_agents, with_lanes
 
 LATE = 1.0
@@ -31,11 +32,6 @@ NO_LINE = "a line of the map left out: not finite, or beyond what is plausible"
 LATE_EGO = "steps left out before the ego comes"
 
 
-ODD_SPEED, ODD_JUMP, ODD_HEADING, ODD_FAR = 70.0, 100.0, 8 * np.pi, 5_000.0
-ODD_SMALL, ODD_LARGE = 0.2, 30.0
-ODD_DT = (0.02, 1.0)
-
-
 def noted(segment: RunSegment, found: Mapping[str, str]) -> RunSegment:
     """The segment with more oddities, kind -> example; the first example of a kind stays."""
     return segment.replace(odd={**found, **segment.odd}) if found else segment
@@ -45,8 +41,8 @@ def mended(segment: RunSegment) -> RunSegment:
     """What remains of a segment that breaks the schema once single agents, states and lines are left out.
 
     Left out are agents without a size, or of 100 m and more; states that are not finite or beyond
-    :mod:`symphony.data.bounds`, and of a track that jumps those that are a jump away from its longest piece; lines of
-    the map with such points. The ego stays, so that the result may still break the schema.
+    :mod:`symphony.data.bounds`, and of a track that jumps those a jump away from its longest piece; lines of the map
+    with such points. The ego stays, so that the result may still break the schema.
     """
     return _agents(_states(_lines(segment)))
 
@@ -58,16 +54,14 @@ def oddities(segment: RunSegment) -> list[str]:
     points = (s.road.lanes.points, s.road.boundary.points, s.road.marks.points)
     lit = (s.signal_state != 0).mean(1)
     found = {
-        f"an agent faster than {ODD_SPEED:g} m/s": largest(s.velocity[seen]) > ODD_SPEED,
-        f"an agent that jumps, at over {ODD_JUMP:g} m/s": bool((jumps(s) > ODD_JUMP * s.dt + 1).any()),
-        f"a box with a side under {ODD_SMALL:g} m": bool((sides < ODD_SMALL).any()),
-        f"a box with a side over {ODD_LARGE:g} m": bool((sides > ODD_LARGE).any()),
-        f"a time step outside {ODD_DT[0]:g} to {ODD_DT[1]:g} s": not ODD_DT[0] <= s.dt <= ODD_DT[1],
-        "a heading that has turned more than 4 times": largest(s.heading[seen]) > ODD_HEADING,
-        f"a map that reaches beyond {ODD_FAR / 1000:g} km": max(map(largest, points)) > ODD_FAR,
-        "lights known for less than half of the time (see --hold-lights)": bool(
-            ((lit > 0) & (lit < 0.5)).any()
-        ),
+        "an agent faster than 70 m/s": largest(s.velocity[seen]) > 70,
+        "an agent that jumps, at over 100 m/s": (jumps(s) > 100 * s.dt + 1).any(),
+        "a box with a side under 0.2 m": (sides < 0.2).any(),
+        "a box with a side over 30 m": (sides > 30).any(),
+        "a time step outside 0.02 to 1 s": not 0.02 <= s.dt <= 1,
+        "a heading that has turned more than 4 times": largest(s.heading[seen]) > 8 * np.pi,
+        "a map that reaches beyond 5 km": max(map(largest, points)) > 5_000,
+        "lights known for less than half of the time (see --hold-lights)": ((lit > 0) & (lit < 0.5)).any(),
     }
     return [what for what, applies in found.items() if applies]
 
@@ -106,10 +100,9 @@ def _states(segment: RunSegment) -> RunSegment:
     if (valid == s.valid).all():
         return s
     agent, step = np.argwhere(valid != s.valid)[0].tolist()
-    masked = {
-        name: np.where(valid.reshape(*valid.shape, *[1] * (array.ndim - 2)), array, array.dtype.type(0))
-        for name, array in (("position", s.position), ("heading", s.heading), ("velocity", s.velocity))
-    }
+    masked = {name: getattr(s, name).copy() for name in STATES[:3]}
+    for array in masked.values():
+        array[~valid] = 0
     return noted(s.replace(valid=valid, **masked), {WILD: f"agent {s.agent_id[agent]}, step {step}"})
 
 
@@ -128,11 +121,8 @@ def _agents(segment: RunSegment) -> RunSegment:
     unknown = ~((size[:, 2] >= 0) & (size[:, 2] < MAX_SIZE))
     size[unknown, 2] = 0  # a height that is not known is none
     thin = (size[:, :2] > 0) & (size[:, :2] < MIN_SIZE)
-    kinds: dict[str, Bools] = {
-        NO_SIZE: np.asarray(~((size[:, :2] > 0) & (size[:, :2] < MAX_SIZE)).all(axis=1)),
-        UNSEEN: np.asarray(~s.valid.any(axis=1)),
-        THIN: np.asarray(thin.any(axis=1)),
-    }
+    sized = ((size[:, :2] > 0) & (size[:, :2] < MAX_SIZE)).all(axis=1)
+    kinds: dict[str, Any] = {NO_SIZE: ~sized, UNSEEN: ~s.valid.any(axis=1), THIN: thin.any(axis=1)}
     for kind, which in kinds.items():
         which[s.ego] &= kind == THIN
         if which.any():
@@ -148,9 +138,6 @@ def from_ego(segment: RunSegment) -> RunSegment:
     if not 0 < first * segment.dt <= LATE + 1e-6 or segment.num_steps - first < 2:
         return segment
     there = np.asarray(segment.valid[:, first:].any(axis=1))
-    timed = {
-        name: getattr(segment, name)[:, first:].copy()
-        for name in ("position", "heading", "velocity", "valid", "signal_state")
-    }
+    timed = {name: getattr(segment, name)[:, first:].copy() for name in (*STATES, "signal_state")}
     later = segment.replace(current_step=max(segment.current_step - first, 0), **timed)
     return noted(with_agents(later, there), {LATE_EGO: f"{first} of {segment.num_steps}"})

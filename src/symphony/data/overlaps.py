@@ -13,12 +13,9 @@ from symphony.data.selection import MOVING, travel
 
 Doubles = NDArray[np.float64]
 
-MANY = 0.05
-"""Share of a store's segments with overlaps above which a conversion warns."""
-BLOCK = 500_000
-"""States that are compared at a time, drivers times agents times steps."""
-TAG = "overlaps"
-"""Tag of a stored segment that has some: how many pairs of agents."""
+MANY = 0.05  # share of a store's segments with overlaps above which a conversion warns
+BLOCK = 500_000  # states that are compared at a time, drivers times agents times steps
+TAG = "overlaps"  # of a stored segment that has some: how many pairs of agents
 
 
 def overlapping(segment: RunSegment) -> NDArray[np.int64]:
@@ -59,12 +56,7 @@ def box_depth(
 ) -> Doubles:
     """[N] metres by which two boxes are in each other, by the separating-axis test; 0 or less if they are not.
 
-    Args:
-        way: [N, 2] from the centre of the one to that of the other.
-        heading_a: [N] of the one.
-        size_a: [N, 2] length and width of the one.
-        heading_b: [N] of the other.
-        size_b: [N, 2] length and width of the other.
+    Takes the way [N, 2] from the centre of one to that of the other, headings [N], lengths and widths [N, 2].
     """
     boxes: Any = ((heading_a, size_a / 2), (heading_b, size_b / 2))
     depth = np.full(len(way), np.inf)
@@ -78,9 +70,3 @@ def box_depth(
                 extent += half[:, 0] * np.abs(np.cos(relative)) + half[:, 1] * np.abs(np.sin(relative))
             depth = np.minimum(depth, extent - np.abs((way * axis).sum(-1)))
     return depth
-
-
-def tags(segment: RunSegment) -> dict[str, int]:
-    """What a store notes of a segment with overlaps; nothing for one without."""
-    found = len(overlapping(segment))
-    return {TAG: found} if found else {}

@@ -6,7 +6,6 @@ processes is a path, no process holds more than one record in memory, and what i
 
 from __future__ import annotations
 
-import functools
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -22,53 +21,32 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
 from symphony.data.sources import Reader
 from symphony.data.sources.base import unexpected
-from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.data.subset import crop
 from symphony.errors import ConfigError, DataError
 
-PART_BYTES, PART_FILES = 8 << 20, 64
-"""Small files are converted so many at a time, since every part costs some 60 small files to write and delete."""
-PRESENT = "present"
-"""Entry of a part for a segment that the store held before."""
-ODD = "odd"
-"""Tag of a segment with something unusual: what it is -> an example."""
+PART_BYTES, PART_FILES = 8 << 20, 64  # small files go together: a part is some 60 files to write and delete
+ODD = "odd"  # tag of a segment with something unusual: what it is -> an example
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """How the records of a file become segments.
-
-    Attributes:
-        reader: of the format.
-        dt: seconds per step.
-        sigma: of the smoothing in seconds, 0 for none.
-        interactive: interactive agents a segment must have (N_I).
-        before: path of the store that is added to, and the segments it held; their ids are passed over.
-        exclude_overlaps: leave out segments with overlapping boxes (see :mod:`symphony.data.overlaps`).
-        radius: metres around the ego's path that are kept (see :func:`symphony.data.subset.crop`); None for all.
-        hold_lights: keep the state of lights where the log has none.
-        strict: leave out records of which something odd would be (see :mod:`symphony.data.odd`).
-    """
+    """How the records of a file become segments: see :func:`symphony.data.convert.convert`."""
 
     reader: Reader
     dt: float
     sigma: float
     interactive: int
-    before: tuple[str, int] | None = None
     exclude_overlaps: bool = False
     radius: float | None = None
     hold_lights: bool = False
     strict: bool = False
 
-    def outcomes(self, path: str) -> Iterator[RunSegment | Skip | None]:
-        """What becomes of each record of a file, in its order; None where the store held the segment before."""
-        before = frozenset[str]() if self.before is None else _ids(*self.before)
+    def outcomes(self, path: str) -> Iterator[RunSegment | Skip]:
+        """Yield what becomes of each record of a file, in its order."""
         for record in self.reader.read(path):
             if isinstance(record, DataError):
                 yield Skip.of(record, path)
-            elif record.segment_id in before:
-                yield None
             else:
                 yield self._prepared(record, path)
 
@@ -103,15 +81,10 @@ class Preparation:
 
 
 def tags_of(segment: RunSegment) -> dict[str, Any]:
-    """What a segment is tagged with that has something unusual, boxes that overlap, or lanes that were joined."""
+    """Return the tags of a segment: what is unusual, boxes that overlap, lanes that were joined."""
     odd = {**segment.odd, **dict.fromkeys(oddities(segment), "")}
-    gaps = {joins.TAG: segment.joined_gaps} if segment.joined_gaps else {}
-    return ({ODD: odd} if odd else {}) | overlaps.tags(segment) | gaps
-
-
-@functools.lru_cache(maxsize=1)
-def _ids(path: str, count: int) -> frozenset[str]:
-    return frozenset(SegmentStore(path).ids[:count])
+    pairs = len(overlaps.overlapping(segment))
+    return {k: v for k, v in ((ODD, odd), (overlaps.TAG, pairs), (joins.TAG, segment.joined_gaps)) if v}
 
 
 @dataclass(frozen=True)
@@ -123,8 +96,8 @@ class Task:
     path: Path
 
 
-def tasks_of(recipe: Preparation, files: list[tuple[str, int]], folder: Path) -> list[Task]:
-    """The parts that files of so many bytes are converted in; they depend on nothing but the sizes."""
+def tasks_of(recipe: Preparation, files: list[list[Any]], folder: Path) -> list[Task]:
+    """Return the parts that files (path, bytes) are converted in; they depend on nothing but the sizes."""
     groups: list[list[str]] = []
     total = 0
     for name, size in files:
@@ -139,14 +112,13 @@ def tasks_of(recipe: Preparation, files: list[tuple[str, int]], folder: Path) ->
 def make_part(task: Task) -> Path:
     """Convert the files of a task, unless that was done before; the part appears once it is complete.
 
-    Its report has a list of ``entries`` for each file: the number of a segment in the part, a skipped record, or
-    :data:`PRESENT`.
+    Its report has a list of ``entries`` for each file: the number of a segment in the part, or a skipped record.
     """
     if task.path.exists():
         return task.path
     draft = Path(tempfile.mkdtemp(prefix=f"{task.path.name}.", dir=task.path.parent))
     with StoreWriter(draft) as writer:
-        entries = [[_entry(o, writer, file) for o in task.recipe.outcomes(file)] for file in task.files]
+        entries = [[_entry(o, writer) for o in task.recipe.outcomes(file)] for file in task.files]
         writer.write_report({"entries": entries})
     try:
         draft.rename(task.path)
@@ -157,13 +129,10 @@ def make_part(task: Task) -> Path:
     return task.path
 
 
-def _entry(outcome: RunSegment | Skip | None, writer: StoreWriter, file: str) -> Any:
-    if isinstance(outcome, RunSegment):
-        # Of a name that comes twice the first is kept; whoever takes them out of the part sees it twice.
-        if writer.has(outcome.segment_id):
-            return writer.index_of(outcome.segment_id)
-        try:
-            return writer.append(outcome, tags=tags_of(outcome) or None)
-        except DataError as error:
-            outcome = Skip.of(error, file, outcome.segment_id)
-    return outcome.to_json() if isinstance(outcome, Skip) else PRESENT
+def _entry(outcome: RunSegment | Skip, writer: StoreWriter) -> Any:
+    if isinstance(outcome, Skip):
+        return outcome.to_json()
+    # Of a name that comes twice the first is kept; whoever takes them out of the part sees it twice.
+    if writer.has(outcome.segment_id):
+        return writer.index_of(outcome.segment_id)
+    return writer.append(outcome, tags=tags_of(outcome))

@@ -15,15 +15,9 @@ from symphony.errors import DataError
 
 @dataclass(frozen=True)
 class Skip:
-    """A record or file that was left out.
+    """A record or file that was left out: why, and of what, where known.
 
-    Attributes:
-        message: why.
-        file: path of the file.
-        segment: id of the segment, where known.
-        field: field of the segment or of the format, where known.
-        exclusion: the paper's exclusion it fell under (see :data:`symphony.data.selection.EXCLUSIONS`); empty
-            for what can't be used.
+    ``exclusion`` is the one of :data:`symphony.data.selection.EXCLUSIONS` it fell under; empty for unusable data.
     """
 
     message: str
@@ -40,24 +34,20 @@ class Skip:
 
     @classmethod
     def of(cls, error: DataError, path: object = "", segment: str = "", exclusion: str = "") -> Skip:
-        """What a report says of an error."""
+        """Return what a report says of an error."""
         texts = (error.message, str(path), error.segment or segment, error.field or "", exclusion)
         # Half a character, as damaged text may hold, could not be written, and would end the conversion.
         return cls(*(text.encode(errors="backslashreplace").decode() for text in texts))
 
     def to_json(self) -> dict[str, str]:
-        """As kept in a report: without ``exclusion`` where there is none."""
-        found = asdict(self)
-        return found if self.exclusion else {k: v for k, v in found.items() if k != "exclusion"}
+        """Return it as kept in a report: without ``exclusion`` where there is none."""
+        return {name: text for name, text in asdict(self).items() if text or name != "exclusion"}
 
     @property
     def error(self) -> DataError:
         """The error it was."""
-        places = {"file": self.file or None, "segment": self.segment or None, "field": self.field or None}
-        return DataError(self.message, **places)
-
-    def __str__(self) -> str:
-        return str(self.error)
+        where = {"file": self.file or None, "segment": self.segment or None, "field": self.field or None}
+        return DataError(self.message, **where)
 
 
 @dataclass
@@ -66,19 +56,16 @@ class Report:
 
     Attributes:
         converted: segments added.
-        present: segments that the store held before.
         files: files read.
         skipped: what was left out, the paper's exclusions included.
         settings: arguments of the conversion.
         odd: what is unusual or was left out, and about how many of the segments added.
-        overlaps: segments added in whose log a moving vehicle's box overlaps another (see
-            :mod:`symphony.data.overlaps`).
-        joined_gaps: links between lanes that were added, summed over the segments (see :mod:`symphony.data.joins`).
+        overlaps: segments added in whose log a moving vehicle's box overlaps another.
+        joined_gaps: links between lanes that were added, summed over the segments.
         odd_examples: the first of each kind of ``odd``.
     """
 
     converted: int = 0
-    present: int = 0
     files: int = 0
     skipped: list[Skip] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
@@ -98,11 +85,10 @@ class Report:
         """What the user should hear; empty if nothing."""
         if self.overlaps <= MANY * self.converted:
             return ""
-        share = 100 * self.overlaps / self.converted
         return (
-            f"in the logs of {self.overlaps} of {self.converted} segments ({share:.1f} %) a moving vehicle's box "
-            "overlaps another: collisions there count errors of the tracking, too; "
-            "--exclude-overlaps leaves them out"
+            f"in the logs of {self.overlaps} of {self.converted} segments "
+            f"({100 * self.overlaps / self.converted:.1f} %) a moving vehicle's box overlaps another: collisions "
+            "there count errors of the tracking, too; --exclude-overlaps leaves them out"
         )
 
     @property
@@ -122,29 +108,25 @@ class Report:
         return {name: found[name] for name in EXCLUSIONS}
 
     def to_json(self) -> dict[str, Any]:
-        """As kept with the store."""
+        """Return it as kept with the store."""
         skipped = [skip.to_json() for skip in self.skipped]
         return {**vars(self), "skipped": skipped, "exclusions": self.exclusions, "reasons": self.reasons}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Report:
-        """The reverse of :meth:`to_json`; an empty mapping gives an empty report.
-
-        Raises:
-            DataError: it is no such report.
-        """
+        """Reverse :meth:`to_json`, or raise a :class:`DataError`; an empty mapping gives an empty report."""
         known = {item.name: value[item.name] for item in fields(cls) if item.name in value}
         for key, found in known.items():
             if not isinstance(found, type(getattr(cls(), key))):
                 raise DataError(f"not a conversion report: {str(found)[:40]!r}", field=key)
         try:
-            skipped = [Skip(**{k: _text(v) for k, v in skip.items()}) for skip in known.pop("skipped", ())]
-            return cls(**known, skipped=skipped)
+            skipped = [Skip(**{k: str(v) for k, v in skip.items()}) for skip in known.pop("skipped", ())]
         except (TypeError, AttributeError) as error:
             raise DataError(f"not a conversion report: {error}", field="skipped") from error
+        return cls(**known, skipped=skipped)
 
     def after(self, earlier: Report) -> Report:
-        """This report joined to the one of an earlier conversion into the same store."""
+        """Join this report to the one of an earlier conversion into the same store."""
         return Report(
             converted=earlier.converted + self.converted,
             files=earlier.files + self.files,
@@ -158,16 +140,10 @@ class Report:
 
 
 def left_out(skipped: Iterable[Skip]) -> list[str]:
-    """A line for each reason: how often, why, and the first segment."""
+    """Return a line for each reason: how often, why, and the first segment."""
     first: dict[str, Skip] = {}
     counts = Counter[str]()
     for skip in skipped:
         counts[skip.reason] += 1
         first.setdefault(skip.reason, skip)
     return [f"{count} x {reason} (first: {first[reason].segment})" for reason, count in counts.most_common()]
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{str(value)[:40]!r} is no text")
-    return value

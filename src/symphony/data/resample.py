@@ -5,7 +5,6 @@ These are choices of the one who prepares the data; readers keep to the log.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -13,25 +12,23 @@ from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_DT, MIN_DT, check_counts
 from symphony.data.odd import noted
-from symphony.data.segment import Ints, RunSegment, SignalState, validate
+from symphony.data.segment import STATES, Ints, RunSegment, SignalState, validate, wrap
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]
 
-MAX_SIGMA = 10.0
-"""Seconds of smoothing; a window that is much longer leaves nothing of the motion."""
-BLOCK = 1_000_000
+MAX_SIGMA = 10.0  # seconds of smoothing; a window that is much longer leaves nothing of the motion
+BLOCK = 1_000_000  # numbers that are held at a time
+EVEN = 0.1  # share of a time step by which a frame may come early or late without being moved
+MAX_GAP = 1.0  # seconds between two frames of a log that are filled in between; a longer gap stays open
+SLOW, FAST = (
+    1.0,
+    2.0,
+)  # m/s between which the heading goes over from the logged one to the direction of motion
 
-EVEN = 0.1
-"""Share of a time step by which a frame may come early or late without being moved."""
-MAX_GAP = 1.0
-"""Seconds between two frames of a log that are filled in between; a longer gap stays open."""
 LOST = "frames lost in the recording, filled in between"
 UNEVEN = "frames at uneven times, brought to even ones"
 REPEATED = "frames left out: not after those before them"
-
-SLOW, FAST = 1.0, 2.0
-"""m/s between which the heading goes over from the logged one to the direction of motion when smoothing."""
 
 
 def resample(segment: RunSegment, dt: float) -> RunSegment:
@@ -63,10 +60,8 @@ def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
     for back in range(1, every):
         before = state[:, every - back :: every][:, : later.shape[1]]
         later[later == SignalState.UNKNOWN] = before[later == SignalState.UNKNOWN]
-    states = ("position", "heading", "velocity", "valid")
-    picked = {name: getattr(segment, name)[:, ::every].copy() for name in states}
-    current = segment.current_step // every
-    return segment.replace(dt=dt, signal_state=lights, current_step=current, **picked)
+    picked = {name: getattr(segment, name)[:, ::every].copy() for name in STATES}
+    return segment.replace(dt=dt, signal_state=lights, current_step=segment.current_step // every, **picked)
 
 
 def hold_lights(segment: RunSegment) -> RunSegment:
@@ -124,12 +119,9 @@ def evened(segment: RunSegment, times: Doubles) -> RunSegment:
     found.valid[:, open_] = False
     found.signal_state[:, open_] = SignalState.UNKNOWN
     lost, uneven = gap > 1.5 * dt, (gap > 0) & (gap <= 1.5 * dt)
-    kinds = (
-        (LOST, int(lost.sum()), steps),
-        (UNEVEN, int(uneven.sum()), steps),
-        (REPEATED, len(times) - len(frames), len(times)),
-    )
-    masked = {n: _masked(getattr(found, n), found.valid) for n in ("position", "heading", "velocity")}
+    repeated = len(times) - len(frames)
+    kinds = ((LOST, lost.sum(), steps), (UNEVEN, uneven.sum(), steps), (REPEATED, repeated, len(times)))
+    masked = {name: _masked(getattr(found, name), found.valid) for name in STATES[:3]}
     return noted(found.replace(**masked), {kind: f"{count} of {of}" for kind, count, of in kinds if count})
 
 
@@ -138,9 +130,8 @@ def _between(segment: RunSegment, before: Ints, after: Ints, share: Doubles) -> 
     valid = segment.valid[:, before] & segment.valid[:, after]
 
     def between(array: NDArray[Any]) -> Doubles:
-        part = share.reshape(1, -1, *[1] * (array.ndim - 2))
         first, second = array[:, before].astype(np.float64), array[:, after].astype(np.float64)
-        return first + part * (second - first)
+        return first + share[:, None] * (second - first)
 
     heading = segment.heading.astype(np.float64)
     turn = wrap(heading[:, after] - heading[:, before])
@@ -177,12 +168,8 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     share = np.clip((speed - SLOW) / (FAST - SLOW), 0, 1)
     # Unwrapping must not show: the result stays on the logged heading's branch.
     heading = logged + wrap(steady + share * turn - logged)
-    return dataclasses.replace(
-        segment,
-        position=_masked(position, valid),
-        velocity=_masked(velocity, valid),
-        heading=_masked(np.where(fitted, heading, logged), valid),
-    )
+    states = {"position": position, "velocity": velocity, "heading": np.where(fitted, heading, logged)}
+    return segment.replace(**{name: _masked(array, valid) for name, array in states.items()})
 
 
 def local_line(
@@ -196,7 +183,7 @@ def local_line(
     masked = (values - mean) * there[..., None]
     steps = valid.shape[1]
     rows = max(BLOCK // steps, 1)  # steps at a time: their lags to all others stay below BLOCK numbers
-    parts = (range(k, min(k + rows, steps)) for k in range(0, steps, rows))
+    parts = (slice(k, min(k + rows, steps)) for k in range(0, steps, rows))
     blocks = [_moments(there, masked, part, dt, sigma) for part in parts]
     s0, s1, s2, y0, y1 = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
     spread = s0 * s2 - s1**2
@@ -207,14 +194,13 @@ def local_line(
     return np.where(fitted[..., None], value, values), np.where(fitted[..., None], slope, 0.0), fitted
 
 
-def _moments(there: Doubles, masked: Doubles, rows: range, dt: float, sigma: float) -> tuple[Doubles, ...]:
+def _moments(there: Doubles, masked: Doubles, rows: slice, dt: float, sigma: float) -> tuple[Doubles, ...]:
     """Weighted sums around some steps: of 1, lag and lag squared [A, rows]; of values, and by lag [A, rows, D]."""
-    steps = there.shape[1]
-    columns = slice(0, steps)
-    if len(rows) < steps:  # a long log: what is out of the window's reach is left out
-        reach = int(min(4 * sigma / dt + 1, steps))
-        columns = slice(max(rows.start - reach, 0), min(rows.stop + reach, steps))
-    lag = (np.arange(steps)[None, columns] - np.arange(steps)[rows.start : rows.stop, None]) * dt
+    steps, columns = np.arange(there.shape[1]), slice(None)
+    if rows != slice(0, len(steps)):  # a long log: what is out of the window's reach is left out
+        reach = int(min(4 * sigma / dt + 1, len(steps)))
+        columns = slice(max(rows.start - reach, 0), rows.stop + reach)
+    lag = (steps[None, columns] - steps[rows, None]) * dt
     weight = np.where(np.abs(lag) <= 4 * sigma, np.exp(-0.5 * (lag / sigma) ** 2), 0.0)
     there, masked = there[:, columns], masked[:, columns]
     sums = (there @ (weight * lag**k).T for k in range(3))
@@ -227,11 +213,6 @@ def _unwrapped(heading: Doubles, valid: NDArray[np.bool_]) -> Doubles:
     for agent in np.flatnonzero(valid.any(axis=1)):
         result[agent, valid[agent]] = np.unwrap(heading[agent, valid[agent]])
     return result
-
-
-def wrap(angle: Doubles) -> Doubles:
-    """The same angles in [-π, π)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _masked(array: Doubles, valid: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -25,6 +25,8 @@ Ints = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
 Check = tuple[str, bool, str]
 """Field, whether it holds, and what is wrong if it doesn't."""
+STATES = ("position", "heading", "velocity", "valid")
+"""Fields with a row for each agent and a column for each step."""
 
 
 class AgentType(IntEnum):
@@ -211,8 +213,8 @@ class RunSegment:
         return dataclasses.replace(self, **changes)
 
 
-def content_hash(segment: RunSegment) -> str:
-    """SHA-256 over every field but ``group``, array dtypes and shapes included; equal content, equal hashes."""
+def content_hash(segment: RunSegment | RoadMap) -> str:
+    """Return SHA-256 over all fields that are hashed, with dtypes and shapes; equal content, equal hashes."""
     digest = hashlib.sha256()
     _feed(digest, segment)
     return digest.hexdigest()
@@ -221,10 +223,9 @@ def content_hash(segment: RunSegment) -> str:
 def _feed(digest: Any, value: Any) -> None:
     if dataclasses.is_dataclass(value):
         for item in dataclasses.fields(value):
-            if not item.metadata.get("hashed", True):
-                continue
-            digest.update(item.name.encode() + b"=")
-            _feed(digest, getattr(value, item.name))
+            if item.metadata.get("hashed", True):
+                digest.update(item.name.encode() + b"=")
+                _feed(digest, getattr(value, item.name))
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str}{value.shape}".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
@@ -236,11 +237,7 @@ def _feed(digest: Any, value: Any) -> None:
 def validate(segment: RunSegment) -> RunSegment:
     """Check the whole schema: sizes, dtypes, shapes, ranges, indices, finite and plausible numbers.
 
-    Returns:
-        The segment itself.
-
-    Raises:
-        DataError: naming the segment and the first field that breaks the schema.
+    Returns the segment itself, or raises a :class:`DataError` that names it and the first field that is wrong.
     """
     for name, ok, message in _checks(segment):
         if not ok:
@@ -250,27 +247,27 @@ def validate(segment: RunSegment) -> RunSegment:
 
 def _checks(s: RunSegment) -> Iterator[Check]:
     agents, steps = s.num_agents, s.valid.shape[1] if s.valid.ndim == 2 else -1
+    lights, lanes = len(s.signal_lane), len(s.road.lane_id)
     yield "segment_id", bool(s.segment_id) and "/" not in s.segment_id, "must be a non-empty name without '/'"
     # The counts come before anything that is slow on large arrays.
-    yield "valid", steps <= bounds.MAX_STEPS, f"{steps} steps, at most {bounds.MAX_STEPS}: cut the log"
-    yield "agent_id", agents <= bounds.MAX_AGENTS, f"{agents} agents, at most {bounds.MAX_AGENTS}"
-    states = agents * steps
-    yield "valid", states <= bounds.MAX_STATES, f"{states} states, at most {bounds.MAX_STATES}: cut the log"
+    points = sum(len(lines.points) for lines in (s.road.lanes, s.road.boundary, s.road.marks))
+    for name, count, least, most, what in (
+        ("valid", steps, 2, bounds.MAX_STEPS, "steps"),
+        ("agent_id", agents, 1, bounds.MAX_AGENTS, "agents"),
+        ("valid", agents * steps, 1, bounds.MAX_STATES, "states"),
+        ("road", points, 0, bounds.MAX_POINTS, "map points"),
+    ):
+        fits = least <= count <= most or s.valid.ndim != 2
+        yield name, fits, f"{count} {what}, allowed are {least} to {most}"
     for name in ("segment_id", "source", "file", "group"):
         text = getattr(s, name)
         yield name, len(text) <= bounds.MAX_NAME, f"{len(text)} characters, at most {bounds.MAX_NAME}"
         yield name, not text or text.isprintable(), "holds characters that can't be printed"
-    points = sum(len(lines.points) for lines in (s.road.lanes, s.road.boundary, s.road.marks))
-    yield "road", points <= bounds.MAX_POINTS, f"{points} map points, at most {bounds.MAX_POINTS}"
-    yield "dt", np.isfinite(s.dt) and s.dt > 0, f"must be positive, is {s.dt}"
     yield "valid", s.valid.dtype == np.bool_ and s.valid.shape == (agents, steps), "must be bool [A, T]"
-    yield "valid", steps >= 2, f"needs at least 2 steps, has {steps}"
-    yield "agent_id", agents >= 1, "has no agents"
+    yield from _array("agent_id", s.agent_id, (agents,), np.int64)
     yield "agent_id", len(np.unique(s.agent_id)) == agents, "ids are not unique"
     yield from _array("agent_type", s.agent_type, (agents,), np.uint8, len(AgentType))
     yield from _array("size", s.size, (agents, 3), np.float32)
-    yield "size", bool((s.size[:, :2] > 0).all()), "length and width must be positive"
-    yield "size", bool((s.size < bounds.MAX_SIZE).all()), f"a side of {bounds.MAX_SIZE:g} m or more"
     yield from _array("position", s.position, (agents, steps, 3), np.float32)
     yield from _array("heading", s.heading, (agents, steps), np.float32)
     yield from _array("velocity", s.velocity, (agents, steps, 2), np.float32)
@@ -279,31 +276,44 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     yield "ego", 0 <= s.ego < agents, f"index {s.ego} outside the {agents} agents"
     yield "ego", bool(s.valid[s.ego].any()), "the ego is valid at no step"
     yield from _road_checks(s.road)
-    lights = len(s.signal_lane)
-    yield from _array("signal_lane", s.signal_lane, (lights,), np.int32, len(s.road.lane_id))
+    yield from _array("signal_lane", s.signal_lane, (lights,), np.int32, lanes)
     yield from _array("signal_point", s.signal_point, (lights, 3), np.float32)
     yield from _array("signal_state", s.signal_state, (lights, steps), np.uint8, len(SignalState))
     yield from _array("interest", s.interest, (len(s.interest),), np.int32, agents)
     yield from _array("predict", s.predict, (len(s.predict),), np.int32, agents)
-    finite = s.origin.dtype == np.float64 and s.origin.shape == (3,) and bool(np.isfinite(s.origin).all())
-    yield "origin", finite, "must be 3 finite numbers, float64"
+    yield from _array("origin", s.origin, (3,), np.float64)
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
-    yield from _value_checks(s)
+    sides = bounds.MIN_SIZE, bounds.MAX_SIZE
+    plausible: tuple[tuple[str, float, float, float, float, str], ...] = (
+        ("dt", s.dt, s.dt, bounds.MIN_DT, bounds.MAX_DT, "s"),
+        ("size", s.size[:, :2].min(), largest(s.size), *sides, "m: length and width must be positive"),
+        ("size", s.size[:, 2].min(), 0, 0, bounds.MAX_SIZE, "m of height"),
+        ("velocity", 0, largest(s.velocity), 0, bounds.MAX_SPEED, "m/s"),
+        ("heading", 0, largest(s.heading), 0, bounds.MAX_HEADING, "rad"),
+        ("position", 0, float(jumps(s).max(initial=0)), 0, bounds.MAX_JUMP, "m in a step"),
+        ("position", 0, largest(s.position[..., 2]), 0, bounds.MAX_HEIGHT, "m of height"),
+        ("signal_point", 0, largest(s.signal_point), 0, bounds.MAX_COORDINATE, "m from the origin"),
+        ("origin", 0, largest(s.origin), 0, bounds.MAX_ORIGIN, "m"),
+    )
+    for name, low, high, lowest, highest, unit in plausible:
+        fits = lowest <= low and high <= highest
+        worst = low if low < lowest else high
+        yield name, fits, f"{worst:.4g} {unit}, plausible are {lowest:g} to {highest:g}"
 
 
 def _road_checks(road: RoadMap) -> Iterator[Check]:
     lanes = len(road.lanes)
     yield "road.lanes", lanes >= 1, "has no lanes"
-    for name in ("lanes", "boundary", "marks"):
-        yield from _polylines(f"road.{name}", getattr(road, name), 2 if name == "boundary" else 1)
-    yield "road.lane_id", road.lane_id.shape == (lanes,), "must be [L]"
+    for name, least in (("lanes", 1), ("boundary", 2), ("marks", 1)):
+        yield from _polylines(f"road.{name}", getattr(road, name), least)
+    yield from _array("road.lane_id", road.lane_id, (lanes,), np.int64)
     yield "road.lane_id", len(np.unique(road.lane_id)) == lanes, "ids are not unique"
     yield from _array("road.lane_type", road.lane_type, (lanes,), np.uint8, len(LaneType))
     for name, most in (("speed_limit", bounds.MAX_SPEED), ("lane_width", bounds.MAX_WIDTH)):
         array = getattr(road, name)
         yield f"road.{name}", array.shape == (lanes,) and array.dtype == np.float32, "must be float32 [L]"
-        yield f"road.{name}", bool((np.isnan(array) | (array > 0)).all()), "must be positive or NaN"
-        yield f"road.{name}", not (array > most).any(), f"more than {most:g}"
+        fits = np.isnan(array) | ((array > 0) & (array <= most))
+        yield f"road.{name}", bool(fits.all()), f"must be NaN or positive and at most {most:g}"
     for name in ("successors", "left_neighbors", "right_neighbors"):
         array = getattr(road, name)
         yield from _array(f"road.{name}", array, (len(array), 2), np.int32, lanes)
@@ -313,6 +323,7 @@ def _road_checks(road: RoadMap) -> Iterator[Check]:
 
 
 def _polylines(name: str, lines: Polylines, least: int) -> Iterator[Check]:
+    yield name, lines.offsets.dtype == np.int64, "offsets must be int64"
     ends = lines.offsets[0] == 0 and lines.offsets[-1] == len(lines.points)
     # Compared, not subtracted: differences of damaged offsets can overflow and look like counts.
     ordered = bool((lines.offsets[1:] >= lines.offsets[:-1]).all())
@@ -321,42 +332,23 @@ def _polylines(name: str, lines: Polylines, least: int) -> Iterator[Check]:
     yield name, len(short) == 0, f"line {short[:1]} has fewer than {least} points"
     yield from _array(name, lines.points, (len(lines.points), 3), np.float32)
     far, height = largest(lines.points[:, :2]), largest(lines.points[:, 2])
-    message = f"{far:.4g} m from the origin, at most {bounds.MAX_COORDINATE:g}"
-    yield name, far <= bounds.MAX_COORDINATE, message
-    yield name, height <= bounds.MAX_HEIGHT, f"a height of {height:.4g} m, at most {bounds.MAX_HEIGHT:g}"
+    fits = far <= bounds.MAX_COORDINATE and height <= bounds.MAX_HEIGHT
+    most = f"at most {bounds.MAX_COORDINATE:g} and {bounds.MAX_HEIGHT:g}"
+    yield name, fits, f"{far:.4g} m from the origin or {height:.4g} m of height, {most}"
 
 
 def _array(
     name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: Any, below: int | None = None
 ) -> Iterator[Check]:
-    # Names of types are slow to form, and every array of every segment comes through here.
-    if array.dtype != dtype:
-        yield name, False, f"dtype {array.dtype}, expected {np.dtype(dtype)}"
-    if array.shape != shape:
-        yield name, False, f"shape {array.shape}, expected {shape}"
+    # Messages are slow to form, and every array of every segment comes through here.
+    if array.dtype != dtype or array.shape != shape:
+        found = f"is {array.dtype} {list(array.shape)}, expected {np.dtype(dtype)} {list(shape)}"
+        yield name, False, found
     if below is not None:
         yield name, bool(((array >= 0) & (array < below)).all()), f"values outside 0 … {below - 1}"
     elif not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array))
         yield name, False, f"{len(bad)} numbers that are not finite, first at index {bad[:1].tolist()}"
-
-
-def _value_checks(s: RunSegment) -> Iterator[Check]:
-    """What is plausible, once shapes and dtypes are right and numbers finite."""
-    least, most = bounds.MIN_DT, bounds.MAX_DT
-    yield "dt", least <= s.dt <= most, f"{s.dt:g} s, expected {least:g} to {most:g}"
-    small = bool((s.size[:, :2] < bounds.MIN_SIZE).any())
-    yield "size", not small, f"a side of less than {bounds.MIN_SIZE:g} m"
-    yield "size", bool((s.size[:, 2] >= 0).all()), "a height below 0"
-    for name, found, most, unit in (
-        ("velocity", largest(s.velocity), bounds.MAX_SPEED, "m/s"),
-        ("heading", largest(s.heading), bounds.MAX_HEADING, "rad"),
-        ("position", float(jumps(s).max(initial=0)), bounds.MAX_JUMP, "m in a step"),
-        ("position", largest(s.position[..., 2]), bounds.MAX_HEIGHT, "m of height"),
-        ("signal_point", largest(s.signal_point), bounds.MAX_COORDINATE, "m from the origin"),
-        ("origin", largest(s.origin), bounds.MAX_ORIGIN, "m"),
-    ):
-        yield name, found <= most, f"{found:.4g} {unit}, at most {most:g} is plausible"
 
 
 def jumps(s: RunSegment) -> NDArray[np.float64]:
@@ -374,5 +366,10 @@ def line_lengths(lines: Polylines) -> NDArray[np.float64]:
 
 
 def largest(array: NDArray[Any]) -> float:
-    """The largest magnitude; 0 of no numbers."""
+    """Return the largest magnitude; 0 of no numbers."""
     return float(np.abs(array).max(initial=0))
+
+
+def wrap(angle: Any) -> Any:
+    """Return the same angles in [-π, π)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +22,8 @@ EXCLUSIONS = {
     "overlaps": "boxes that overlap in the log",
 }
 """The paper's exclusions, and last the one a conversion may add, in words."""
-POINT_SPACING = 2.0
-"""Metres between the roadgraph points that are counted."""
-MOVING = 2.0
-"""Metres of logged travel past which an agent counts as moving."""
+POINT_SPACING = 2.0  # metres between the roadgraph points that are counted
+MOVING = 2.0  # metres of logged travel past which an agent counts as moving
 
 
 def travel(segment: RunSegment) -> NDArray[np.float32]:
@@ -40,8 +37,7 @@ def travel(segment: RunSegment) -> NDArray[np.float32]:
     return np.where(segment.valid, away, 0).max(1)
 
 
-@dataclass(frozen=True)
-class InteractiveChoice:
+class InteractiveChoice(NamedTuple):
     """The agents [count] that are simulated (the ego, its partner, the rest), and why the partner was chosen."""
 
     agents: NDArray[np.int64]
@@ -63,12 +59,12 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
     """
     seen = segment.valid[:, 0] & (segment.agent_type == AgentType.VEHICLE)
     others = seen & (np.arange(segment.num_agents) != segment.ego)
-    order = _nearest_first(segment)
+    first = segment.position[:, 0, :2]
+    distance = np.linalg.norm(first - first[segment.ego], axis=-1)
+    order = np.lexsort((distance, ~segment.valid.all(1)))
     others, moves = order[others[order]], order[(others & (travel(segment) > MOVING))[order]]
     has_ego = bool(segment.valid[segment.ego, 0])
-    partner, context = None, None
-    if has_ego and count > 1:
-        partner, context = _partner(segment, others, moves)
+    partner, context = _partner(segment, others, moves) if has_ego and count > 1 else (None, None)
     chosen = [segment.ego] if partner is None else [segment.ego, partner]
     chosen += [agent for agent in moves.tolist() if agent != partner]
     if (len(chosen) < count and not fewer) or not has_ego:
@@ -94,9 +90,8 @@ def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
     too_few = 0
     for segment in segments:
         try:
-            choice = interactive_choice(segment, count)
-            agents = segment.agent_id[choice.agents].tolist()
-            found[segment.segment_id] = {"context": choice.context, "agents": agents}
+            agents, context = interactive_choice(segment, count)
+            found[segment.segment_id] = {"context": context, "agents": segment.agent_id[agents].tolist()}
         except DataError:
             too_few += 1
     counts = Counter(each["context"] for each in found.values())
@@ -120,24 +115,13 @@ def _partner(
     throughout = segment.valid[moves].all(1)
     pool = moves[throughout] if throughout.any() else moves
     found = relations(segment, pool)
-    for gaps, contexts in (
-        ((found.merge,), (Context.MERGE,)),
-        ((found.crossing,), (Context.CROSSING,)),
-        ((found.leader, found.follower), (Context.LEADER, Context.FOLLOWER)),
-    ):
-        gap = np.min(gaps, axis=0)
-        # The first of the smallest gaps, so the nearest of them.
-        best = int(gap.argmin())
-        if np.isfinite(gap[best]):
-            return int(pool[best]), contexts[int(np.argmin([each[best] for each in gaps]))]
+    following = np.minimum(found.leader, found.follower)
+    queue = Context.LEADER if found.leader[following.argmin()] <= following.min() else Context.FOLLOWER
+    gaps = {Context.MERGE: found.merge, Context.CROSSING: found.crossing, queue: following}
+    for context, gap in gaps.items():
+        if np.isfinite(gap.min()):
+            return int(pool[gap.argmin()]), context  # the first of the smallest gaps, so the nearest of them
     return int(pool[0]), Context.NEAREST
-
-
-def _nearest_first(segment: RunSegment) -> NDArray[np.int64]:
-    """[A] agents by distance from the ego at the first step, those seen throughout before the others."""
-    first = segment.position[:, 0, :2]
-    distance = np.linalg.norm(first - first[segment.ego], axis=-1)
-    return np.lexsort((distance, ~segment.valid.all(1)))
 
 
 def road_points(segment: RunSegment) -> int:
@@ -155,15 +139,15 @@ def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
     Playback agents are those seen at some step but for the ``count`` interactive ones that a segment must have at its
     first step; for roadgraph points see :func:`road_points`.
     """
-    where = {"file": segment.file or None, "segment": segment.segment_id}
-    playback = int(segment.valid.any(1).sum()) - count
-    if playback > MAX_PLAYBACK_AGENTS:
-        message = f"{playback} playback agents, at most {MAX_PLAYBACK_AGENTS} allowed"
-        return "playback_agents", DataError(message, **where, field="agents")
-    points = road_points(segment)
-    if points > MAX_ROAD_POINTS:
-        message = f"{points} roadgraph points, at most {MAX_ROAD_POINTS} allowed"
-        return "roadgraph_points", DataError(message, **where, field="road")
+    playback, points = int(segment.valid.any(1).sum()) - count, road_points(segment)
+    for kind, field, number, most in (
+        ("playback_agents", "agents", playback, MAX_PLAYBACK_AGENTS),
+        ("roadgraph_points", "road", points, MAX_ROAD_POINTS),
+    ):
+        if number > most:
+            message = f"{number} {kind.replace('_', ' ')}, at most {most} allowed"
+            file = segment.file or None
+            return kind, DataError(message, file=file, segment=segment.segment_id, field=field)
     try:
         interactive_agents(segment, count)
     except DataError as error:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import mmap
 import operator
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, SupportsIndex, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data import store_format as layout
+from symphony.data.bounds import MAX_AGENTS, MAX_POINTS, MAX_STEPS
 from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
-from symphony.data.store_format import MAPS, SEGMENTS, decoded, read_ids, read_indices, rows
+from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_header, read_json
 from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
@@ -37,14 +39,31 @@ class SegmentStore(Sequence[RunSegment]):
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path).absolute()
-        layout.check_header(self.path)
-        self._segments, self._maps = read_indices(self.path)
-        more = layout.check_columns(self.path, SEGMENTS, self._segments)
-        if layout.check_columns(self.path, MAPS, self._maps) or more:
-            layout.check_whole(self.path, len(self._segments))
-        self._unseen = np.ones(len(self._segments), np.bool_)
-        self._columns = layout.map_columns(self.path, SEGMENTS, self._segments)
-        self._road_columns = layout.map_columns(self.path, MAPS, self._maps)
+        check_header(self.path)
+        self._segments, self._maps = _read_indices(self.path)
+        self._columns: dict[str, NDArray[Any]] = {}
+        more = self._map_columns(SEGMENTS, self._segments)
+        if self._map_columns(MAPS, self._maps) or more:
+            counted = self.report.get("converted")
+            if isinstance(counted, int) and counted > len(self):
+                message = (
+                    f"index holds {len(self)} segments, the report of their conversion {counted}: cut short"
+                )
+                raise DataError(message, file=SEGMENTS.index_path(self.path))
+        self._unseen = np.ones(len(self), np.bool_)
+
+    def _map_columns(self, table: Table, records: NDArray[Any]) -> bool:
+        """Map what each column must hold. Return if one has more: a writer works or died, or the index is cut."""
+        used, more = table.ends(records), False
+        for column in table.columns:
+            path, rows = table.column_path(self.path, column), int(used[table.axes[column.axis]])
+            need = rows * column.row_bytes
+            size = path.stat().st_size if path.is_file() else -1
+            if size < need:
+                raise DataError(f"column is truncated: {size} of {need} bytes", file=path, field=column.name)
+            self._columns[column.name] = _mapped(path, np.dtype((column.dtype, column.tail)), rows)
+            more |= size > need
+        return more
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SegmentStore, (str(self.path),)
@@ -60,23 +79,18 @@ class SegmentStore(Sequence[RunSegment]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         row = self._row(index)
-        try:
-            segment = self._read(row)
-            if self._unseen[row]:
-                self._check(row, segment)
-                self._unseen[row] = False
-        except DataError as error:
-            raise error.at(file=self.path, segment=self._name(row)) from error
+        segment = self._read(row)
+        if self._unseen[row]:
+            self._check(row, segment)
+            self._unseen[row] = False
         return segment
 
     def _read(self, row: int) -> RunSegment:
-        record = self._segments[row]
-        parts = rows(SEGMENTS, self._columns, record)
+        record, parts = self.raw(SEGMENTS, row)
         agents, steps, lights = len(parts["agent_id"]), int(record["steps"]), len(parts["signal_lane"])
-        parts.pop("tags")
         for name in ("segment_id", "source", "file"):
-            parts[name] = decoded(bytes(parts[name]), name)
-        parts["group"] = group_of(self._tags(row), parts["segment_id"])
+            parts[name] = _text(parts[name])
+        parts["group"] = _group(self._parsed(row, parts.pop("tags")), parts["segment_id"])
         for name in ("position", "heading", "velocity", "valid"):
             parts[name] = parts[name].reshape(agents, steps, *parts[name].shape[1:])
         parts["signal_state"] = parts["signal_state"].reshape(lights, steps)
@@ -90,18 +104,13 @@ class SegmentStore(Sequence[RunSegment]):
         )
 
     def _check(self, row: int, segment: RunSegment) -> None:
-        if content_hash(segment) != self.content(row):
-            raise DataError("content does not match its hash: the store was damaged", file=self.path)
         try:
+            if content_hash(segment) != self.content(row):
+                raise DataError("content does not match its hash: the store was damaged")
             validate(segment)
-        except DataError as error:  # names the log it was read from
-            raise DataError(error.message, file=self.path, field=error.field) from error
-
-    def _name(self, row: int) -> str:
-        try:
-            return self._text("segment_id", row)
-        except DataError:
-            return f"number {row}"
+        except DataError as error:  # which names the log it was read from
+            name = segment.segment_id
+            raise DataError(error.message, file=self.path, segment=name, field=error.field) from error
 
     def __iter__(self) -> Iterator[RunSegment]:
         return (self[i] for i in range(len(self)))
@@ -112,28 +121,28 @@ class SegmentStore(Sequence[RunSegment]):
             raise IndexError(f"segment {i} of {len(self)}")
         return i % len(self)
 
+    def raw(self, table: Table, number: int) -> tuple[Any, dict[str, Any]]:
+        """Return the index record of a segment or map, and views of its rows of every column."""
+        record = (self._segments if table is SEGMENTS else self._maps)[number]
+        begin, count = record["begin"].tolist(), record["count"].tolist()
+        rows = {}
+        for column in table.columns:
+            axis = table.axes[column.axis]
+            rows[column.name] = self._columns[column.name][begin[axis] : begin[axis] + count[axis]]
+        return record, rows
+
     def road(self, number: int) -> RoadMap:
-        """One of the distinct maps (see :attr:`map_index`)."""
+        """Return one of the distinct maps (see :attr:`map_index`)."""
         if not 0 <= number < len(self._maps):
             raise IndexError(f"map {number} of {len(self._maps)}")
-        parts = rows(MAPS, self._road_columns, self._maps[number])
+        _, parts = self.raw(MAPS, number)
         for name in ("lanes", "boundary", "marks"):
             parts[name] = Polylines(parts.pop(f"{name}.points"), parts.pop(f"{name}.offsets"))
         return RoadMap(**parts)
 
     def content(self, index: SupportsIndex) -> str:
-        """Hash of a segment's content, its map included, as it was written."""
+        """Return the hash of a segment's content, its map included, as it was written."""
         return cast(str, self._segments["hash"][self._row(index)].tobytes().hex())
-
-    def raw(self, index: SupportsIndex) -> tuple[str, Any, dict[str, NDArray[Any]], Any]:
-        """A segment as it is stored: id, index record, rows of every column, index record of its map."""
-        record = self._segments[self._row(index)]
-        values = rows(SEGMENTS, self._columns, record)
-        return self._text("segment_id", self._row(index)), record, values, self._maps[int(record["map"])]
-
-    def raw_road(self, number: int) -> dict[str, NDArray[Any]]:
-        """Rows of every column of a map."""
-        return rows(MAPS, self._road_columns, self._maps[number])
 
     @property
     def num_maps(self) -> int:
@@ -141,45 +150,34 @@ class SegmentStore(Sequence[RunSegment]):
         return len(self._maps)
 
     @property
+    def map_hashes(self) -> list[bytes]:
+        """Hash of the content of each distinct map."""
+        return [key.tobytes() for key in self._maps["hash"]]
+
+    @property
     def map_index(self) -> NDArray[np.int64]:
         """[segments] which distinct map each segment lies on."""
         return self._segments["map"]
 
+    @property
+    def num_steps(self) -> NDArray[np.int64]:
+        """[segments] logged steps, the first included."""
+        return self._segments["steps"].astype(np.int64)
+
+    @property
+    def time_steps(self) -> NDArray[np.float64]:
+        """[segments] seconds per step."""
+        return self._segments["dt"].astype(np.float64)
+
     @cached_property
     def ids(self) -> list[str]:
         """Segment ids in order of insertion."""
-        return read_ids(self.path, self._segments)
+        return self._texts("segment_id")
 
     @cached_property
-    def _places(self) -> dict[str, int]:
-        return {name: i for i, name in enumerate(self.ids)}
-
-    def index_of(self, segment_id: str | int) -> int:
-        """Index of a segment by its id, or by its number, which it is; a :class:`DataError` if there is none."""
-        if isinstance(segment_id, int):
-            if not 0 <= segment_id < len(self):
-                held = f"the store holds {len(self)} segments, the first is number 0"
-                raise DataError(held, file=self.path, segment=str(segment_id))
-            return segment_id
-        if segment_id not in self._places:
-            raise DataError("no such segment in the store", file=self.path, segment=segment_id)
-        return self._places[segment_id]
-
-    def tags(self, index: SupportsIndex) -> dict[str, Any]:
-        """What was given as ``tags`` when the segment was appended."""
-        found = self._tags(self._row(index))
-        return {name: value for name, value in found.items() if name != GROUP}
-
-    def _tags(self, row: int) -> dict[str, Any]:
-        try:
-            found = json.loads(self._text("tags", row) or "{}")
-        except (ValueError, RecursionError) as error:
-            raise DataError(
-                f"not JSON: {error}", file=self.path, segment=self._name(row), field="tags"
-            ) from error
-        if not isinstance(found, dict):
-            raise DataError("not a JSON object", file=self.path, segment=self._name(row), field="tags")
-        return found
+    def sources(self) -> NDArray[np.str_]:
+        """[segments] :attr:`RunSegment.source` of each."""
+        return np.array(self._texts("source"), np.str_)
 
     @cached_property
     def groups(self) -> NDArray[np.str_]:
@@ -187,22 +185,42 @@ class SegmentStore(Sequence[RunSegment]):
 
         Its own id where the store does not know; the simulated network where an earlier release generated it.
         """
-        found = [group_of(self._tags(i), name) for i, name in enumerate(self.ids)]
-        return np.array(found, np.str_)
+        tags = (self._parsed(i, text) for i, text in enumerate(self._texts("tags")))
+        return np.array([_group(*each) for each in zip(tags, self.ids, strict=True)], np.str_)
+
+    def _texts(self, column: str) -> list[str]:
+        axis, data = SEGMENTS.axes[column], self._columns[column].tobytes()
+        ends = [0, *np.cumsum(self._segments["count"][:, axis]).tolist()]
+        return [_text(data[a:b]) for a, b in pairwise(ends)]
 
     @cached_property
-    def sources(self) -> NDArray[np.str_]:
-        """[segments] :attr:`RunSegment.source` of each."""
-        return np.array([self._text("source", i) for i in range(len(self))], np.str_)
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.ids)}
 
-    def _text(self, column: str, row: int) -> str:
-        axis = SEGMENTS.axes[column]
-        begin, count = (int(self._segments[row][key][axis]) for key in ("begin", "count"))
+    def index_of(self, segment_id: str | int) -> int:
+        """Return the index of a segment by its id, or by its number, which it is; :class:`DataError` if none is."""
+        if isinstance(segment_id, int) and 0 <= segment_id < len(self):
+            return segment_id
+        if segment_id not in self._places:
+            held = f"no such segment: the store holds {len(self)} segments, the first is number 0"
+            raise DataError(held, file=self.path, segment=str(segment_id))
+        return self._places[segment_id]
+
+    def tags(self, index: SupportsIndex) -> dict[str, Any]:
+        """Return what was given as ``tags`` when the segment was appended."""
+        row = self._row(index)
+        found = self._parsed(row, self.raw(SEGMENTS, row)[1]["tags"])
+        return {name: value for name, value in found.items() if name != GROUP}
+
+    def _parsed(self, row: int, tags: Any) -> dict[str, Any]:
         try:
-            return decoded(bytes(self._columns[column][begin : begin + count]), column)
-        except DataError as error:
-            name = f"number {row}" if column == "segment_id" else self._name(row)
-            raise error.at(file=self.path, segment=name) from error
+            found = json.loads((tags if isinstance(tags, str) else _text(tags)) or "{}")
+            if not isinstance(found, dict):
+                raise ValueError("no object")
+        except (ValueError, RecursionError) as error:
+            name = self.ids[row]
+            raise DataError(f"not JSON: {error}", file=self.path, segment=name, field="tags") from error
+        return found
 
     @property
     def unfinished(self) -> str | None:
@@ -223,7 +241,7 @@ class SegmentStore(Sequence[RunSegment]):
             raise DataError(self.unfinished, file=self.path)
 
     def checksum(self) -> str:
-        """SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.
+        """Return SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.
 
         A hash covers all of a segment that :class:`~symphony.data.segment.RunSegment` holds, its map included; not
         its tags, the order of insertion or the report. That the content still has these hashes is seen when it is
@@ -240,41 +258,26 @@ class SegmentStore(Sequence[RunSegment]):
         A :class:`DataError` names the first segment that is not what was written. ``progress`` is told how many are
         done, of how many.
         """
-        for number, key in enumerate(self._maps["hash"]):
-            if content_hash(cast(Any, self.road(number))) != key.tobytes().hex():
+        for number, key in enumerate(self.map_hashes):
+            if content_hash(self.road(number)) != key.hex():
                 message = f"map {number} does not match its hash: the store was damaged"
                 raise DataError(message, file=self.path)
-        seen: dict[str, int] = {}
         for row, name in enumerate(self.ids):
-            if seen.setdefault(name, row) != row:
+            if self._places[name] != row:
                 raise DataError("two segments of this name", file=self.path, segment=name, field="segment_id")
-            try:
-                self._check(row, self._read(row))
-            except DataError as error:
-                raise error.at(file=self.path, segment=name) from error
-            self.tags(row)
+            self._check(row, self._read(row))
             self._unseen[row] = False
             if progress is not None:
                 progress(row + 1, len(self))
 
     @property
-    def num_steps(self) -> NDArray[np.int64]:
-        """Logged steps of every segment, the first included."""
-        return self._segments["steps"].astype(np.int64)
-
-    @property
-    def time_steps(self) -> NDArray[np.float64]:
-        """Seconds per step of every segment."""
-        return self._segments["dt"].astype(np.float64)
-
-    @property
     def report(self) -> dict[str, Any]:
         """The conversion report (empty where none was written)."""
-        path = self.path / layout.REPORT
-        return layout.read_json(path) if path.exists() else {}
+        path = self.path / REPORT
+        return read_json(path) if path.exists() else {}
 
     def summary(self) -> dict[str, Any]:
-        """Counts and ranges over the whole store, as JSON can hold them; reads no agent or map data."""
+        """Return counts and ranges over the whole store, as JSON can hold them; reads no agent or map data."""
         segments, maps = self._segments, self._maps
         steps, dt = segments["steps"], segments["dt"]
         lanes = maps["count"][:, MAPS.axes["lanes"]]
@@ -295,6 +298,15 @@ class SegmentStore(Sequence[RunSegment]):
         }
 
 
+def _text(data: Any) -> str:
+    """Text of bytes. What a damaged store has instead of it does not have the hash of its segment."""
+    return bytes(data).decode(errors="replace")
+
+
+def _group(tags: dict[str, Any], segment_id: str) -> str:
+    return str(tags.get(GROUP) or tags.get(NETWORK) or segment_id)
+
+
 def _span(values: NDArray[Any]) -> dict[str, float]:
     """Smallest, mean and largest, to a microsecond; empty for no values."""
     if len(values) == 0:
@@ -302,6 +314,58 @@ def _span(values: NDArray[Any]) -> dict[str, float]:
     return {"min": values.min().item(), "mean": round(float(values.mean()), 6), "max": values.max().item()}
 
 
-def group_of(tags: Mapping[str, Any], segment_id: str) -> str:
-    """The recording that a segment belongs to: as its tags say, else itself."""
-    return str(tags.get(GROUP) or tags.get(NETWORK) or segment_id)
+def _read_indices(folder: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Records of the segments, and of the maps they lie on, memory-mapped.
+
+    A :class:`DataError` says if an index is missing, cut short or contradicts itself.
+    """
+    segments = _read_index(folder, SEGMENTS, None)
+    count, axes = segments["count"], SEGMENTS.axes
+    agents, lights, steps = count[:, axes["agents"]], count[:, axes["signals"]], segments["steps"]
+    # Limits first: a product of numbers out of range may wrap around to a right one.
+    sound = (steps >= 2) & (steps <= MAX_STEPS) & (agents <= MAX_AGENTS) & (lights <= MAX_POINTS)
+    sound &= count[:, axes["states"]] == agents * steps
+    sound &= count[:, axes["signal_states"]] == lights * steps
+    sound &= (segments["ego"] >= 0) & (segments["ego"] < agents) & (segments["map"] >= 0)
+    _check_sound(sound, SEGMENTS, folder)
+    # Maps no segment points at belong to an append that never finished.
+    maps = _read_index(folder, MAPS, limit=int(segments["map"].max(initial=-1)) + 1)
+    lines = {n: maps["count"][:, MAPS.axes[f"{n}.offsets"]] for n in ("lanes", "boundary", "marks")}
+    sound = np.all([line >= 1 for line in lines.values()], axis=0)
+    for name in ("lanes", "marks"):
+        sound &= maps["count"][:, MAPS.axes[name]] == lines[name] - 1
+    _check_sound(sound, MAPS, folder)
+    return segments, maps
+
+
+def _check_sound(sound: NDArray[np.bool_], table: Table, folder: Path) -> None:
+    if not sound.all():
+        message = f"record {int(np.argmin(sound))} contradicts itself: the file is damaged"
+        raise DataError(message, file=table.index_path(folder))
+
+
+def _read_index(folder: Path, table: Table, limit: int | None) -> NDArray[Any]:
+    """The complete records of an index; a torn last record is not one. With a limit there must be as many."""
+    path = table.index_path(folder)
+    if not path.is_file():
+        raise DataError("index file is missing", file=path)
+    count = path.stat().st_size // table.record.itemsize
+    if limit is not None and count < limit:
+        raise DataError(f"index holds {count} records, {limit} are in use", file=path)
+    records = _mapped(path, table.record, count if limit is None else limit)
+    begin, rows = records["begin"], records["count"]
+    chained = np.array_equal(begin[1:], begin[:-1] + rows[:-1]) and not begin[:1].any()
+    # Sums that pass the largest integer wrap around, and would follow one another again.
+    if not chained or (rows < 0).any() or (begin < 0).any():
+        raise DataError("index records do not follow one another: the file is damaged", file=path)
+    return records
+
+
+def _mapped(path: Path, row: np.dtype[Any], rows: int) -> NDArray[Any]:
+    """A read-only view of the start of a file (an empty file can't be mapped)."""
+    if rows == 0:
+        return np.zeros(0, row)
+    # Not np.memmap, which asks the disk for every folder on the way to each file, and is slow to slice.
+    with path.open("rb") as file:
+        mapped = mmap.mmap(file.fileno(), rows * row.itemsize, access=mmap.ACCESS_READ)
+    return np.frombuffer(mapped, row)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 import operator
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, cast
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data import store_format as layout
-from symphony.data.segment import RoadMap, RunSegment, content_hash, validate
+from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.data.store import GROUP, TWICE, SegmentStore
-from symphony.data.store_format import MAPS, SEGMENTS, TableWriter, decoded, read_ids, read_indices
+from symphony.data.store_format import MAPS, SEGMENTS, Table
 from symphony.errors import DataError
-from symphony.files import Lock
+from symphony.files import Lock, naming, write_json
 
 
 class StoreWriter:
@@ -35,115 +36,100 @@ class StoreWriter:
 
     def __init__(self, path: str | Path, *, append: bool = False) -> None:
         self.path = Path(path).absolute()
-        if self.path.exists() and not self.path.is_dir():
-            raise DataError("not a directory", file=self.path)
         fresh = not (self.path / layout.HEADER).exists()
         if fresh and not _is_blank(self.path):
             raise DataError("not empty and not a segment store: refusing to write into it", file=self.path)
-        if not fresh:
-            layout.check_header(self.path)
-            if not append:
-                raise DataError("already a segment store (append to it, or choose another)", file=self.path)
+        if not fresh and not append:
+            raise DataError("already a segment store (append to it, or choose another)", file=self.path)
         self.path.mkdir(parents=True, exist_ok=True)
         self._lock: Lock | None = layout.lock(self.path)
         try:
-            self._open(fresh)
+            if not (self.path / layout.HEADER).exists():
+                _create(self.path)
+            store = SegmentStore(self.path)
+            self._ids = {name: k for k, name in enumerate(store.ids)}
+            self._roads = {key: k for k, key in enumerate(store.map_hashes)}
+            self._maps = _TableWriter(self.path, MAPS, store._maps)
+            self._segments = _TableWriter(self.path, SEGMENTS, store._segments)
         except BaseException:
             self._lock.close()
             raise
 
-    def _open(self, fresh: bool) -> None:
-        if fresh:
-            _create(self.path)
-        segments, maps = read_indices(self.path)
-        for table, records in ((SEGMENTS, segments), (MAPS, maps)):
-            layout.check_columns(self.path, table, records)
-        self._ids = {name: k for k, name in enumerate(read_ids(self.path, segments))}
-        self._roads = {record.tobytes(): k for k, record in enumerate(maps["hash"])}
-        self._maps = TableWriter(self.path, MAPS, maps)
-        self._segments = TableWriter(self.path, SEGMENTS, segments)
-
     def __len__(self) -> int:
-        return self._segments.count
+        return self._segments.state[0]
 
     def has(self, segment_id: str) -> bool:
-        """Whether a segment of that name is in the store."""
+        """Return whether a segment of that name is in the store."""
         return segment_id in self._ids
 
     def index_of(self, segment_id: str) -> int:
-        """Index of a segment that is in the store."""
+        """Return the index of a segment that is in the store."""
         return self._ids[segment_id]
 
     def append(self, segment: RunSegment, *, tags: Mapping[str, Any] | None = None) -> int:
-        """Add one segment.
+        """Add one segment and return its index.
 
         Args:
             segment: validated here.
             tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the name
                 ``group``, where the segment's group is kept.
 
-        Returns:
-            Its index.
-
         Raises:
             DataError: the segment breaks the schema, or one of that name is there already.
         """
-        self._check_open()
         segment = _plain(validate(segment))
-        try:
-            if self.has(segment.segment_id):
-                raise DataError(TWICE, field="segment_id")
-            return self._append(segment, _tags_text(segment, tags))
-        except DataError as error:
-            raise error.at(file=segment.file or None, segment=segment.segment_id) from error
-
-    def _append(self, segment: RunSegment, tags: str) -> int:
-        key = bytes.fromhex(content_hash(cast(Any, segment.road)))
-        road = self._road(key, lambda: _road_values(segment.road))
+        if tags and GROUP in tags:
+            raise DataError(f"{GROUP!r} is no name for a tag", segment=segment.segment_id, field="tags")
+        # Not a column of its own: older stores and releases have none.
+        known = segment.group not in {"", segment.segment_id}
+        noted = {**(tags or {}), **({GROUP: segment.group} if known else {})}
         values = {c.name: getattr(segment, c.name) for c in SEGMENTS.columns if c.name != "tags"}
-        for name in ("segment_id", "source", "file"):
+        values["tags"] = json.dumps(noted, ensure_ascii=False) if noted else ""
+        for name in ("segment_id", "source", "file", "tags"):
             values[name] = np.frombuffer(values[name].encode(), np.uint8)
-        number = self._segments.append(
-            values | {"tags": np.frombuffer(tags.encode(), np.uint8)},
-            bytes.fromhex(content_hash(segment)),
-            map=road,
-            steps=segment.num_steps,
-            ego=segment.ego,
-            current_step=segment.current_step,
-            dt=segment.dt,
-            origin=segment.origin,
-        )
-        self._ids[segment.segment_id] = number
-        return number
+        scalars = {n: getattr(segment, n) for n in ("ego", "current_step", "dt", "origin")}
+        scalars["steps"] = segment.num_steps
 
-    def _road(self, key: bytes, values: Callable[[], dict[str, NDArray[Any]]]) -> int:
-        if key not in self._roads:
-            self._roads[key] = self._maps.append(values(), key)
-        return self._roads[key]
+        def road() -> dict[str, Any]:
+            return {column.name: operator.attrgetter(column.name)(segment.road) for column in MAPS.columns}
+
+        digest, road_digest = (bytes.fromhex(content_hash(each)) for each in (segment, segment.road))
+        return self._write(segment.segment_id, values, scalars, digest, road_digest, road)
 
     def copy(self, store: SegmentStore, index: int) -> int:
         """Add a segment of another store, tags included; many times faster than reading and appending it.
 
         Returns its index, or raises a :class:`DataError` where one of that name is there already.
         """
-        self._check_open()
-        name, record, values, road = store.raw(index)
-        if self.has(name):
-            file = decoded(bytes(values["file"]), "file") or None
-            raise DataError(TWICE, file=file, segment=name, field="segment_id")
-        key = road["hash"].tobytes()
-        scalars = {field: record[field] for field, *_ in SEGMENTS.scalars}
-        scalars["map"] = self._road(key, lambda: store.raw_road(int(record["map"])))
-        self._ids[name] = self._segments.append(values, record["hash"].tobytes(), **scalars)
-        return self._ids[name]
+        record, values = store.raw(SEGMENTS, index)
+        map_record, road = store.raw(MAPS, int(record["map"]))
+        scalars = {name: record[name] for name, *_ in SEGMENTS.scalars}
+        hashes = record["hash"].tobytes(), map_record["hash"].tobytes()
+        return self._write(store.ids[index], values, scalars, *hashes, lambda: road)
 
-    def _check_open(self) -> None:
+    def _write(
+        self,
+        name: str,
+        values: Mapping[str, Any],
+        scalars: Mapping[str, Any],
+        digest: bytes,
+        road_digest: bytes,
+        road: Callable[[], dict[str, Any]],
+    ) -> int:
         if self._lock is None:
             raise ValueError("the writer is closed")
+        if self.has(name):
+            file = bytes(values["file"]).decode(errors="replace") or None
+            raise DataError(TWICE, file=file, segment=name, field="segment_id")
+        if road_digest not in self._roads:
+            self._roads[road_digest] = self._maps.append(road(), road_digest, {})
+        number = self._segments.append(values, digest, {**scalars, "map": self._roads[road_digest]})
+        self._ids[name] = number
+        return number
 
     def write_report(self, report: Mapping[str, Any]) -> None:
         """Replace the conversion report kept with the store."""
-        layout.write_json(self.path / layout.REPORT, report)
+        write_json(self.path / layout.REPORT, report)
 
     def close(self) -> None:
         """Bring everything to the disk and let the next writer in."""
@@ -162,6 +148,65 @@ class StoreWriter:
         self.close()
 
 
+class _TableWriter:
+    """Appends rows to the columns of a table, then the record that makes them count.
+
+    Writes go straight to the operating system, in this order, so a process that dies at any moment leaves
+    whole records and at most some bytes past the last one, which the next writer cuts off.
+    """
+
+    def __init__(self, folder: Path, table: Table, records: NDArray[Any]) -> None:
+        self.table = table
+        self.state = (len(records), table.ends(records))
+        self._index: BinaryIO = table.index_path(folder).open("r+b", buffering=0)
+        self._files: dict[str, BinaryIO] = {
+            c.name: table.column_path(folder, c).open("r+b", buffering=0) for c in table.columns
+        }
+        self._trim()
+
+    def append(self, values: Mapping[str, NDArray[Any]], digest: bytes, scalars: Mapping[str, Any]) -> int:
+        """Write rows of every column (leading dimensions are flattened) and a record; return its number."""
+        record = np.zeros(1, self.table.record)
+        counts = np.zeros(len(self.table.axes), np.int64)
+        for column in self.table.columns:
+            counts[self.table.axes[column.axis]] = values[column.name].nbytes // column.row_bytes
+        number, end = self.state
+        for column in self.table.columns:
+            begin = int(end[self.table.axes[column.axis]]) * column.row_bytes
+            _write_at(self._files[column.name], begin, values[column.name])
+        record["begin"], record["count"] = end, counts
+        record["hash"] = np.frombuffer(digest, np.uint8)
+        for name, value in scalars.items():
+            record[name] = value
+        _write_at(self._index, number * self.table.record.itemsize, record)
+        # One assignment: an interrupt must not find the count and the ends apart.
+        self.state = (number + 1, end + counts)
+        return number
+
+    def _trim(self) -> None:
+        """Cut off what lies past the last record."""
+        number, end = self.state
+        self._index.truncate(number * self.table.record.itemsize)
+        for column in self.table.columns:
+            self._files[column.name].truncate(int(end[self.table.axes[column.axis]]) * column.row_bytes)
+
+    def close(self) -> None:
+        """Bring everything to the disk, columns before the index, and write no more."""
+        self._trim()
+        for file in (*self._files.values(), self._index):
+            with naming(Path(file.name)):
+                os.fsync(file.fileno())
+            file.close()
+
+
+def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:
+    data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+    with naming(Path(file.name)):
+        file.seek(offset)
+        while data:
+            data = data[file.write(data) :]
+
+
 def _plain(segment: RunSegment) -> RunSegment:
     """Python scalars and text in place of NumPy's, which would enter the content hash."""
     texts = {name: str(getattr(segment, name)) for name in ("segment_id", "source", "file")}
@@ -169,25 +214,17 @@ def _plain(segment: RunSegment) -> RunSegment:
     return segment.replace(**texts, **numbers)
 
 
-def _tags_text(segment: RunSegment, tags: Mapping[str, Any] | None) -> str:
-    """JSON of the tags and the group, which has no column of its own: older stores and releases have none."""
-    if tags and GROUP in tags:
-        raise DataError(f"{GROUP!r} is no name for a tag", field="tags")
-    known = segment.group not in {"", segment.segment_id}
-    found = {**(tags or {}), **({GROUP: segment.group} if known else {})}
-    return json.dumps(found, ensure_ascii=False) if found else ""
-
-
-def _road_values(road: RoadMap) -> dict[str, NDArray[Any]]:
-    return {column.name: operator.attrgetter(column.name)(road) for column in MAPS.columns}
-
-
 def _is_blank(path: Path) -> bool:
-    """Nothing there, or only the empty files of a writer that died before it had begun."""
-    own = {layout.LOCK, f"{layout.HEADER}.tmp"}
-    files = path.rglob("*") if path.is_dir() else ()
+    """Whether nothing is there, or only the empty files of a writer that died before it had begun."""
+    if not path.is_dir():
+        return not path.exists()
+    draft = f".{Path(layout.HEADER).stem}."
     return all(
-        f.is_dir() or f.name in own or (f.suffix in {".idx", ".bin"} and not f.stat().st_size) for f in files
+        f.is_dir()
+        or f.name == layout.LOCK
+        or f.name.startswith(draft)
+        or (f.suffix in {".idx", ".bin"} and not f.stat().st_size)
+        for f in path.rglob("*")
     )
 
 
@@ -197,4 +234,4 @@ def _create(path: Path) -> None:
     for table in layout.TABLES:
         for file in (table.index_path(path), *(table.column_path(path, c) for c in table.columns)):
             file.touch()
-    layout.write_json(path / layout.HEADER, layout.header())
+    write_json(path / layout.HEADER, layout.header())

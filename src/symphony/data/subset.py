@@ -10,20 +10,17 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from symphony.data.segment import Bools, Polylines, RunSegment, validate
-from symphony.errors import ConfigError
+from symphony.data.segment import STATES, Bools, Polylines, RunSegment, validate
 
 MARGIN = 10.0
 """Metres beside the lanes that are kept within which the boundary is kept, too."""
-OF_AGENTS = ("agent_id", "agent_type", "size", "position", "heading", "velocity", "valid")
-"""Fields with a row for each agent."""
 
 
 def with_agents(segment: RunSegment, kept: Bools) -> RunSegment:
     """The agents that a mask [A] keeps, the ego among them, everything that refers to them renumbered."""
     return segment.replace(
         ego=int(kept[: segment.ego].sum()),
-        **{name: getattr(segment, name)[kept] for name in OF_AGENTS},
+        **{name: getattr(segment, name)[kept] for name in ("agent_id", "agent_type", "size", *STATES)},
         interest=_renumbered(segment.interest[kept[segment.interest]], kept),
         predict=_renumbered(segment.predict[kept[segment.predict]], kept),
     )
@@ -54,22 +51,12 @@ def _renumbered(index: NDArray[Any], kept: Bools) -> NDArray[np.int32]:
 
 
 def crop(segment: RunSegment, radius: float) -> RunSegment:
-    """What comes within a distance of the ego's logged path: some sources give a whole district with every scene.
+    """Keep what comes within a radius in metres of the ego's logged path: some sources give a whole district.
 
     Lanes are kept whole, with their links and lights; of the boundary and the marks the pieces that are near enough,
     or beside a lane that is kept. Where lanes go on beyond, the boundary stays open. Agents are kept whole if they
-    are near enough at some step.
-
-    Args:
-        segment: a valid segment.
-        radius: metres.
-
-    Raises:
-        ConfigError: the radius is not positive.
-        DataError: no lane is near enough.
+    are near enough at some step. Raises a :class:`DataError` if no lane is near enough.
     """
-    if not (np.isfinite(radius) and radius > 0):
-        raise ConfigError(f"radius must be positive, is {radius}")
     road = segment.road
     near = _shape(segment.position[segment.ego, segment.valid[segment.ego]]).buffer(radius)
     shapely.prepare(near)

@@ -29,7 +29,7 @@ from symphony.config import Score, SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.flags import collision_flags
 from symphony.errors import ConfigError
-from symphony.imports import build_object
+from symphony.imports import load_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.rollouts.unroll import draw_goals
@@ -69,7 +69,7 @@ def _settings(
 def pruning_rule(config: SearchConfig) -> PruningRule:
     """Which branches go on."""
     if ":" in config.rule:
-        return build_object(config.rule)
+        return load_object(config.rule)()
     rules: dict[str, Callable[[], PruningRule]] = {
         "best": lambda: KeepBest(0.5),
         "systematic": lambda: Systematic(config.temperature),
