@@ -20,7 +20,7 @@ from torch import Tensor
 from symphony import EvaluateConfig, SegmentStore, builtin_store, evaluate, load_agent
 from symphony.envs.scene import SceneBatch
 from symphony.files import write_json
-from symphony.learning.logged import logged
+from symphony.learning.experts import logged
 from symphony.rollouts.unroll import Rollouts
 
 AGENT, ROLLOUTS, NEAR, MOVES = "pretrained:bc_ts_h", 16, 3.0, 5.0

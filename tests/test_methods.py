@@ -28,7 +28,7 @@ from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError
 from symphony.learning import SearchReplay
 from symphony.learning.demonstrations import SceneDataset
-from symphony.learning.logged import logged
+from symphony.learning.experts import logged
 from symphony.recipes import train
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics

@@ -24,7 +24,7 @@ from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
 from symphony.imports import load_object
 from symphony.learning.demonstrations import SceneDataset
-from symphony.learning.logged import logged, logged_heights
+from symphony.learning.experts import logged, logged_heights
 from symphony.metrics import Choice, CollisionKinds, RolloutMetrics, choices, collision_kinds, route_turns
 from symphony.roadgraph import visited_curvatures
 from symphony.rollouts.crowd import crowd_dataset

@@ -27,8 +27,7 @@ from symphony.envs.routes import FollowedRoutes, RouteWindow, packed, route_choi
 from symphony.envs.scene import SceneBatch, collate, scene
 from symphony.errors import DataError, DataWarning
 from symphony.geometry.frames import with_speed
-from symphony.learning.experts import Experts, KeptExperts, fit_experts
-from symphony.learning.logged import expert_batch, logged, logged_routes
+from symphony.learning.experts import Experts, KeptExperts, expert_batch, fit_experts, logged, logged_routes
 from symphony.roadgraph import LaneGraph
 
 if TYPE_CHECKING:
@@ -104,12 +103,9 @@ class ItemCache(Generic[T]):
         while self._held > self.limit and len(self.kept) > 1:
             if not self._warned:
                 self._warned = True
-                warnings.warn(
-                    f"{self.name} take more than {self.limit / 2**30:.2g} GiB of memory: {len(self.kept)} are kept, "
-                    "others are prepared anew each time they are drawn",
-                    DataWarning,
-                    stacklevel=2,
-                )
+                much = f"{self.limit / 2**30:.2g} GiB of memory: {len(self.kept)} are kept"
+                why = f"{self.name} take more than {much}, others are prepared anew each time they are drawn"
+                warnings.warn(why, DataWarning, stacklevel=2)
             self._held -= self.kept.popitem(last=False)[1][1]
         return found
 
@@ -157,14 +153,13 @@ class SceneDataset:
         self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        build = partial(
-            SceneDataset,
-            routes=self.routes,
-            duration=self.duration,
-            keep=self.keep,
-            persona=self.persona,
-        )
-        return build, (self.store, self.interactive, self.dynamics, self.indices)
+        how: Any = {
+            "routes": self.routes,
+            "duration": self.duration,
+            "keep": self.keep,
+            "persona": self.persona,
+        }
+        return partial(SceneDataset, **how), (self.store, self.interactive, self.dynamics, self.indices)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -181,12 +176,9 @@ class SceneDataset:
         steps = self.store.time_steps[self.indices]
         other = np.flatnonzero(steps != steps[0])
         if len(other):
-            raise DataError(
-                f"has steps of {steps[other[0]]:g} s, others of {steps[0]:g} s",
-                file=self.store.path,
-                segment=self.store.ids[self.indices[other[0]]],
-                field="dt",
-            )
+            why = f"has steps of {steps[other[0]]:g} s, others of {steps[0]:g} s"
+            name = self.store.ids[self.indices[other[0]]]
+            raise DataError(why, file=self.store.path, segment=name, field="dt")
         return float(steps[0])
 
     @property
@@ -211,12 +203,8 @@ class SceneDataset:
             return segment
         steps = round(self.duration / segment.dt) + 1
         if segment.num_steps < steps:
-            has = (segment.num_steps - 1) * segment.dt
-            raise DataError(
-                f"has {has:g} s, {self.duration:g} are asked for",
-                file=self.store.path,
-                segment=segment.segment_id,
-            )
+            why = f"has {(segment.num_steps - 1) * segment.dt:g} s, {self.duration:g} are asked for"
+            raise DataError(why, file=self.store.path, segment=segment.segment_id)
         timed = ("position", "heading", "velocity", "valid", "signal_state")
         return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
 
@@ -298,31 +286,21 @@ class SceneDataset:
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
         if perturb is not None:
-            from symphony.learning.perturbation import (  # noqa: PLC0415 - few learn from displaced states
-                AHEAD,
-                AHEAD_IN_STYLE,
-                perturbed,
-            )
+            from symphony.learning import perturbation  # noqa: PLC0415 - few learn from displaced states
 
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
-            size, ahead = scenes.box_size[item, agent], AHEAD_IN_STYLE if self.persona else AHEAD
-            state, action = perturbed(
-                state, action, now, later, size, self.dynamics, self.dt, perturb.share, rng, ahead
-            )
+            log = now, later, scenes.box_size[item, agent]
+            ahead = perturbation.AHEAD_IN_STYLE if self.persona else perturbation.AHEAD
+            how = self.dynamics, self.dt, perturb.share, rng, ahead
+            state, action = perturbation.perturbed(state, action, *log, *how)
         seen = None
         if observation.route:
             progress = torch.cat([e.progress.flatten() for e in found])[begin[row] + when]
             seen = _seen_routes(found, row, progress, state)
-        return expert_batch(
-            scenes.to(device),
-            item.to(device),
-            when.to(device),
-            agent.to(device),
-            state.to(device),
-            observation,
-            action=action.to(device),
-            routes=None if seen is None else RouteWindow(*(part.to(device) for part in seen)),
-        )
+        where = item.to(device), when.to(device), agent.to(device), state.to(device)
+        routes = None if seen is None else RouteWindow(*(part.to(device) for part in seen))
+        action = action.to(device)
+        return expert_batch(scenes.to(device), *where, observation, action=action, routes=routes)
 
     def sample_goals(
         self,
@@ -351,20 +329,12 @@ class SceneDataset:
         state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
             device
         )
-        batch = expert_batch(
-            self.scenes(items).to(device),
-            torch.tensor([i for i, _, _ in chosen], device=device),
-            when.to(device),
-            torch.stack([e.agent[k] for _, e, k in chosen]).to(device),
-            state,
-            observation,
-        )
-        features, mask = route_choices(
-            state[:, None],
-            FollowedRoutes(points, first[:, None], length[:, None]),
-            observation.distance_scale,
-            turns=observation.turns,
-        )
+        item, agent = torch.tensor([i for i, _, _ in chosen]), torch.stack([e.agent[k] for _, e, k in chosen])
+        where = item.to(device), when.to(device), agent.to(device), state
+        batch = expert_batch(self.scenes(items).to(device), *where, observation)
+        routes = FollowedRoutes(points, first[:, None], length[:, None])
+        scale, turns = observation.distance_scale, observation.turns
+        features, mask = route_choices(state[:, None], routes, scale, turns=turns)
         batch.set(keys.ROUTES, features)
         batch.set(keys.ROUTES_MASK, mask)
         batch.set(keys.GOAL, torch.tensor([[table.logged] for table in tables], device=device))

@@ -1,5 +1,5 @@
 """Logged vehicles as demonstrations: the actions that lead through what they did, fitted many segments at a time and
-kept with their store.
+kept with their store; their states in the log, and what they would observe.
 """
 
 from __future__ import annotations
@@ -14,15 +14,28 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
+from tensordict import TensorDict
 from torch import Tensor
 
 import symphony
+from symphony import keys
 from symphony.data.npz import read_npz
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
 from symphony.envs.dynamics import Bicycle, Displacement
-from symphony.envs.routes import RouteTable, drivable, logged_progress, route_table
+from symphony.envs.objects import objects_at
+from symphony.envs.observation import ObservationConfig, observe
+from symphony.envs.routes import (
+    FollowedRoutes,
+    RouteTable,
+    RouteWindow,
+    drivable,
+    logged_progress,
+    route_table,
+)
+from symphony.envs.scene import SceneBatch
 from symphony.errors import DataError
 from symphony.files import replacing
 from symphony.geometry.frames import with_speed
@@ -78,9 +91,7 @@ def fit_experts(
     routes: bool = False,
 ) -> list[Experts]:
     """Fit every vehicle of some segments that moves or stands in a lane (waiting is driving, parking is not), and the
-    ego in any case.
-
-    Vehicles are fitted independently of one another: whatever is fitted together, the result is the same.
+    ego in any case, each independently of the others.
 
     Args:
         segments: the run segments.
@@ -113,13 +124,8 @@ def fit_experts(
 def _demonstrators(segment: RunSegment, graph: LaneGraph) -> NDArray[np.int64]:
     """Rows of the agents to learn from."""
     valid = segment.valid
-    everyone, first = np.arange(segment.num_agents), valid.argmax(1)
-    lane = lane_of(
-        graph,
-        segment.position[everyone, first, :2],
-        segment.heading[everyone, first],
-        tolerance=IN_LANE,
-    )
+    at = np.arange(segment.num_agents), valid.argmax(1)
+    lane = lane_of(graph, segment.position[at][:, :2], segment.heading[at], tolerance=IN_LANE)
     chosen = (segment.agent_type == AgentType.VEHICLE) & ((travel(segment) > MOVING) | (lane >= 0))
     chosen[segment.ego] = True
     chosen &= (valid[:, 1:] & valid[:, :-1]).any(1)
@@ -155,9 +161,7 @@ def _fit_together(
         parts = [getattr(segments[k], name)[rows[k]] for k in group]
         # Shorter segments are padded with steps that are not valid, which come after theirs and change nothing.
         late = [[(0, 0), (0, steps - part.shape[1])] + [(0, 0)] * (part.ndim - 2) for part in parts]
-        return torch.from_numpy(
-            np.concatenate([np.pad(part, width) for part, width in zip(parts, late, strict=True)])
-        )
+        return torch.from_numpy(np.concatenate([*map(np.pad, parts, late)]))
 
     position, heading, velocity, valid = map(joined, ("position", "heading", "velocity", "valid"))
     size = torch.from_numpy(np.concatenate([segments[k].size[rows[k], :2] for k in group]))
@@ -171,6 +175,61 @@ def _fit_together(
         # Copies, so that a segment kept in memory doesn't keep the whole group.
         found[k] = action[:, : length - 1].clone(), state[:, :length].clone()
     return found
+
+
+def logged_routes(tables: Sequence[RouteTable], row: Int[Tensor, " M"]) -> FollowedRoutes:
+    """The routes that experts took, one expert in each row [M, 1]."""
+    none = np.zeros((0, 2), np.float32)
+    lines = [table.line(table.logged) if table.logged >= 0 else none for table in tables]
+    count = torch.tensor([len(line) for line in lines])
+    begin = count.cumsum(0) - count
+    return FollowedRoutes(torch.from_numpy(np.concatenate(lines)), begin[row][:, None], count[row][:, None])
+
+
+def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
+    """The states of the interactive agents in the log, and where they are valid."""
+    steps = scenes.log_valid.shape[1]
+    index = scenes.interactive[:, None].expand(-1, steps, -1)
+    log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
+    valid = scenes.log_valid.gather(2, index) & scenes.interactive_valid[:, None]
+    return with_speed(log), valid
+
+
+def logged_heights(scenes: SceneBatch) -> Float[Tensor, "B T N 2"] | None:
+    """Height and level of the interactive agents in the log; None where no scene has levels."""
+    if not scenes.agent_height.shape[1]:
+        return None
+    return scenes.agent_height.take_along_dim(scenes.interactive[:, None, :, None], 2)
+
+
+def expert_batch(
+    scenes: SceneBatch,
+    scene_of: Int[Tensor, " M"],
+    step: Int[Tensor, " M"],
+    agent: Int[Tensor, " M"],
+    state: Float[Tensor, "M 4"],
+    observation: ObservationConfig,
+    *,
+    action: Tensor | None = None,
+    routes: RouteWindow | None = None,
+) -> TensorDict:
+    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and what
+    they see of their routes, where given.
+    """
+    index, here = agent[:, None], state[:, None]
+    real = torch.ones_like(index, dtype=torch.bool)
+    objects = objects_at(scenes, scene_of, step, here, index, real)
+    seen = observe(scenes, scene_of, step, objects, index, observation, routes=routes)
+    batch = TensorDict({}, batch_size=[len(step)], device=state.device)
+    batch.set(keys.VALID, real)
+    batch.set(keys.STATE, here)
+    if observation.persona:
+        batch.set(keys.PERSONA, scenes.persona[scene_of, agent][:, None])
+    for name, value in seen.items():
+        batch.set(("agents", "observation", name), value)
+    if action is not None:
+        batch.set(keys.ACTION, action[:, None])
+    return batch
 
 
 class KeptExperts:

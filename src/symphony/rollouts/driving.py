@@ -21,7 +21,7 @@ from symphony.envs.dynamics import Bicycle
 from symphony.envs.flags import offroad_flags
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.learning.logged import logged, logged_heights
+from symphony.learning.experts import logged, logged_heights
 from symphony.metrics import collisions
 from symphony.modules import SeededNoise
 from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv, RuledEgo, ego_policy

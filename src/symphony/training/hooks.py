@@ -1,7 +1,4 @@
-"""Hooks of a run: validation, which chooses among checkpoints, and previews of the agent while it trains.
-
-Neither changes the course of the training. This module loads what simulates, judges and draws; the trainer does not.
-"""
+"""Hooks of a run that do not change its course: validation, which chooses among checkpoints, and previews."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +27,7 @@ from symphony.files import naming
 from symphony.geometry.frames import wrap
 from symphony.learning import SearchReplay
 from symphony.learning.demonstrations import SceneDataset, evenly_spaced
-from symphony.learning.logged import logged
+from symphony.learning.experts import logged
 from symphony.render import animate_rollouts
 from symphony.rollouts.driving import simulate_batch
 from symphony.rollouts.unroll import Rollouts
@@ -38,25 +36,18 @@ from symphony.training.trainer import Trainer
 
 METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
 """Metrics of a validation that are recorded."""
-PANELS = 2
-"""Run segments in the animation of a preview, at most."""
-SEGMENTS = 8
-"""Run segments simulated for a preview, evenly spaced; the animation has the first two."""
-ROLLOUTS = 2
-"""Rollouts of each segment in a preview, at most; the animation has the first."""
-QUANTILES = (10, 50, 90)
-"""Percent."""
+SEGMENTS, ROLLOUTS = 8, 2
+"""Run segments simulated for a preview, evenly spaced, and rollouts of each, at most."""
+PANELS = 2  # segments in its animation, the first ones, with their first rollouts
+QUANTILES = (10, 50, 90)  # percent
 
 Samples = dict[str, NDArray[np.float64]]
 """Values [K] by what they are of; K may be 0."""
 
 
 def add_hooks(trainer: Trainer) -> None:
-    """Give a trainer the hooks that its configuration asks for.
-
-    Raises:
-        ConfigError: more rollouts are asked for than a tree has branches.
-        DataError: the store to validate on can't be read, is empty, or a segment has too few agents.
+    """Give a trainer the hooks that its configuration asks for. Raises ConfigError for more rollouts than a tree has
+    branches, DataError if the store to validate on can't be read, is empty, or has too few agents.
     """
     config, agent, device = trainer.config, trainer.agent, trainer.world.device
     shown = trainer.data
@@ -68,12 +59,7 @@ def add_hooks(trainer: Trainer) -> None:
 
 
 class Validator:
-    """Evaluates an agent as it will be used, search included.
-
-    Args:
-        config: with a store to validate on.
-        agent: evaluated as it is at each call.
-        device: its networks'.
+    """Evaluates an agent, whose networks are on a device, as it is at each call and will be used, search included.
 
     Attributes:
         best: the best so far; to be set for a run that goes on.
@@ -82,24 +68,16 @@ class Validator:
     """
 
     def __init__(self, config: ValidationConfig, agent: Agent, device: torch.device) -> None:
-        if agent.searches and config.rollouts > agent.search.test_branches:
-            raise ConfigError(
-                f"validation.rollouts ({config.rollouts}) must not exceed search.test-branches "
-                f"({agent.search.test_branches}), the branches of one tree"
-            )
+        branches = agent.search.test_branches
+        if agent.searches and config.rollouts > branches:
+            most = f"search.test-branches ({branches}), the branches of one tree"
+            raise ConfigError(f"validation.rollouts ({config.rollouts}) must not exceed {most}")
         store = SegmentStore(config.data or Path())
         if len(store) == 0:
             raise DataError("the store holds no run segments", file=store.path)
         chosen = evenly_spaced(len(store), config.segments)
-        self.dataset = SceneDataset(
-            store,
-            agent.interactive,
-            agent.dynamics,
-            chosen,
-            routes=agent.goals is not None,
-            duration=agent.duration,
-            keep=len(chosen),
-        )
+        how: Any = {"routes": agent.goals is not None, "duration": agent.duration, "keep": len(chosen)}
+        self.dataset = SceneDataset(store, agent.interactive, agent.dynamics, chosen, **how)
         # All scenes are prepared before the first update, so that one that can't be used is found then.
         for i in range(len(chosen)):
             self.dataset.scene(i)
@@ -110,15 +88,8 @@ class Validator:
         self.what = f"{len(chosen)} segments of {store.checksum()}, {config.rollouts} rollouts"
 
     def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]:
-        """Evaluate the agent as it is after an update, and remember whether it is the best so far: whether collision
-        rate plus off-road time is lower than at any time before (paper, section V-B).
-
-        Args:
-            step: updates made so far.
-            progress: called with the segments done and their total.
-
-        Returns:
-            The numbers for the record, all beginning with ``validation_``.
+        """The numbers for the record after an update, all beginning with ``validation_``. The best agent is the one
+        whose collision rate plus off-road time is lowest (paper, section V-B).
         """
         with undisturbed(self.agent, self.device):
             found = evaluate_dataset(self.agent, self.dataset, self.how, progress).metrics.compute()
@@ -134,7 +105,7 @@ class Validator:
 
 @contextmanager
 def undisturbed(agent: Agent, device: torch.device) -> Iterator[None]:
-    """Use networks on a device as they will be used after training, which goes on as if they had not been used."""
+    """Use networks on a device as after training, which goes on as if they had not been used."""
     modules = agent.modules.values()
     modes = [module.training for module in modules]
     devices = [torch.cuda.current_device()] if device.type == "cuda" else []
@@ -149,14 +120,8 @@ def undisturbed(agent: Agent, device: torch.device) -> Iterator[None]:
 
 
 class Previewer:
-    """Simulates an agent as it is meant to be simulated, and shows it in the run's folder ``media``.
-
-    Args:
-        config: of the run.
-        agent: shown as it is at each call.
-        dataset: segments to choose from, evenly spaced: the same at each call.
-        device: the networks'.
-        replay: gives the states that the discriminator learns from.
+    """Simulates an agent as it is meant to be simulated, on the same run segments of a data set at each call, and
+    shows it in the run's folder ``media``.
     """
 
     def __init__(
@@ -176,13 +141,8 @@ class Previewer:
         self.how = EvaluateConfig(rollouts=rollouts, device=str(device))
 
     def __call__(self, step: int, tracker: Tracker | None = None) -> dict[str, float]:
-        """Show the agent as it is after an update, in the folder and to a tracker.
-
-        Returns:
-            The numbers for the record, see :func:`quantiles`.
-
-        Raises:
-            DataError: if the disk refuses.
+        """Show the agent as it is after an update, in the folder and to a tracker; returns :func:`quantiles` for the
+        record, and raises DataError if the disk refuses.
         """
         segments, scenes = [self.dataset.segment(i) for i in self.items], self.dataset.scenes(self.items)
         with undisturbed(self.agent, self.device):
@@ -220,16 +180,9 @@ def quantiles(samples: Samples) -> dict[str, float]:
 
 
 def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> Samples:
-    """The motion of interactive agents in rollouts and in the log, and how far apart these are.
-
-    Args:
-        scenes: B scenes.
-        rollouts: [B, K, ...] of them.
-        dt: [B] seconds per step.
-
-    Returns:
-        ``speed`` (m/s), ``acceleration`` (m/s^2) and ``turn`` (rad/s) at every step, simulated and, in ``speed_log``
-        etc., logged; ``ade`` (m) of every segment.
+    """The motion of interactive agents in rollouts [B, K] of scenes with steps of dt seconds: ``speed`` (m/s),
+    ``acceleration`` (m/s^2) and ``turn`` (rad/s) at every step, simulated and, in ``speed_log`` etc., logged; ``ade``
+    (m) of every segment.
     """
     log, seen = (part[:, None] for part in logged(scenes))
     step = log.new_tensor(dt)[:, None, None, None]
@@ -245,12 +198,8 @@ def _motion(
     state: Float[Tensor, "B K U N 4"], valid: Bool[Tensor, "B K T N"], dt: Float[Tensor, "B 1 1 1"]
 ) -> Samples:
     """The motion of the valid [B, K, T, N] steps to the later of states [B, K, T + 1, N, 4]."""
-    change = state[:, :, 1:] - state[:, :, :-1]
-    found = {
-        "speed": state[:, :, 1:, :, 3],
-        "acceleration": change[..., 3] / dt,
-        "turn": wrap(change[..., 2]) / dt,
-    }
+    change, speed = state[:, :, 1:] - state[:, :, :-1], state[:, :, 1:, :, 3]
+    found = {"speed": speed, "acceleration": change[..., 3] / dt, "turn": wrap(change[..., 2]) / dt}
     return {name: _finite(values[valid]) for name, values in found.items()}
 
 

@@ -22,22 +22,16 @@ ID = "wandb-id"
 
 
 class Tracker:
-    """Writes the metrics of a run.
+    """Writes the metrics of a run; DataError if the disk refuses, ConfigError if Weights & Biases does.
 
     Args:
         folder: of the run; ``metrics.jsonl`` is written there.
         settings: shown by Weights & Biases beside the curves.
-        wandb: ``offline``, ``online`` or ``disabled``. The environment variable ``WANDB_MODE`` overrides it, as
-            it does everywhere else.
+        wandb: ``offline``, ``online`` or ``disabled``; the environment variable ``WANDB_MODE`` overrides it.
         after: keep only records up to this step of an earlier, interrupted run, which this one goes on with.
 
     Attributes:
-        path: the file.
         kept: records of that earlier run.
-
-    Raises:
-        ConfigError: Weights & Biases can't be used, say without a key.
-        DataError: the disk refuses.
     """
 
     def __init__(
@@ -53,37 +47,31 @@ class Tracker:
         # Put in place as a whole, lest a kill meanwhile lose what is kept.
         write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
         self._run = None
-        mode: Any = os.environ.get("WANDB_MODE", wandb)
+        mode = os.environ.get("WANDB_MODE", wandb)
         if mode != "disabled":
             import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
+            how: Any = {
+                "project": os.environ.get("WANDB_PROJECT", "symphony"),
+                "name": folder.name,
+                "mode": mode,
+            }
+            how |= {"config": settings, "id": _run_id(folder, again=after > 0), "dir": str(folder)}
+            how |= {"resume": "allow" if after else None}
             try:
-                self._run = tracking.init(
-                    project=os.environ.get("WANDB_PROJECT", "symphony"),
-                    name=folder.name,
-                    dir=str(folder),
-                    config=settings,
-                    mode=mode,
-                    id=_run_id(folder, again=after > 0),
-                    resume="allow" if after else None,
-                    settings=tracking.Settings(silent=True, console="off"),
-                )
+                self._run = tracking.init(**how, settings=tracking.Settings(silent=True, console="off"))
             except tracking.errors.Error as error:
-                raise ConfigError(
-                    f"Weights & Biases: {' '.join(str(error).split())} Or keep the curves here: --wandb offline"
-                ) from error
+                told, hint = " ".join(str(error).split()), "Or keep the curves here: --wandb offline"
+                raise ConfigError(f"Weights & Biases: {told} {hint}") from error
         with naming(self.path):
             self._file = self.path.open("a", encoding="utf-8")
 
     def log(self, step: int, values: Mapping[str, float | str]) -> None:
         """Record numbers, and words, at an update. Raises DataError if the disk refuses."""
         # JSON knows no NaN, which stands for statistics of nothing, and no infinity.
-        known = {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in values.items()
-        }
+        odd = {name: None for name, x in values.items() if isinstance(x, float) and not math.isfinite(x)}
         with naming(self.path):
-            self._file.write(json.dumps({"step": step, **known}) + "\n")
+            self._file.write(json.dumps({"step": step, **values, **odd}) + "\n")
             self._file.flush()
         if self._run is not None:
             self._run.log(dict(values), step=step)
@@ -99,7 +87,7 @@ class Tracker:
         self._run.log(found, step=step)
 
     def sync(self) -> None:
-        """Wait until all records are on the disk: a checkpoint must not survive a power cut that they don't."""
+        """Put all records on the disk: a checkpoint must not survive a power cut that they don't."""
         with naming(self.path):
             os.fsync(self._file.fileno())
 

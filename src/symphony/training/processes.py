@@ -1,7 +1,7 @@
-"""Training by several processes, as ``torchrun`` starts them: each draws batches of its own, gradients are averaged.
+"""Training by several processes, as ``torchrun`` starts them, with torch's DistributedDataParallel.
 
-The losses are wrapped in torch's DistributedDataParallel. Their means are over the entries of all processes, so that
-W processes with batches of B do what one would do with a batch of W x B, however uneven the shards are.
+Means of losses are over the entries of all processes, so that W processes with batches of B do what one would do with
+a batch of W x B, however uneven the shards are.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from symphony.objectives.base import MaskedLoss
 from symphony.streams import stream_of
 
 _SEED_STRIDE = 1 << 20
+# One may be validating while the others wait; torchrun itself notices one that has died.
 _PATIENCE = timedelta(days=1)
-"""Time that the others have to arrive, one of which may be validating; torchrun itself notices one that has died."""
 
 
 class SharedLoss(DistributedDataParallel):
@@ -46,13 +46,7 @@ class SharedLoss(DistributedDataParallel):
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes that train one run together, seen from one of them.
-
-    Attributes:
-        device: where this one computes.
-        rank: number of this one.
-        count: how many there are.
-    """
+    """The processes that train one run together, seen from the one of a `rank`, which computes on a device."""
 
     device: torch.device
     rank: int = 0
@@ -68,10 +62,7 @@ class Processes:
         return seed + self.rank * _SEED_STRIDE
 
     def reseed(self, seed: int, step: int) -> None:
-        """Make the global random numbers of an update those of (seed, update, process) alone.
-
-        A checkpoint holds those of the leading process only.
-        """
+        """Make the global random numbers those of (seed, update, process): a checkpoint holds one process's."""
         if self.count > 1:
             torch.manual_seed(stream_of(f"update {seed} {self.rank} {step}"))
 
@@ -83,10 +74,8 @@ class Processes:
         return SharedLoss(loss)
 
     def mean(self, values: Mapping[str, Num[Tensor, ""]]) -> dict[str, Num[Tensor, ""]]:
-        """Means over the processes of the numbers each has under the same names; those that are NaN are left out.
-
-        What a loss reports becomes exactly its value on the joint batch. AUCs and what searches report become means
-        of the processes' own.
+        """Means over the processes of numbers under the same names, NaN left out: of what a loss reports exactly its
+        value on the joint batch, of AUCs and what searches report the mean of the processes' own.
         """
         if self.count == 1 or not values:
             return dict(values)
@@ -114,14 +103,11 @@ class Processes:
 def processes(device: torch.device) -> Iterator[Processes]:
     """The processes this one was started with by ``torchrun``, or that have a process group already; else it alone.
 
-    Args:
-        device: asked for; ``cuda`` becomes the device of each process's own.
-
-    Raises:
-        ConfigError: if there are more processes than CUDA devices on this machine.
+    A device ``cuda`` becomes that of each process's own: ConfigError if this machine has fewer than processes.
     """
-    own = dist.is_available() and not dist.is_initialized() and dist.is_torchelastic_launched()
-    if not own and not (dist.is_available() and dist.is_initialized()):
+    begun = dist.is_available() and dist.is_initialized()
+    own = dist.is_available() and not begun and dist.is_torchelastic_launched()
+    if not own and not begun:
         yield Processes(device)
         return
     if device.type == "cuda":

@@ -43,30 +43,21 @@ from symphony.training.processes import Processes
 if TYPE_CHECKING:
     from symphony.learning import SceneDataset, SearchReplay
 
-KEEP = 3
-"""Checkpoints kept in a run's folder, the last ones; the best beside them."""
-CLIP = 1.0
-"""Largest norm of a network's gradient."""
-LOCK = "run.lock"
-"""Held by the process that trains."""
+KEEP = 3  # checkpoints in a run's folder, the last ones; the best beside them
+CLIP = 1.0  # largest norm of a network's gradient
+LOCK = "run.lock"  # held by the process that trains
 NORM = "gradient_norm_"
-PATIENCE = 20
-"""Updates in a row that may be skipped."""
-WINDOW = 10
-"""Records that an alarm looks back on."""
+PATIENCE = 20  # updates in a row that may be skipped
+WINDOW = 10  # records that an alarm looks back on
 ALARMS = {
-    "discriminator_too_strong": (
-        "the discriminator tells simulated from logged states almost without fail (AUC above 0.98 in the last 10 "
-        "records): its scores rank little; consider a lower rate, a gradient penalty or noise for it"
-    ),
-    "discriminator_blind": (
-        "the discriminator can't tell simulated from logged states (AUC below 0.52 in the last 10 records): its "
-        "scores are chance; consider a higher rate, or more features or states for it"
-    ),
+    "discriminator_too_strong": "the discriminator tells simulated from logged states almost without fail (AUC above "
+    "0.98 in the last 10 records): its scores rank little; consider a lower rate or a gradient penalty for it",
+    "discriminator_blind": "the discriminator can't tell simulated from logged states (AUC below 0.52 in the last 10 "
+    "records): its scores are chance; consider a higher rate, or more features or states for it",
 }
 """Values that `alarm` in the metrics may have, and what they mean."""
 FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every")
-"""Settings that may be others when a run goes on."""
+"""Settings that may be others when a run goes on, which is no other run for more updates or another machine."""
 _SEED_STRIDE = 1_000_003
 
 Updates = Iterator[tuple[str, TensorDictBase]]
@@ -79,13 +70,7 @@ Rates = Callable[[int], Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of updates of one kind.
-
-    Attributes:
-        until: the first update, counted from the start of the run, that no longer belongs to it.
-        update: computes the losses of an update; see :data:`Updates`.
-        rates: of the optimizers.
-    """
+    """A stretch of updates of one kind, up to the update `until`, counted from the start of the run."""
 
     until: int
     update: Callable[[int], Updates]
@@ -108,21 +93,14 @@ class TrainingError(SymphonyError):
 
 @dataclass
 class Skips:
-    """Steps of optimizers that were left out because the gradient was not finite.
-
-    Attributes:
-        total: of all networks, since the run began.
-        in_row: of each network, up to now.
-    """
+    """How many steps of optimizers were left out because the gradient was not finite, of each network in a row."""
 
     total: int = 0
     in_row: dict[str, int] = field(default_factory=dict)
 
     def count(self, values: Mapping[str, Tensor]) -> list[str]:
-        """Count those of one update, from its norms of the gradient; returns the networks concerned.
-
-        Raises:
-            TrainingError: if a network had to skip too many in a row.
+        """Count those of one update, from its norms of the gradient; returns the networks concerned, and raises
+        TrainingError if one had to skip too many in a row.
         """
         norms = {name.removeprefix(NORM): value for name, value in values.items() if name.startswith(NORM)}
         if not norms:
@@ -134,21 +112,16 @@ class Skips:
         for name in norms:
             self.in_row[name] = self.in_row.get(name, 0) + 1 if name in bad else 0
             if self.in_row[name] >= PATIENCE:
-                loss = f"loss_{name}"
-                told = f" ({loss} is {values[loss].item():g})" if loss in values else ""
                 raise TrainingError(
-                    f"the gradient of the {name} network{told} was not finite in {PATIENCE} updates in a row; "
-                    "the last checkpoint is intact: lower the learning rate, or check the data"
+                    f"the gradient of the {name} network (loss_{name} is {values[f'loss_{name}'].item():g}) was not "
+                    f"finite in {PATIENCE} updates in a row; the last checkpoint is intact: lower the learning rate, "
+                    "or check the data"
                 )
         return bad
 
 
 class Alarms:
-    """Watches the records of a run for a discriminator that has won or learns nothing.
-
-    Args:
-        records: earlier ones of a run that goes on.
-    """
+    """Watches the records of a run, earlier ones included, for a discriminator that has won or learns nothing."""
 
     def __init__(self, records: Iterable[Mapping[str, Any]] = ()) -> None:
         self._recent: deque[float] = deque(maxlen=WINDOW)
@@ -169,16 +142,10 @@ class Alarms:
 
 
 class Validation(Protocol):
-    """A hook that evaluates the agent as it is after an update; gives numbers for the record.
-
-    Attributes:
-        best: the best checkpoint so far.
-        what: the run segments it is evaluated on and how often: scores of something else can't be compared.
-        dataset: these run segments.
-    """
+    """A hook that evaluates the agent as it is after an update; gives numbers for the record."""
 
     best: Best | None
-    what: str
+    what: str  # the run segments of `dataset` and how often they are simulated: scores of others can't be compared
     dataset: SceneDataset
 
     def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]: ...  # noqa: D102
@@ -207,10 +174,6 @@ class Trainer:
     Attributes:
         validator: a hook called at every checkpoint, of which the best then is the run's agent.
         previewer: a hook called every ``preview.every`` updates; see :func:`symphony.training.hooks.add_hooks`.
-
-    Raises:
-        ConfigError: if the folder holds another run, or settings can't be used.
-        DataError: if a store can't be read or holds nothing to learn from.
     """
 
     validator: Validation | None = None
@@ -238,15 +201,15 @@ class Trainer:
         self.skips, self.told = Skips(), set[str]()
         self.best: Best | None = None
         self.validated: str | None = None
-        self.progress = Progress(
+        speed = TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left")
+        columns = (
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left"),
+            speed,
             TimeRemainingColumn(),
-            console=Console(stderr=True),
-            disable=not processes.is_main,
         )
+        self.progress = Progress(*columns, console=Console(stderr=True), disable=not processes.is_main)
         self.tracker: Tracker | None = None
         self.checksum = data.checksum()
         self.done = checkpoint_to_resume(config)
@@ -267,15 +230,12 @@ class Trainer:
             TrainingError: if gradients stay infinite or undefined.
         """
         with contextlib.ExitStack() as held:
-            # No process writes before all have looked at what there is.
-            self.world.wait()
+            self.world.wait()  # no process writes before all have looked at what there is
             if self.world.is_main:
                 self.config.out.mkdir(parents=True, exist_ok=True)
                 self._lock = held.enter_context(Lock(self.config.out / LOCK))
                 if checkpoint_to_resume(self.config) != self.done:
-                    raise ConfigError(
-                        f"{self.config.out}: another process went on with this run in the meantime"
-                    )
+                    raise ConfigError(f"{self.config.out}: another process went on with this run meanwhile")
             return self._run()
 
     def _run(self) -> Path:
@@ -309,9 +269,8 @@ class Trainer:
             self.alarms = Alarms(self.tracker.kept)
         try:
             with self.progress:
-                self.task = self.progress.add_task(
-                    "training", total=config.steps, completed=step, loss="-", speed="-"
-                )
+                shown: Any = {"total": config.steps, "completed": step, "loss": "-", "speed": "-"}
+                self.task = self.progress.add_task("training", **shown)
                 self._update_from(step)
         finally:
             if self.tracker is not None:
@@ -338,12 +297,12 @@ class Trainer:
                 continue
             paused = time.perf_counter()
             if self.validator is not None and (last or step % config.checkpoint_every == 0):
-                numbers |= self.validator(step, self._show_validated)
+                numbers |= self.validator(step, lambda n, total: self._show(f"validating {n}/{total}"))
                 self.best, self.validated = self.validator.best, self.validator.what
             if self.previewer is not None and (last or step % config.preview.every == 0):
-                self.progress.update(self.task, description="previewing")
+                self._show("previewing")
                 numbers |= self.previewer(step, self.tracker)
-            self.progress.update(self.task, description="training")
+            self._show("training")
             began += time.perf_counter() - paused
             if numbers:
                 self.tracker.log(step, numbers)
@@ -410,8 +369,8 @@ class Trainer:
             self.told.add(condition)
             self.progress.console.print(f"warning: {message}", style="yellow", soft_wrap=True)
 
-    def _show_validated(self, done: int, total: int) -> None:
-        self.progress.update(self.task, description=f"validating {done}/{total}")
+    def _show(self, what: str) -> None:
+        self.progress.update(self.task, description=what)
 
     def _save(self, step: int) -> None:
         """Write a checkpoint; by now all records up to it are on the disk."""
@@ -423,13 +382,8 @@ class Trainer:
             "processes": self.world.count,
             "data": self.checksum,
         }
-        save_checkpoint(
-            self.config.out / "checkpoints",
-            step=step,
-            modules=self.agent.modules,
-            optimizers=self.optimizers,
-            extra=extra,
-        )
+        what: Any = {"modules": self.agent.modules, "optimizers": self.optimizers, "extra": extra}
+        save_checkpoint(self.config.out / "checkpoints", step=step, **what)
         self._prune()
 
     def _prune(self) -> None:
@@ -438,33 +392,25 @@ class Trainer:
 
     def _restore(self, extra: Mapping[str, Any]) -> None:
         before = extra.get("processes", 1)
-        if before != self.world.count:
-            raise ConfigError(
-                f"{self.config.out}: trained by {before} processes so far, can't be resumed by {self.world.count}"
-            )
-        if extra.get("data", self.checksum) != self.checksum:
-            raise DataError(
-                f"not the run segments that {self.config.out} learned from so far: "
-                f"checksum {self.checksum[:12]}, then {str(extra['data'])[:12]}",
-                file=self.data.store.path,
-            )
+        out, count = self.config.out, self.world.count
+        if before != count:
+            raise ConfigError(f"{out}: trained by {before} processes so far, can't be resumed by {count}")
+        then = str(extra.get("data", self.checksum))
+        if then != self.checksum:
+            why = f"not the run segments that {out} learned from so far"
+            numbers = f"checksum {self.checksum[:12]}, then {then[:12]}"
+            raise DataError(f"{why}: {numbers}", file=self.data.store.path)
         self.best, self.validated = Best.of(extra), extra.get("validated")
         self.skips = Skips(**extra.get("skips") or {})
         if self.validator is not None:
             if self.best is not None and self.validated not in (None, self.validator.what):
-                raise ConfigError(
-                    f"{self.config.out}: its best checkpoint was chosen by {self.validated}; can't be compared with "
-                    f"{self.validator.what}"
-                )
+                chosen = f"its best checkpoint was chosen by {self.validated}"
+                raise ConfigError(f"{out}: {chosen}; can't be compared with {self.validator.what}")
             self.validator.best = self.best
 
 
 def checkpoint_to_resume(config: RunConfig) -> Path | None:
-    """The checkpoint to go on from; None for a new run.
-
-    Raises:
-        ConfigError: if the folder holds a run that is not to be gone on with, or another one.
-    """
+    """The checkpoint to go on from; None for a new run. ConfigError if the folder holds a run that is another."""
     path, records = config.out / "config.json", config.out / RECORDS
     found = latest(config.out / "checkpoints")
     if path.exists():
@@ -474,20 +420,15 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
         if not config.resume:
             raise ConfigError(f"{config.out} holds a run already; choose another folder or --resume")
         before = read_json(type(config), path)
-        # More updates, another machine or fewer records do not make it another run.
-        free = {name: getattr(config, name) for name in FREE}
+        free = {name: getattr(config, name) for name in (*FREE, "validation")}
         # Scores on other segments could not be compared with those so far.
-        free["validation"] = config.validation
         if before.validation.data is not None:
             free["validation"] = dataclasses.replace(before.validation, data=config.validation.data)
-        before = dataclasses.replace(before, **free)
-        changed = _changed(before, config)
+        changed = _changed(dataclasses.replace(before, **free), config)
         if changed:
             raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
-    if found is not None and not path.exists():
-        raise ConfigError(
-            f"{config.out} holds checkpoints of a run whose config.json is gone; choose another folder"
-        )
+    elif found is not None:
+        raise ConfigError(f"{config.out} holds checkpoints without their config.json; choose another folder")
     return found
 
 
@@ -506,9 +447,8 @@ def _changed(before: Any, after: Any, where: str = "") -> list[str]:
 def warm_start(agent: Agent, run: Path) -> None:
     """Take over the networks that another run has too; personas that they had not change nothing at first.
 
-    Raises:
-        ConfigError: if there is no such run, or it learned another time step.
-        CheckpointError: if its networks have other shapes; names the settings of the agent that differ.
+    Raises ConfigError if there is no such run, or it learned another time step, and CheckpointError if its networks
+    have other shapes, with the settings of the agent that differ.
     """
     folder, which = split_name(str(run))
     source = choose(folder, which)
@@ -528,9 +468,8 @@ def warm_start(agent: Agent, run: Path) -> None:
 
 
 def _only_personas(before: AgentSpec, after: AgentSpec) -> bool:
-    """Whether personas are all that is new to the networks, and come after all that they knew.
-
-    Any other input would stand before inputs that are learned already, whose weights it would get.
+    """Whether personas are all that is new to the networks, and come after all that they knew: any other input would
+    stand before inputs that are learned already, whose weights it would get.
     """
     told = dataclasses.replace(before.agent, persona=True, interactive=after.agent.interactive)
     alike = told == after.agent and before.goals == after.goals and before.action_space == after.action_space
