@@ -1,24 +1,97 @@
-"""What TorchRL's own tests ask of every loss module."""
+"""What TorchRL's own tests ask of every loss module, and actors and batches for those that imitate."""
 
 from __future__ import annotations
 
 import copy
+import inspect
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import (
+    InteractionType,
+    NormalParamExtractor,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import nn
+from torch.distributions import Categorical, Independent, Normal
+
+OBSERVATION, LOGITS, ACTION = ("agents", "observation"), ("agents", "logits"), ("agents", "action")
+VALID, ROLLOUT = ("agents", "valid"), ("agents", "rollout")
 
 
-def check_contract(make, td, name, parameters):
-    """Keys, dispatch, gradients, state and copies of a loss.
+def categorical_actor(classes=7, observation=OBSERVATION, action=ACTION, kind=Categorical, mask=None):
+    """Logits are read beside a mask if there is one; they are those of any kind of categorical."""
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(4, 16), nn.ReLU(), nn.Linear(16, classes))
+    keys = {"logits": LOGITS} if mask is None else {"logits": LOGITS, "mask": mask}
+    how = {"distribution_class": kind, "default_interaction_type": InteractionType.RANDOM}
+    head = ProbabilisticTensorDictModule(in_keys=keys, out_keys=[action], **how)
+    return ProbabilisticTensorDictSequential(TensorDictModule(network, [observation], [LOGITS]), head)
 
-    `make()` builds the loss with a network of its own, always with the same weights; `td` is a batch for it,
-    `name` the loss among its outputs and `parameters` how many tensors its network trains.
+
+def independent_normal(loc, scale):
+    return Independent(Normal(loc, scale), 1)
+
+
+def gaussian_actor(observation=OBSERVATION, action=ACTION):
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(4, 4), NormalParamExtractor())
+    keys = {name: name if observation == "observation" else ("agents", name) for name in ("loc", "scale")}
+    head = ProbabilisticTensorDictModule(keys, [action], distribution_class=independent_normal)
+    return ProbabilisticTensorDictSequential(TensorDictModule(network, [observation], [*keys.values()]), head)
+
+
+def batch(*shape, agents=3, classes=7, continuous=False):
+    torch.manual_seed(1)
+    td = TensorDict(batch_size=shape)
+    td[OBSERVATION] = torch.randn(*shape, agents, 4)
+    td[ACTION] = torch.randn(*shape, agents, 2) if continuous else torch.randint(classes, (*shape, agents))
+    td[VALID] = torch.rand(*shape, agents) < 0.7
+    # Whole entries come from one source, and there are many more rollouts than experts.
+    td[ROLLOUT] = (torch.rand(*shape, 1) < 0.8).expand(*shape, agents).clone()
+    return td
+
+
+def learned(loss, td):
+    """What a loss reports, and the gradients of its parameters."""
+    loss.zero_grad(set_to_none=True)
+    out = loss(td)
+    next(out[key] for key in loss.out_keys if key.startswith("loss")).sum().backward()
+    return [value.detach() for value in out.values()], [p.grad for p in loss.parameters()]
+
+
+def trained(loss, td, steps, rate=0.03):
+    """What a loss reports before and after some updates."""
+    optimizer, before = torch.optim.Adam(loss.parameters(), lr=rate), loss(td)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        out = loss(td)
+        next(out[key] for key in loss.out_keys if key.startswith("loss")).backward()
+        optimizer.step()
+    return before, out
+
+
+def check_contract(make, td, parameters, dirty=None):
+    """Keys, dispatch, gradients, state, copies and refusals of a loss.
+
+    `make(**arguments)` builds the loss with a network of its own, always with the same weights; `td` is a batch for
+    it, its network trains so many `parameters`, and `dirty` batches differ from `td` in what does not count.
     """
-    _check_outputs(make(), td, name)
+    loss = make()
+    (name,) = (key for key in loss.out_keys if key.startswith("loss"))
+    _check_outputs(loss, td, name)
     _check_keys(make, td, name)
     _check_dispatch(make(), td, name)
-    _check_gradients(make(), td, name, parameters)
+    _, gradients = learned(make(), td)
+    assert len(gradients) == parameters
+    assert all(gradient is not None and gradient.norm() > 0 for gradient in gradients)
+    for other in () if dirty is None else (dirty,):
+        torch.testing.assert_close(learned(make(), other), learned(make(), td), equal_nan=True)
     _check_state(make, td, name)
+    _check_refusals(make, td)
 
 
 def _check_outputs(loss, td, name):
@@ -28,9 +101,8 @@ def _check_outputs(loss, td, name):
     assert (td == before).all()
     assert out.batch_size == torch.Size([])
     assert set(out.keys()) == set(loss.out_keys)
-    # A trainer optimises the sum of all that starts with "loss".
-    assert [key for key in loss.out_keys if key.startswith("loss")] == [name]
     assert out[name].requires_grad
+    # A trainer optimises the sum of all that starts with "loss".
     assert not any(out[key].requires_grad for key in loss.out_keys if key != name)
     assert out[name].isfinite().all()
     with torch.no_grad():
@@ -66,17 +138,11 @@ def _check_dispatch(loss, td, name):
     present = [key for key in loss.in_keys if key in td.keys(True)]
     arguments = {key if isinstance(key, str) else "_".join(key): td[key] for key in present}
     from_td = loss(td)
-    for value, key in zip(loss(**arguments), loss.out_keys, strict=True):
+    values = loss(**arguments)
+    for value, key in zip(values if isinstance(values, tuple) else (values,), loss.out_keys, strict=True):
         torch.testing.assert_close(value, from_td[key], equal_nan=True)
     loss.select_out_keys(name)
     torch.testing.assert_close(loss(**arguments), from_td[name])
-
-
-def _check_gradients(loss, td, name, parameters):
-    loss(td)[name].sum().backward()
-    named = dict(loss.named_parameters())
-    assert len(named) == parameters
-    assert all(p.grad is not None and p.grad.norm() > 0 for p in named.values())
 
 
 def _check_state(make, td, name):
@@ -95,3 +161,18 @@ def _check_state(make, td, name):
             p.zero_()
     assert torch.equal(value, loss(td)[name])
     assert not torch.equal(value, clone(td)[name])
+
+
+def _check_refusals(make, td):
+    wrong = {"reduction": ["median"], "label_smoothing": [1.0, -0.1], "gradient_penalty": [-1.0]}
+    accepted = inspect.signature(type(make())).parameters
+    for argument, values in wrong.items():
+        for value in values if argument in accepted else ():
+            with pytest.raises(ValueError, match=argument):
+                make(**{argument: value})
+    key = make().tensor_keys.valid
+    with pytest.raises(KeyError, match="use_mask=False"):
+        make()(td.exclude(key))
+    for mask, message in ((td[key].float(), "is torch.float32"), (td[key][..., None], "has shape")):
+        with pytest.raises(ValueError, match=message):
+            make()(td.clone().set(key, mask))

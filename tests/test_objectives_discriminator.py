@@ -9,31 +9,31 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.nn import functional
 
-from helpers_objectives import check_contract
+from helpers_objectives import OBSERVATION, VALID, check_contract, trained
 from symphony.modules import SceneEncoder, SceneNetwork, encoder, pool_elements
 from symphony.objectives import DiscriminatorLoss, auc
 
-OBSERVATION, SCORE = ("agents", "observation"), ("agents", "score")
-SIMULATED, VALID = ("agents", "simulated"), ("agents", "valid")
+SCORE, SIMULATED = ("agents", "score"), ("agents", "simulated")
 PENALTY = {"gradient_penalty": 0.3}
 
 
-class Discriminator(nn.Module):
-    def __init__(self, dtype=torch.float32):
+class Squeeze(nn.Module):
+    def __init__(self, network):
         super().__init__()
-        self.net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1)).to(dtype)
+        self.network = network
 
-    def forward(self, x):
-        return self.net(x).squeeze(-1)
+    def forward(self, *inputs):
+        return self.network(*inputs).squeeze(-1)
 
 
-def discriminator(dtype=torch.float32):
+def discriminator(dtype=torch.float32, score=SCORE):
     torch.manual_seed(0)
-    return TensorDictModule(Discriminator(dtype), in_keys=[OBSERVATION], out_keys=[SCORE])
+    net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1)).to(dtype)
+    return TensorDictModule(Squeeze(net), in_keys=[OBSERVATION], out_keys=[score])
 
 
 def batch(*shape, agents=3):
@@ -78,9 +78,8 @@ def test_it_is_cross_entropy_with_a_mean_per_kind(shape, smoothing, reduction):
     logit = discriminator()(td.clone())[SCORE]
     # Two classes, so that torch smooths the labels.
     classes = torch.stack([torch.zeros_like(logit), logit], -1).flatten(0, -2)
-    entropy = functional.cross_entropy(
-        classes, td[SIMULATED].long().flatten(), label_smoothing=smoothing, reduction="none"
-    ).reshape(logit.shape)
+    how = {"label_smoothing": smoothing, "reduction": "none"}
+    entropy = functional.cross_entropy(classes, td[SIMULATED].long().flatten(), **how).reshape(logit.shape)
     fake, real = td[VALID] & td[SIMULATED], td[VALID] & ~td[SIMULATED]
     assert 0 < real.sum() < fake.sum() / 2
     expected = {
@@ -121,36 +120,12 @@ def test_a_kind_that_is_absent_adds_nothing():
     assert all((p.grad == 0).all() for p in network.parameters())
 
 
-def test_padding_changes_nothing():
-    td = batch(30)
-    dirty = torch.cat([td, td[:5]])
-    dirty[VALID][30:] = False
-    dirty[SIMULATED] = dirty[SIMULATED] ^ ~dirty[VALID]
-    dirty[OBSERVATION] = torch.where(dirty[VALID][..., None], dirty[OBSERVATION], 1e3)
-    results = []
-    for data in (td, dirty):
-        network = discriminator()
-        out = DiscriminatorLoss(network, **PENALTY)(data)
-        out["loss_discriminator"].backward()
-        results.append([*(v.detach() for v in out.values()), *(p.grad for p in network.parameters())])
-    for a, b in zip(*results, strict=True):
-        torch.testing.assert_close(a, b)
-
-
 def test_trained_it_scores_simulated_states_higher():
     td = batch(200)
     td[OBSERVATION][..., 0] += 4.0 * td[SIMULATED]
-    loss = DiscriminatorLoss(discriminator(), gradient_penalty=0.01)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=0.03)
-    for _ in range(60):
-        optimizer.zero_grad()
-        out = loss(td)
-        out["loss_discriminator"].backward()
-        optimizer.step()
+    _, out = trained(DiscriminatorLoss(discriminator(), gradient_penalty=0.01), td, 60)
     assert out["score_simulated"] > 0 > out["score_data"]
     assert min(out["auc"], out["accuracy_simulated"], out["accuracy_data"]) > 0.9
-    logit = loss.get_stateful_net("discriminator")(td.clone())[SCORE]
-    assert (logit[td[SIMULATED] & td[VALID]] > 0).float().mean() > 0.9
 
 
 def test_only_the_discriminator_receives_a_gradient():
@@ -163,17 +138,19 @@ def test_only_the_discriminator_receives_a_gradient():
 
 @pytest.mark.parametrize("arguments", [{}, PENALTY, {**PENALTY, "reduction": "none"}])
 def test_it_keeps_the_contract_of_torchrl(arguments):
-    check_contract(
-        lambda: DiscriminatorLoss(discriminator(), use_mask=True, **arguments),
-        batch(20),
-        "loss_discriminator",
-        parameters=4,
-    )
+    td = batch(20)
+    dirty, padded = td.clone(), ~td[VALID]
+    dirty[SIMULATED] = td[SIMULATED] ^ padded
+    dirty[OBSERVATION][padded] = 1e3
+
+    def make(**more):
+        return DiscriminatorLoss(discriminator(), use_mask=True, **{**arguments, **more})
+
+    check_contract(make, td, 4, dirty)
 
 
 def test_the_key_of_the_score_can_be_set():
-    network = TensorDictModule(Discriminator(), in_keys=[OBSERVATION], out_keys=["score"])
-    loss = DiscriminatorLoss(network)
+    loss = DiscriminatorLoss(discriminator(score="score"))
     with pytest.raises(KeyError, match="writes no score"):
         loss(batch(3))
     loss.set_keys(score="score")
@@ -185,10 +162,7 @@ def test_the_penalty_of_a_linear_discriminator_is_its_weight(reduction):
     """The gradient of w . x is w wherever x is."""
     td = batch(20)
     net = nn.Linear(4, 1)
-    network = TensorDictSequential(
-        TensorDictModule(net, in_keys=[OBSERVATION], out_keys=["logit"]),
-        TensorDictModule(lambda x: x.squeeze(-1), in_keys=["logit"], out_keys=[SCORE]),
-    )
+    network = TensorDictModule(Squeeze(net), in_keys=[OBSERVATION], out_keys=[SCORE])
     arguments = {"reduction": reduction}
     out = DiscriminatorLoss(network, gradient_penalty=0.5, **arguments)(td)
     plain = DiscriminatorLoss(network, **arguments)(td)
@@ -214,15 +188,6 @@ def test_gradients_of_the_penalised_loss_by_differences():
         return loss(td)["loss_discriminator"]
 
     assert torch.autograd.gradcheck(value, parameters)
-
-
-class Squeeze(nn.Module):
-    def __init__(self, network):
-        super().__init__()
-        self.network = network
-
-    def forward(self, *inputs):
-        return self.network(*inputs).squeeze(-1)
 
 
 def scenes(count, elements):
@@ -255,9 +220,8 @@ def test_the_penalty_reaches_the_encoders_through_every_pool(monkeypatch):
     loss = DiscriminatorLoss(network, gradient_penalty=5.0)
     weights = [p for name, p in loss.named_parameters() if "groups" in name and p.shape[-1] == 6]
     assert len(weights) == 1
-    assert torch.autograd.gradcheck(
-        lambda *_: loss(td)["loss_discriminator"], weights, eps=1e-7, fast_mode=True
-    )
+    how = {"eps": 1e-7, "fast_mode": True}
+    assert torch.autograd.gradcheck(lambda *_: loss(td)["loss_discriminator"], weights, **how)
 
 
 def test_the_penalty_is_that_of_each_agent_by_itself():
@@ -275,26 +239,11 @@ def test_the_penalty_is_that_of_each_agent_by_itself():
     torch.testing.assert_close(loss(td)["gradient_penalty"], torch.stack(rows).mean())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"gradient_penalty": -1.0}, "gradient_penalty must be"),
-        ({"label_smoothing": 1.0}, "label_smoothing must be in"),
-        ({"reduction": "median"}, "unknown reduction"),
-    ],
-)
-def test_bad_arguments_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        DiscriminatorLoss(discriminator(), **arguments)
-
-
 def test_bad_inputs_are_refused():
     td = batch(5)
     loss = DiscriminatorLoss(discriminator())
     with pytest.raises(KeyError, match="no flag under"):
         loss(td.exclude(SIMULATED))
-    with pytest.raises(KeyError, match="use_mask=False"):
-        DiscriminatorLoss(discriminator(), use_mask=True)(td.exclude(VALID))
     wrong = td.clone()
     wrong[SIMULATED] = wrong[SIMULATED].float()
     with pytest.raises(ValueError, match=r"flag .* is torch.float32"):
@@ -302,9 +251,7 @@ def test_bad_inputs_are_refused():
     wrong[SIMULATED] = td[SIMULATED][..., None]
     with pytest.raises(ValueError, match=r"flag .* has shape \(5, 3, 1\).*\(5, 3\)"):
         loss(wrong)
-    shared = TensorDictModule(
-        lambda x, y: x.sum(-1) + y.sum(), in_keys=[OBSERVATION, "shared"], out_keys=[SCORE]
-    )
+    shared = TensorDictModule(lambda x, y: x.sum(-1) + y.sum(), [OBSERVATION, "shared"], [SCORE])
     td["shared"] = torch.randn(5, 2)
     with pytest.raises(ValueError, match=r"penalised input has shape \(5, 2\), expected \(5, 3\) in front"):
         DiscriminatorLoss(shared, gradient_penalty=1.0)(td)
@@ -324,15 +271,6 @@ def test_auc_counts_pairs(entries):
         assert float(found) == pytest.approx(float(((a > b).double() + 0.5 * (a == b)).mean()), abs=1e-6)
     else:
         assert found.isnan()
-
-
-def test_auc_of_many_scores():
-    torch.manual_seed(0)
-    score, positive = torch.randn(40, 50).round(decimals=1), torch.rand(40, 50) < 0.3
-    a, b = score[positive][:, None], score[~positive]
-    assert float(auc(score, positive)) == pytest.approx(float(((a > b).double() + 0.5 * (a == b)).mean()))
-    assert float(auc(score, positive) + auc(-score, positive)) == pytest.approx(1)
-    assert float(auc(score.exp(), positive)) == float(auc(score, positive))
 
 
 def test_auc_of_strange_scores():

@@ -1,0 +1,222 @@
+"""The losses that imitate, as TorchRL tests its own: behavioural cloning and distillation of a search."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from torch import nn
+from torch.distributions import Categorical
+from torch.nn import functional
+from torchrl.modules import MaskedCategorical, OneHotCategorical
+from torchrl.objectives import BCLoss as TorchRLBCLoss
+
+from helpers_objectives import (
+    ACTION,
+    LOGITS,
+    OBSERVATION,
+    ROLLOUT,
+    VALID,
+    batch,
+    categorical_actor,
+    check_contract,
+    gaussian_actor,
+    learned,
+    trained,
+)
+from symphony.objectives import BCLoss, DistillationLoss
+
+KINDS = pytest.mark.parametrize("kind", [BCLoss, DistillationLoss])
+
+
+def bc(td, mask=None, key="loss_bc", actor=categorical_actor, **arguments):
+    """What cloning reports of the entries of a mask."""
+    return BCLoss(actor(), **arguments)(td if mask is None else td.clone().set(VALID, mask))[key]
+
+
+@pytest.mark.parametrize("shape", [(), (4, 5)])
+@pytest.mark.parametrize("smoothing", [0.0, 0.1])
+@pytest.mark.parametrize("reduction", [None, "sum", "none"])
+def test_cloning_is_cross_entropy_over_valid_agents(shape, smoothing, reduction):
+    td = batch(*shape)
+    td[VALID][..., 0] = True
+    out = BCLoss(categorical_actor(), reduction=reduction, label_smoothing=smoothing)(td)
+    logits, action = categorical_actor()[0](td.clone())[LOGITS][td[VALID]], td[ACTION][td[VALID]]
+    how = {"label_smoothing": smoothing, "reduction": reduction or "mean"}
+    expected = functional.cross_entropy(logits, action, **how)
+    if reduction == "none":
+        assert out["loss_bc"].shape == out["accuracy"].shape == td[VALID].shape
+        torch.testing.assert_close(out["loss_bc"][td[VALID]], expected)
+        assert (out["loss_bc"][~td[VALID]] == 0).all()
+    else:
+        torch.testing.assert_close(out["loss_bc"], expected)
+        torch.testing.assert_close(out["entropy"], Categorical(logits=logits).entropy().mean())
+        torch.testing.assert_close(out["accuracy"], (logits.argmax(-1) == action).float().mean())
+
+
+def test_cloning_agrees_with_torchrl_on_flat_keys():
+    td = TensorDict(observation=torch.randn(20, 4), action=torch.randn(20, 2), batch_size=[20])
+    actors = [gaussian_actor("observation", "action") for _ in range(2)]
+    loss = BCLoss(actors[0])
+    loss.set_keys(action="action")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The name target_actor_network_params", UserWarning)
+        theirs = TorchRLBCLoss(actors[1])
+    assert set(loss(td).keys()) == {"loss_bc"} == set(loss.out_keys)
+    torch.testing.assert_close(loss(td)["loss_bc"], theirs(td)["loss_bc"])
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("reduction", [None, "sum"])
+def test_distillation_is_one_bc_loss_per_kind(continuous, reduction):
+    td, actor = batch(30, continuous=continuous), gaussian_actor if continuous else categorical_actor
+    out = DistillationLoss(actor(), reduction=reduction)(td)
+    expert, rollout = td[VALID] & ~td[ROLLOUT], td[VALID] & td[ROLLOUT]
+    assert 0 < expert.sum() < rollout.sum()
+    parts = [bc(td, mask, actor=actor, reduction=reduction) for mask in (expert, rollout)]
+    torch.testing.assert_close(out["loss_distillation"], parts[0] + parts[1])
+    for name, mask in (("nll_expert", expert), ("nll_rollout", rollout)):
+        torch.testing.assert_close(out[name], bc(td, mask, actor=actor).detach())
+    for name in () if continuous else ("accuracy", "entropy"):
+        torch.testing.assert_close(out[name], bc(td, expert, name))
+
+
+def test_distillation_by_hand():
+    """An actor with fixed probabilities 1/2, 1/4, 1/8, 1/8."""
+    actor = ProbabilisticTensorDictSequential(
+        TensorDictModule(nn.Linear(1, 4), in_keys=["x"], out_keys=["logits"]),
+        ProbabilisticTensorDictModule(in_keys=["logits"], out_keys=["a"], distribution_class=Categorical),
+    )
+    with torch.no_grad():
+        actor[0].module.bias.copy_(torch.tensor([0.5, 0.25, 0.125, 0.125]).log())
+    td = TensorDict(x=torch.zeros(6, 1), a=torch.tensor([0, 1, 1, 3, 0, 0]), batch_size=[6])
+    td["rollout"] = torch.tensor([False, False, True, True, True, True])
+    td["valid"] = torch.tensor([True, True, True, True, True, False])
+    loss = DistillationLoss(actor)
+    loss.set_keys(action="a", valid="valid", rollout="rollout")
+    out, bits = loss(td), (2 + 3 + 1) / 3
+    expected = torch.tensor([1.5 + bits, 1.5, bits]) * torch.tensor(2.0).log()
+    got = torch.stack([out["loss_distillation"], out["nll_expert"], out["nll_rollout"]])
+    torch.testing.assert_close(got, expected)
+    assert out["accuracy"] == 0.5
+
+
+def test_distillation_without_reduction_keeps_the_shape():
+    td = batch(6, 5)
+    out = DistillationLoss(categorical_actor(), reduction="none", label_smoothing=0.2)(td)
+    assert {value.shape for value in out.values()} == {td[VALID].shape}
+    torch.testing.assert_close(out["loss_distillation"], bc(td, reduction="none", label_smoothing=0.2))
+    torch.testing.assert_close(out["nll_expert"] + out["nll_rollout"], bc(td, reduction="none").detach())
+    assert (out["nll_expert"][td[ROLLOUT]] == 0).all()
+
+
+def test_more_rollouts_weigh_no_more_and_a_kind_that_is_absent_adds_nothing():
+    td = batch(20)
+    rollouts = td[td[ROLLOUT][:, 0]]
+    one, other = (DistillationLoss(categorical_actor())(x) for x in (td, torch.cat([td, rollouts, rollouts])))
+    torch.testing.assert_close(one["loss_distillation"], other["loss_distillation"])
+    for kind in (True, False):
+        td[ROLLOUT] = torch.full_like(td[ROLLOUT], kind)
+        found = DistillationLoss(categorical_actor())(td)["loss_distillation"]
+        torch.testing.assert_close(found, bc(td))
+
+
+@KINDS
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_without_valid_agents_it_is_zero_with_zero_gradient(kind, reduction):
+    td = batch(5)
+    td[VALID] = torch.zeros_like(td[VALID])
+    values, gradients = learned(kind(categorical_actor(), reduction=reduction), td)
+    assert all((value == 0).all() for value in [*values, *gradients])
+
+
+@KINDS
+@pytest.mark.parametrize("continuous", [False, True])
+def test_it_keeps_the_contract_of_torchrl(kind, continuous):
+    actor, td = gaussian_actor if continuous else categorical_actor, batch(20, continuous=continuous)
+    td = td if kind is DistillationLoss else td.exclude(ROLLOUT)
+    dirty, padded = td.clone(), ~td[VALID]
+    dirty[ACTION][padded] = -1
+    dirty[OBSERVATION][padded] = 1e4
+    if kind is DistillationLoss:
+        dirty[ROLLOUT] = td[ROLLOUT] ^ padded
+
+    def make(**arguments):
+        return kind(actor(), use_mask=True, **arguments)
+
+    check_contract(make, td, 2 if continuous else 4, dirty)
+
+
+def test_training_it_imitates():
+    td = batch(200)
+    td[ACTION] = (td[OBSERVATION][..., 0] > 0).long() + 2 * (td[OBSERVATION][..., 1] > 0).long()
+    assert trained(BCLoss(categorical_actor()), td, 150)[1]["accuracy"] > 0.95
+
+
+def test_a_mask_counts_where_there_is_one():
+    """And must be there if it is demanded, or read by the network anyway; False never reads it."""
+    td = batch(20)
+    masked, bare = bc(td), td.exclude(VALID)
+    everyone = bc(td, torch.ones_like(td[VALID]))
+    assert not torch.isclose(everyone, masked)
+    torch.testing.assert_close(bc(bare), everyone)
+    torch.testing.assert_close(bc(td, use_mask=False), everyone)
+    torch.testing.assert_close(bc(td, use_mask=True), masked)
+    assert VALID not in BCLoss(categorical_actor(), use_mask=False).in_keys
+    # A network that reads the mask: what is without one can't be told from what is to be trained on.
+    reading = BCLoss(categorical_actor(observation=VALID), use_mask=None)
+    with pytest.raises(KeyError, match="use_mask=False"):
+        reading._mask(bare)
+    reading.set_keys(valid="other")
+    assert reading._mask(bare) is None
+    # TorchRL's own masks count, too.
+    td = batch(4, 5)
+    keep = torch.rand(4, 5, 1) < 0.5
+    found = bc(td.clone().set(("collector", "mask"), keep))
+    torch.testing.assert_close(found, bc(td, td[VALID] & keep))
+
+
+def test_bad_inputs_are_refused():
+    with pytest.raises(ValueError, match="needs an actor whose distribution"):
+        BCLoss(gaussian_actor(), label_smoothing=0.1)
+    with pytest.raises(KeyError, match="no expert action"):
+        BCLoss(categorical_actor())(batch(5).exclude(ACTION))
+    td = batch(5)
+    td[ROLLOUT] = td[ROLLOUT].long()
+    with pytest.raises(ValueError, match=r"rollout flag .* is torch.int64"):
+        DistillationLoss(categorical_actor())(td)
+
+
+@pytest.mark.parametrize("shape", [(6, 1), (6, 6), (1,), ()])
+def test_an_action_of_another_shape_is_refused_where_it_would_be_broadcast(shape):
+    td = TensorDict(batch_size=[])
+    td[OBSERVATION], td[ACTION] = torch.randn(6, 4), torch.zeros(shape, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"action .* has shape"):
+        BCLoss(categorical_actor(), use_mask=False)(td)
+    td[ACTION] = torch.randn(6, 1)
+    with pytest.raises(ValueError, match=r"has shape \(6, 1\), the actor's are \(6, 2\)"):
+        BCLoss(gaussian_actor())(td)
+
+
+@pytest.mark.parametrize("agents", [3, 7])
+@pytest.mark.parametrize("smoothing", [0.0, 0.2])
+def test_one_hot_actions_are_those_of_their_indices(agents, smoothing):
+    td = batch(4, agents=agents)
+    one_hot = td.clone().set(ACTION, functional.one_hot(td[ACTION], 7))
+    wanted = BCLoss(categorical_actor(), label_smoothing=smoothing)(td)
+    found = BCLoss(categorical_actor(kind=OneHotCategorical), label_smoothing=smoothing)(one_hot)
+    torch.testing.assert_close(dict(found.items()), dict(wanted.items()))
+
+
+def test_label_smoothing_expects_nothing_of_categories_that_are_impossible():
+    td = batch(5, classes=4)
+    td["mask"] = (torch.arange(7) < 4).expand(5, 3, 7)
+    found = bc(td, actor=lambda: categorical_actor(kind=MaskedCategorical, mask="mask"), label_smoothing=0.2)
+    found.backward()
+    actor = categorical_actor()
+    last = actor[0].module[-1]
+    last.weight, last.bias = nn.Parameter(last.weight[:4]), nn.Parameter(last.bias[:4])
+    torch.testing.assert_close(found, bc(td, actor=lambda: actor, label_smoothing=0.2))
