@@ -1,7 +1,7 @@
 """Training that is killed again and again, in a process of its own that has no threads.
 
-For each method ``OUT/METHOD/whole`` is trained in one go, and ``OUT/METHOD/killed`` by processes that kill themselves
-one after the other. Prints what they died at.
+``OUT/whole`` is trained in one go, and ``OUT/killed`` by processes that kill themselves one after the other. Prints
+what they died at.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +20,8 @@ from symphony.training import trainer as training
 from symphony.training.logging import Tracker
 
 STEPS = 8
-OWNERS = {
-    "_update": Trainer,
-    "log": Tracker,
-    "evaluate_dataset": hooks,
-    "fsync": os,
-    "rename": Path,
-    "replace": Path,
-    "rmtree": shutil,
-    "unlink": Path,
-}
+OWNERS = {"_update": Trainer, "log": Tracker, "evaluate_dataset": hooks, "fsync": os, "rmtree": shutil}
+OWNERS |= dict.fromkeys(("rename", "replace", "unlink"), Path)
 DEATHS = (
     ("_update", 1, ""),
     ("fsync", 5, ""),  # in the first checkpoint, when some of its files are written
@@ -53,7 +44,7 @@ def config(method: Any, store: Path, out: Path) -> TrainConfig:
 
 def die_at(name: str, count: int, file: str, report: int) -> None:
     """Have this process killed at an operation that went well so many times."""
-    action: Callable[..., Any] = getattr(OWNERS[name], name)
+    action: Any = getattr(OWNERS[name], name)
     left = iter(range(count))
 
     def deadly(*args: Any, **options: Any) -> Any:
@@ -84,13 +75,10 @@ def live(settings: TrainConfig, death: tuple[str, int, str] | None = None) -> in
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def main(store: Path, out: Path, methods: list[str]) -> int:
-    """Train each method in one go and in many."""
+def main(store: Path, out: Path, method: str) -> int:
+    """Train in one go and in many."""
     os.fsync = lambda descriptor: None  # the kernel outlives us
     training.KEEP = 2
-    for method in methods:
-        part, whole = (config(method, store, out / method / name) for name in ("killed", "whole"))
-        ends = [live(part, death) for death in DEATHS]
-        if ends != [-signal.SIGKILL] * len(DEATHS) or live(part) or live(whole):
-            return 1
-    return 0
+    part, whole = (config(method, store, out / name) for name in ("killed", "whole"))
+    ends = [live(part, death) for death in DEATHS]
+    return int(ends != [-signal.SIGKILL] * len(DEATHS) or live(part) != 0 or live(whole) != 0)

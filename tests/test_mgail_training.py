@@ -12,14 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers_runs import build, pieces, same_weights, tiny, weights
+from helpers_runs import build, pieces, same_weights, stopped, tiny, weights
 from helpers_segments import crossing, hide, straight_road
+from helpers_store import fill
 from symphony import keys
 from symphony.agents import load_agent
-from symphony.agents.checkpoint import latest
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.store import SegmentStore
-from symphony.data.store_writer import StoreWriter
 from symphony.envs import Displacement
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import evaluate
@@ -43,10 +42,8 @@ def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 
 def written(path: Path, *steps: int) -> Path:
     """A store of segments of so many steps; one vehicle comes into sight after the start."""
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=steps[0]))
-        writer.append(crossing(4, seed=0, steps=steps[1]))
-        writer.append(hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 4)))
+    late = hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 4))
+    fill(path, [straight_road(4, seed=0, steps=steps[0]), crossing(4, seed=0, steps=steps[1]), late])
     return path
 
 
@@ -81,23 +78,20 @@ def copies(trainer: Trainer) -> dict[str, list[Tensor]]:
 
 def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> set[str]:
     """Networks of which most weights changed; none may have changed in part of them only."""
-    shares = {
-        name: sum(not torch.equal(*pair) for pair in zip(before[name], after[name], strict=True))
-        / len(before[name])
-        for name in before
-    }
+    changed = {k: [not torch.equal(*pair) for pair in zip(before[k], after[k], strict=True)] for k in before}
+    shares = {name: sum(found) / len(found) for name, found in changed.items()}
     assert all(share == 0 or share > 0.7 for share in shares.values()), shares
     return {name for name, share in shares.items() if share}
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_each_phase_changes_the_networks_it_is_for(store: Path, tmp_path: Path, method: str) -> None:
-    trainer = build(config(method, store, tmp_path, mgail=replace(SHORT, expert_weight=0.0)))
-    goals = {"goals"} if method.endswith("_h") else set()
-    phases = ({"policy"}, {"policy"}, {"discriminator"}, {"discriminator"}) + (
-        {"policy", "discriminator"},
-    ) * 2
-    rates = []
+@pytest.mark.parametrize(("method", "cells"), [*((method, 0) for method in METHODS), ("mgail", 5)])
+def test_each_phase_changes_the_networks_it_is_for(
+    store: Path, tmp_path: Path, method: str, cells: int
+) -> None:
+    settings = config(method, store, tmp_path, mgail=replace(SHORT, expert_weight=0.0))
+    trainer = build(replace(settings, agent=replace(settings.agent, cells=cells)))
+    goals, rates = {"goals"} if method.endswith("_h") else set(), []
+    phases = [{"policy"}] * 2 + [{"discriminator"}] * 2 + [{"policy", "discriminator"}] * 2
     for step, phase in enumerate(phases):
         before = copies(trainer)
         record = trainer._update(step)
@@ -110,15 +104,7 @@ def test_each_phase_changes_the_networks_it_is_for(store: Path, tmp_path: Path, 
         rates.append(trainer.optimizers["policy"].param_groups[0]["lr"])
     # The policy's rate starts anew with the second phase, at one of its own.
     assert rates[0] == trainer.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[5]
-
-
-@pytest.mark.parametrize("method", ["mgail_h", "mgail_ts_h"])
-def test_goals_and_discriminator_learn_nothing_from_the_loss_of_the_policy(
-    store: Path, tmp_path: Path, method: str
-) -> None:
-    trainer = build(config(method, store, tmp_path))
-    for step in range(5):
-        trainer._update(step)
+    # Goals and discriminator learn nothing from the loss of the policy.
     used = pieces(trainer)
     for module in trainer.agent.modules.values():
         module.zero_grad(set_to_none=True)
@@ -165,20 +151,19 @@ def test_settings_of_the_configuration_reach_the_loss(store: Path, tmp_path: Pat
 def test_regression_beside_it_and_more_updates_of_the_discriminator(
     store: Path, tmp_path: Path, method: str
 ) -> None:
-    found = []
+    found: list[dict[str, Tensor]] = []
+    both = MGAILConfig(regression=0, head_start=0, rollouts=3, discriminator_updates=2)
     for weight in (0.5, 1.0):
-        both = MGAILConfig(
-            regression=0, head_start=0, rollouts=3, expert_weight=weight, discriminator_updates=2
-        )
-        trainer, steps = build(config(method, store, tmp_path, mgail=both)), []
+        trainer = build(config(method, store, tmp_path, mgail=replace(both, expert_weight=weight)))
+        steps: list[int] = []
         trainer.optimizers["discriminator"].register_step_post_hook(lambda *_, steps=steps: steps.append(1))
         found.append(trainer._update(0))
         assert len(steps) == 2
-    for record in found:
-        torch.testing.assert_close(record["loss_policy"], record["loss_mgail"] + record["loss_regression"])
-    half, whole = found
-    torch.testing.assert_close(2 * half["loss_regression"], whole["loss_regression"])
-    assert half["loss_regression"] != 0
+        parts = found[-1]["loss_mgail"] + found[-1]["loss_regression"]
+        torch.testing.assert_close(found[-1]["loss_policy"], parts)
+    half, whole = (record["loss_regression"] for record in found)
+    torch.testing.assert_close(2 * half, whole)
+    assert half != 0
 
 
 def test_a_run_that_ends_before_its_adversarial_updates_says_so(
@@ -192,66 +177,27 @@ def test_a_run_that_ends_before_its_adversarial_updates_says_so(
 
 @pytest.mark.parametrize(("method", "dies_at"), [("mgail", 5), ("mgail_ts_h", 3)])
 def test_a_killed_run_ends_like_an_unbroken_one(
-    store: Path,
-    trained: Trained,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    method: str,
-    dies_at: int,
+    store: Path, trained: Trained, tmp_path: Path, method: str, dies_at: int
 ) -> None:
-    whole = trained(method)
-    update = Trainer._update
-
-    def deadly(self: Trainer, step: int) -> dict[str, Tensor]:
-        if step == dies_at:
-            raise KeyboardInterrupt
-        return update(self, step)
-
     settings = config(method, store, tmp_path / "run", resume=True)
-    with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "_update", deadly)
-        with pytest.raises(KeyboardInterrupt):
-            train(settings)
-    done = latest(settings.out / "checkpoints")
-    assert done is not None
-    assert int(done.name.removeprefix("step-")) == dies_at - 1
+    stopped(trained(method), settings.out, dies_at - 1)
     train(settings)
-    assert same_weights(weights(settings.out), weights(whole))
+    assert same_weights(weights(settings.out), weights(trained(method)))
     assert [r["step"] for r in read_metrics(settings.out)] == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_policy_of_a_histogram_learns_and_is_evaluated(store: Path, tmp_path: Path) -> None:
-    settings = config("mgail", store, tmp_path / "run")
-    trainer = build(replace(settings, agent=replace(settings.agent, cells=5)))
-    for step, phase in ((0, {"policy"}), (2, {"discriminator"}), (4, {"policy", "discriminator"})):
-        before = copies(trainer)
-        record = trainer._update(step)
-        assert moved(before, copies(trainer)) == phase
-        assert all(math.isfinite(v) for k, v in record.items() if k.startswith(("loss", "gradient")))
-    agent = load_agent(str(train(replace(settings, agent=replace(settings.agent, cells=5)))))
-    assert agent.spec.agent.cells == 5
-    numbers = evaluate(agent, store, SETTINGS).numbers()
-    assert all(math.isfinite(float(numbers[name])) for name in ("ade", "collision_rate", "offroad_time"))
-
-
 @pytest.mark.parametrize("method", METHODS)
-def test_an_agent_is_evaluated_as_it_was_trained(trained: Trained, store: Path, method: str) -> None:
+def test_an_agent_is_evaluated_as_it_was_trained_or_otherwise(
+    trained: Trained, store: Path, method: str
+) -> None:
     agent = load_agent(str(trained(method)))
     assert agent.dynamics == Displacement()
     assert (agent.goals is None) == (not method.endswith("_h"))
-    assert agent.discriminator is not None
-    usual = evaluate(agent, store, SETTINGS).numbers()
-    assert usual["search"] == ("tree" if "_ts" in method else "none")
+    usual, kinds = evaluate(agent, store, SETTINGS).numbers(), ("tree", "none")
+    assert usual["search"] == kinds["_ts" not in method]
     assert all(math.isfinite(float(usual[name])) for name in ("ade", "collision_rate", "offroad_time"))
-
-
-@pytest.mark.parametrize(("method", "kind"), [("mgail", "tree"), ("mgail_ts_h", "none")])
-def test_an_agent_may_be_evaluated_otherwise(trained: Trained, store: Path, method: str, kind: Any) -> None:
-    agent = load_agent(str(trained(method)))
-    usual, other = (
-        evaluate(agent, store, how).numbers() for how in (SETTINGS, replace(SETTINGS, search=kind))
-    )
-    assert usual["search"] != other["search"] == kind
+    other = evaluate(agent, store, replace(SETTINGS, search=kinds["_ts" in method])).numbers()
+    assert usual["search"] != other["search"]
     assert other["ade"] != usual["ade"]
 
 
@@ -288,43 +234,33 @@ def test_the_duration_cuts_segments(seconds: Path, tmp_path: Path) -> None:
 def test_a_segment_too_short_for_the_duration_is_named(seconds: Path, tmp_path: Path) -> None:
     settings = config("mgail", seconds, tmp_path / "run", duration=2, segments=3)
     train(replace(settings, steps=1))
-    for fails in (
-        lambda: train(replace(settings, out=tmp_path / "long", duration=3)),
-        lambda: evaluate("constant_velocity", seconds, EvaluateConfig(rollouts=1, duration=3)),
-    ):
-        with pytest.raises(DataError, match=r"has 2.* s, 3 are asked for") as caught:
-            fails()
-        assert caught.value.file == seconds
-        assert caught.value.segment in ("straight-0", "crossing-0", "crossing-1")
+    with pytest.raises(DataError, match=r"has 2.* s, 3 are asked for") as caught:
+        train(replace(settings, out=tmp_path / "long", duration=3))
+    assert caught.value.file == seconds
+    assert caught.value.segment in ("straight-0", "crossing-0", "crossing-1")
     with pytest.raises(ConfigError, match="duration"):
         config("mgail", seconds, tmp_path, duration=-1)
 
 
 def test_an_agent_is_evaluated_for_the_duration_it_was_trained_with(seconds: Path, tmp_path: Path) -> None:
-    run = train(config("mgail", seconds, tmp_path / "run", duration=1, steps=1))
-    agent = load_agent(str(run))
+    agent = load_agent(str(train(config("mgail", seconds, tmp_path / "run", duration=1, steps=1))))
     assert agent.duration == 1
     assert agent.spec is not None
 
-    def numbers(of: int, asked: int, where: Path = seconds) -> Any:
-        evaluated = replace(SETTINGS, duration=asked)
+    def numbers(of: int, asked: int) -> Any:
         other = replace(agent, spec=replace(agent.spec, duration=of))
-        return pytest.approx(evaluate(other, where, evaluated).numbers(), nan_ok=True)
+        return pytest.approx(
+            evaluate(other, seconds, replace(SETTINGS, duration=asked)).numbers(), nan_ok=True
+        )
 
     assert numbers(1, 0) == numbers(0, 1).expected
     assert numbers(2, 1) == numbers(1, 0).expected
     assert numbers(2, 0) != numbers(1, 0).expected
-    # All of it is no cut.
-    with StoreWriter(tmp_path / "even") as writer:
-        for seed in range(2):
-            writer.append(crossing(4, seed=seed, steps=11))
-    assert numbers(0, 0, tmp_path / "even") == numbers(0, 2, tmp_path / "even").expected
 
 
 def test_eight_agents_train(tmp_path: Path) -> None:
-    with StoreWriter(tmp_path / "store") as writer:
-        writer.append(straight_road(9, seed=0, steps=7))
-        writer.append(hide(crossing(10, seed=1, steps=9), 2, slice(5, 9)))
+    late = hide(crossing(10, seed=1, steps=9), 2, slice(5, 9))
+    fill(tmp_path / "store", [straight_road(9, seed=0, steps=7), late])
     both = MGAILConfig(regression=1, head_start=0, rollouts=3)
     settings = config("mgail_ts_h", tmp_path / "store", tmp_path / "run", steps=3, mgail=both)
     run = train(replace(settings, agent=replace(settings.agent, interactive=8)))

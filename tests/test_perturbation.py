@@ -44,17 +44,11 @@ def test_on_the_log_the_way_back_is_the_log(speed: float, acceleration: float, s
     assert wrap(found[..., 2] - log[1:, 2]).abs() < (1e-6 if speed > 2 else 0.05)
 
 
-@given(
-    speed=st.floats(4, 30),
-    along=st.floats(-2, 2),
-    across=st.floats(-0.8, 0.8),
-    turn=st.floats(-0.1, 0.1),
-    faster=st.floats(-2, 2),
-)
-def test_it_leads_back(speed: float, along: float, across: float, turn: float, faster: float) -> None:
-    log = drive(speed, 0.0, 0.005, 50)
-    off = rotate(torch.tensor([along, across], dtype=torch.float64), log[0, 2])
-    state = log[:1] + torch.cat([off, torch.tensor([turn, faster], dtype=torch.float64)])
+@given(st.floats(4, 30), st.tuples(*(st.floats(-most, most) for most in (2, 0.8, 0.1, 2))))
+def test_it_leads_back(speed: float, by: tuple[float, ...]) -> None:
+    """From errors along, across, in heading and in speed."""
+    log, error = drive(speed, 0.0, 0.005, 50), torch.tensor(by, dtype=torch.float64)
+    state = log[:1] + torch.cat([rotate(error[:2], log[0, 2]), error[2:]])
     for t in range(50):
         state = way_back(state, log[t : t + 1], log[t + 1 : t + 2], LENGTH, DT)
     assert (state[0, :2] - log[-1, :2]).norm() < 0.2

@@ -5,88 +5,54 @@ from __future__ import annotations
 import json
 import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.cli import recipe as recipes
-from symphony.data.store_writer import StoreWriter
-from symphony.recipes import recipe_of
+from symphony.config import METHODS
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
-TINY = [
-    "--steps",
-    "3",
-    "--states",
-    "16",
-    "--agent.hidden",
-    "8",
-    "--agent.num-points",
-    "10",
-]
-COMMON = [*TINY, "--wandb", "disabled", "--rollouts", "2"]
-SEARCH = [
-    "--search.branches",
-    "2",
-    "--search.prune-every",
-    "3",
-    "--search.test-branches",
-    "2",
-    "--search.updates",
-    "2",
-    "--checkpoint-every",
-    "2",
-    "--search.states",
-    "8",
-]
-ADVERSARIAL = [
-    *SEARCH,
-    "--mgail.regression",
-    "1",
-    "--mgail.head-start",
-    "1",
-    "--mgail.rollouts",
-    "2",
-]
-ARGUMENTS = {
-    "bc.py": COMMON,
-    "bc_h.py": COMMON,
-    "bc_ts.py": [*COMMON, *SEARCH],
-    "bc_ts_h.py": [*COMMON, *SEARCH],
-    "mgail.py": [*COMMON, *ADVERSARIAL],
-    "mgail_h.py": [*COMMON, *ADVERSARIAL],
-    "mgail_ts.py": [*COMMON, *ADVERSARIAL],
-    "mgail_ts_h.py": [*COMMON, *ADVERSARIAL],
-}
-
-
-@pytest.mark.parametrize(
-    "recipe", sorted(path.name for path in RECIPES.glob("*.py") if path.stem != "__init__")
+COMMON = "--steps 3 --states 16 --agent.hidden 8 --agent.num-points 10 --wandb disabled --rollouts 2"
+SEARCH = (
+    "--search.branches 2 --search.prune-every 3 --search.test-branches 2 --search.updates 2 --search.states 8"
 )
-def test_recipe(
-    recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+ADVERSARIAL = "--mgail.regression 1 --mgail.head-start 1 --mgail.rollouts 2"
+ARGUMENTS = {"bc": COMMON, "bc_h": COMMON}
+ARGUMENTS |= dict.fromkeys(("bc_ts", "bc_ts_h"), f"{COMMON} {SEARCH} --checkpoint-every 2")
+ARGUMENTS |= dict.fromkeys(
+    ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h"), f"{ARGUMENTS['bc_ts']} {ADVERSARIAL}"
+)
+
+
+@pytest.fixture
+def run_script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Path, str], Any]:
+    """Run a file as a script in an empty folder; returns its status."""
+
+    def run(file: Path, words: str) -> Any:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(recipes, "settle", lambda: None)
+        monkeypatch.setattr(sys, "argv", [file.name, *words.split()])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(file), run_name="__main__")
+        return ended.value.code
+
+    return run
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_recipe(run_script: Any, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
     for split, seed in (("train", 0), ("test", 1)):
-        with StoreWriter(tmp_path / split) as writer:
-            writer.append(straight_road(4, seed=seed, steps=8))
-            writer.append(crossing(4, seed=seed, steps=8))
-    data = [
-        "--data",
-        str(tmp_path / "train"),
-        "--test",
-        str(tmp_path / "test"),
-        "--out",
-        str(tmp_path / "run"),
-    ]
-    monkeypatch.setattr(recipes, "settle", lambda: None)
-    monkeypatch.setattr(sys, "argv", [recipe, *data, *ARGUMENTS[recipe]])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(RECIPES / recipe), run_name="__main__")
-    assert ended.value.code == 0
+        fill(tmp_path / split, [straight_road(4, seed=seed, steps=8), crossing(4, seed=seed, steps=8)])
+    words = f"--data train --test test --out run {ARGUMENTS[method]}"
+    assert run_script(RECIPES / f"{method}.py", words) == 0
     (file,) = (tmp_path / "run" / "evaluations").iterdir()
     found = json.loads(file.read_text())
-    assert found["run"]["method"] == Path(recipe).stem
+    assert found["run"]["method"] == method
     assert found["playback"]["ade"] == 0
     assert found["ade"] > 0
     assert len(found["per_segment"]) == 2
@@ -94,40 +60,16 @@ def test_recipe(
 
 
 def test_a_changed_copy_elsewhere_is_what_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run_script: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with StoreWriter(tmp_path / "data") as writer:
-        writer.append(crossing(4, steps=8))
+    fill(tmp_path / "data", [crossing(4, steps=8)])
     source, update = (RECIPES / "bc.py").read_text(encoding="utf-8"), 'yield "policy", policy_loss(experts)'
     assert update in source
     changed = tmp_path / "mine.py"
     changed.write_text(source.replace(update, f'{update}; print("mine")'), encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recipes, "settle", lambda: None)
-    monkeypatch.setattr(sys, "argv", ["mine.py", "--data", "data", "--test", "data", "--out", "run", *COMMON])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(changed), run_name="__main__")
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.count("mine\n") == 3  # updates
-
-
-def test_mistakes_are_told_in_a_line_before_the_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with StoreWriter(tmp_path / "train") as writer:
-        writer.append(straight_road(4, steps=8))
-    words = [
-        "--data",
-        str(tmp_path / "train"),
-        "--test",
-        str(tmp_path / "none"),
-        "--out",
-        str(tmp_path / "run"),
-    ]
-    monkeypatch.setattr(sys, "argv", ["bc.py", *words, *COMMON])
-    monkeypatch.setattr(recipes, "settle", lambda: None)
-    with pytest.raises(SystemExit) as ended:
-        recipes.main(recipe_of("bc"), None)
-    assert ended.value.code == 1
+    # Mistakes are told in a line before the training.
+    assert run_script(changed, f"--data data --test none --out run {COMMON}") == 1
     assert "none: no such directory" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+    assert run_script(changed, f"--data data --test data --out run {COMMON}") == 0
+    assert capsys.readouterr().out.count("mine\n") == 3  # updates
