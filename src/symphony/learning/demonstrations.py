@@ -289,10 +289,10 @@ class SceneDataset:
             from symphony.learning import perturbation  # noqa: PLC0415 - few learn from displaced states
 
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
-            log = now, later, scenes.box_size[item, agent]
+            size = scenes.box_size[item, agent]
             ahead = perturbation.AHEAD_IN_STYLE if self.persona else perturbation.AHEAD
             how = self.dynamics, self.dt, perturb.share, rng, ahead
-            state, action = perturbation.perturbed(state, action, *log, *how)
+            state, action = perturbation.perturbed(state, action, now, later, size, *how)
         seen = None
         if observation.route:
             progress = torch.cat([e.progress.flatten() for e in found])[begin[row] + when]
